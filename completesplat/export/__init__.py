@@ -1,0 +1,1 @@
+"""Files that a person opens: splats, videos, contact sheets, scene descriptions."""

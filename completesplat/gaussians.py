@@ -1,0 +1,64 @@
+"""The scene representation: a set of 3D Gaussians with activated parameters, in world space."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from completesplat.geometry.cameras import transform_points
+from completesplat.geometry.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class Gaussians(TensorDataclass):
+    """3D Gaussians. Every value is final: scales in world units, opacities in [0, 1], sRGB colours from 0 to 1.
+
+    Quaternions are (w, x, y, z), of any length but zero for a defined rotation. There is one colour for all
+    directions (only the DC term of spherical harmonics exists, as in the paper), so none is stored as a harmonic.
+    """
+
+    means: Float[Tensor, "*batch gaussian 3"]
+    quaternions: Float[Tensor, "*batch gaussian 4"]
+    scales: Float[Tensor, "*batch gaussian 3"]
+    opacities: Float[Tensor, "*batch gaussian"]
+    colors: Float[Tensor, "*batch gaussian 3"]
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians in each set."""
+        return self.means.shape[-2]
+
+    def covariances(self) -> Float[Tensor, "*batch gaussian 3 3"]:
+        """R S S^T R^T (Kerbl et al. 2023, Eq. 6)."""
+        root = quaternion_to_matrix(self.quaternions) * self.scales[..., None, :]
+        return root @ root.mT
+
+    def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "Gaussians":
+        """Move the Gaussians by a rotation and translation (the upper left block must be a rotation)."""
+        rotation = matrix_to_quaternion(matrix[..., :3, :3])[..., None, :]
+        means = transform_points(matrix, self.means)
+        return replace(self, means=means, quaternions=quaternion_multiply(rotation, self.quaternions))
+
+    def keep(self, mask: Bool[Tensor, " gaussian"]) -> "Gaussians":
+        """The marked Gaussians of one unbatched set."""
+        return self[mask]
+
+    def finite(self) -> Bool[Tensor, "*batch gaussian"]:
+        """Which Gaussians have finite values throughout."""
+        marks = [self.opacities.isfinite()]
+        marks += [x.isfinite().all(-1) for x in (self.means, self.quaternions, self.scales, self.colors)]
+        return torch.stack(marks).all(0)
+
+
+def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
+    """All Gaussians of the sets (of equal batch shape) in one."""
+    return Gaussians(
+        means=torch.cat([s.means for s in sets], dim=-2),
+        quaternions=torch.cat([s.quaternions for s in sets], dim=-2),
+        scales=torch.cat([s.scales for s in sets], dim=-2),
+        opacities=torch.cat([s.opacities for s in sets], dim=-1),
+        colors=torch.cat([s.colors for s in sets], dim=-2),
+    )

@@ -1,0 +1,133 @@
+"""Pinhole cameras, and the only place that states their conventions.
+
+Axes are OpenCV's: +x right, +y down, +z forward. `world_to_camera` maps homogeneous world points to camera
+points. Intrinsics are in pixels; pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
+(i + 0.5, j + 0.5) and (0, 0) is the top left corner of the image.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class Cameras(TensorDataclass):
+    """Pinhole cameras that share one image size (height, width), in pixels."""
+
+    world_to_camera: Float[Tensor, "*batch 4 4"]
+    intrinsics: Float[Tensor, "*batch 3 3"]
+    image_size: tuple[int, int]
+
+    @property
+    def camera_to_world(self) -> Float[Tensor, "*batch 4 4"]:
+        """The rigid inverse of `world_to_camera`."""
+        return invert_rigid(self.world_to_camera)
+
+    @property
+    def centers(self) -> Float[Tensor, "*batch 3"]:
+        """Optical centres in world coordinates."""
+        return self.camera_to_world[..., :3, 3]
+
+    def relative_to(self, reference: "Cameras") -> "Cameras":
+        """The same cameras in a world whose frame is the reference camera's frame."""
+        return replace(self, world_to_camera=self.world_to_camera @ reference.camera_to_world)
+
+    def scale_world(self, factor: Float[Tensor, "*#batch"]) -> "Cameras":
+        """The same cameras after all world coordinates are multiplied by `factor`."""
+        matrix = self.world_to_camera.clone()
+        matrix[..., :3, 3] = matrix[..., :3, 3] * factor[..., None]
+        return replace(self, world_to_camera=matrix)
+
+
+def invert_rigid(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of a rotation and translation: (R, t) -> (R^T, -R^T t)."""
+    rotation = matrix[..., :3, :3].mT
+    inverse = torch.zeros_like(matrix)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ matrix[..., :3, 3:]).squeeze(-1)
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def transform_points(
+    matrix: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch n 3"]
+) -> Float[Tensor, "*batch n 3"]:
+    """Apply an affine 4 x 4 matrix to points."""
+    return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
+
+
+def project(
+    cameras: Cameras, points: Float[Tensor, "*#batch n 3"]
+) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
+    """World points to pixel coordinates (u, v) and depth along the optical axis."""
+    camera_points = transform_points(cameras.world_to_camera, points)
+    homogeneous = camera_points @ cameras.intrinsics.mT
+    return homogeneous[..., :2] / homogeneous[..., 2:], camera_points[..., 2]
+
+
+def unproject(
+    cameras: Cameras, pixels: Float[Tensor, "*#batch n 2"], depth: Float[Tensor, "*#batch n"]
+) -> Float[Tensor, "*batch n 3"]:
+    """Pixel coordinates with depth along the optical axis to world points; the inverse of `project`."""
+    camera_points = rays_through(cameras.intrinsics, pixels) * depth[..., None]
+    return transform_points(cameras.camera_to_world, camera_points)
+
+
+def rays_through(
+    intrinsics: Float[Tensor, "*#batch 3 3"], pixels: Float[Tensor, "*#batch n 2"]
+) -> Float[Tensor, "*batch n 3"]:
+    """Camera-frame rays ((u - cx) / fx, (v - cy) / fy, 1): not of unit length, so that ray * depth is a point."""
+    focal = torch.diagonal(intrinsics, dim1=-2, dim2=-1)[..., None, :2]
+    xy = (pixels - intrinsics[..., None, :2, 2]) / focal
+    return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
+
+
+def pixel_centers(
+    height: int, width: int, device: torch.device | None = None, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "height width 2"]:
+    """Coordinates (u, v) of all pixel centres."""
+    v = torch.arange(height, device=device, dtype=dtype) + 0.5
+    u = torch.arange(width, device=device, dtype=dtype) + 0.5
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+
+
+def pixel_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
+    """Camera-frame rays through all pixel centres, scaled so that z = 1."""
+    height, width = cameras.image_size
+    pixels = pixel_centers(height, width, cameras.intrinsics.device, cameras.intrinsics.dtype)
+    return rays_through(cameras.intrinsics, pixels.flatten(0, 1)).unflatten(-2, (height, width))
+
+
+def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
+    """Intrinsics of a square image with the given horizontal field of view and a central principal point."""
+    focal = 0.5 * size / torch.tensor(fov_degrees).deg2rad().div(2).tan().item()
+    return torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+
+
+def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: int) -> Cameras:
+    """Cameras of the image that is cut to a square (in pixels, fractions allowed) and resized to `size`."""
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 0, 2] -= left
+    intrinsics[..., 1, 2] -= top
+    intrinsics[..., :2, :] *= size / side
+    return Cameras(cameras.world_to_camera, intrinsics, (size, size))
+
+
+def look_at(
+    eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """`world_to_camera` of a camera at `eye` that sees `target` in its centre and `up` pointing up in the image."""
+    eye, target, up = torch.broadcast_tensors(eye, target, up)
+    forward = torch.nn.functional.normalize(target - eye, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack([right, down, forward], dim=-2)
+    matrix = torch.zeros(*eye.shape[:-1], 4, 4, dtype=eye.dtype, device=eye.device)
+    matrix[..., :3, :3] = rotation
+    matrix[..., :3, 3] = -(rotation @ eye[..., None]).squeeze(-1)
+    matrix[..., 3, 3] = 1
+    return matrix

@@ -1,0 +1,61 @@
+"""What every rasterizer takes and gives."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class RenderingConstants:
+    """The constants on which all backends agree (values of gsplat 1.5.3, `RasterizeToPixels3DGSFwd.cu`).
+
+    Attributes:
+        blur: added to the diagonal of the projected covariance, in px^2.
+        near_plane: Gaussians whose centre is not further than this are culled, in world units.
+        max_alpha: clamp on a Gaussian's alpha at a pixel (0.999 in gsplat 1.5.3, 0.99 in 1.6).
+        min_alpha: contributions below it are skipped.
+        min_transmittance: a pixel stops before the Gaussian that would bring its transmittance to this or less.
+        frustum_margin: the Jacobian is evaluated at a point clamped to this multiple of half the field of view
+            beyond the image's border (`_torch_impl.py:105`).
+    """
+
+    blur: float = 0.3
+    near_plane: float = 0.01
+    max_alpha: float = 0.999
+    min_alpha: float = 1 / 255
+    min_transmittance: float = 1e-4
+    frustum_margin: float = 0.3
+
+
+@dataclass(frozen=True)
+class Rendering(TensorDataclass):
+    """Rendered views before a background: colour and depth are sums weighted by each Gaussian's contribution.
+
+    `depth` is the accumulated depth (gsplat's "D"): divide by alpha for the expected depth.
+    """
+
+    color: Float[Tensor, "batch view 3 height width"]
+    depth: Float[Tensor, "batch view 1 height width"]
+    alpha: Float[Tensor, "batch view 1 height width"]
+
+    def over(self, background: Float[Tensor, "#batch #view 3 #height #width"] | float) -> Tensor:
+        """The image in front of a background colour: [batch view 3 height width]."""
+        return self.color + (1 - self.alpha) * background
+
+    def expected_depth(self) -> Float[Tensor, "batch view 1 height width"]:
+        """Mean depth of what is seen at a pixel; 0 where nothing is."""
+        return self.depth / self.alpha.clamp(min=1e-10)
+
+
+class Rasterizer(Protocol):
+    """Renders a batch of scenes, each from several cameras."""
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Gaussians of batch shape [batch], cameras of batch shape [batch view]."""
+        ...

@@ -1,0 +1,114 @@
+"""The definition: dense, differentiable, in plain torch and in any floating dtype."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pixel_centers, transform_points
+from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.tensors import stack
+
+
+class ReferenceRasterizer:
+    """Every Gaussian against every pixel. Memory and time grow with their product: for tests and small scenes.
+
+    Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled or not finite take
+    no part at all: they are left out before anything is computed, so their gradients are zero, never NaN.
+    """
+
+    def __init__(self, constants: RenderingConstants | None = None) -> None:
+        self.constants = constants or RenderingConstants()
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Render scenes [batch] from cameras [batch view]."""
+        batch, view = cameras.world_to_camera.shape[:2]
+        scenes = [stack([self._render(gaussians[b], cameras[b, v]) for v in range(view)]) for b in range(batch)]
+        return stack(scenes)
+
+    def _render(self, gaussians: Gaussians, camera: Cameras) -> Rendering:
+        height, width = camera.image_size
+        visible, depth_order = visible_in_depth_order(gaussians, camera, self.constants)
+        chosen = gaussians[visible][depth_order]
+        centers, depths, covariances = project_gaussians(chosen, camera, self.constants)
+        pixels = pixel_centers(height, width, centers.device, centers.dtype).flatten(0, 1)
+        alphas = alphas_at(pixels, centers, covariances, chosen.opacities, self.constants)
+        weights = composite(alphas, self.constants)
+
+        def image(values: Float[Tensor, "gaussian channel"]) -> Tensor:
+            return (weights.mT @ values).mT.unflatten(-1, (height, width))
+
+        return Rendering(image(chosen.colors), image(depths[:, None]), image(torch.ones_like(depths)[:, None]))
+
+
+def visible_in_depth_order(
+    gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
+) -> tuple[Tensor, Tensor]:
+    """Mask of the Gaussians that can be drawn, and the order of those by depth (ties keep their order)."""
+    depths = transform_points(camera.world_to_camera, gaussians.means)[:, 2].detach()
+    visible = gaussians.finite() & depths.isfinite() & (depths > constants.near_plane)
+    return visible, torch.argsort(depths[visible], stable=True)
+
+
+def project_gaussians(
+    gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
+) -> tuple[Float[Tensor, "gaussian 2"], Float[Tensor, " gaussian"], Float[Tensor, "gaussian 2 2"]]:
+    """Centres (px), depths and 2D covariances (px^2) of Gaussians in front of one camera.
+
+    The covariance is J W Sigma W^T J^T (Zwicker et al., "EWA splatting", 2001, Eq. 31) plus the blur.
+    """
+    points = transform_points(camera.world_to_camera, gaussians.means)
+    x, y, z = points.unbind(-1)
+    k = camera.intrinsics
+    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    centers = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+
+    height, width = camera.image_size
+    slope_x = _clamp_slope(x / z, fx, cx, width, constants.frustum_margin)
+    slope_y = _clamp_slope(y / z, fy, cy, height, constants.frustum_margin)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([fx / z, zero, -fx * slope_x / z], -1),
+            torch.stack([zero, fy / z, -fy * slope_y / z], -1),
+        ],
+        dim=-2,
+    )
+    to_image = jacobian @ camera.world_to_camera[:3, :3]
+    blur = constants.blur * torch.eye(2, dtype=z.dtype, device=z.device)
+    return centers, z, to_image @ gaussians.covariances() @ to_image.mT + blur
+
+
+def _clamp_slope(slope: Tensor, focal: Tensor, principal: Tensor, extent: int, margin: float) -> Tensor:
+    """Limit x / z (or y / z) to the frustum with a margin: the Jacobian explodes far outside the image."""
+    beyond = margin * 0.5 * extent / focal
+    return slope.clamp(min=-principal / focal - beyond, max=(extent - principal) / focal + beyond)
+
+
+def alphas_at(
+    pixels: Float[Tensor, "pixel 2"],
+    centers: Float[Tensor, "gaussian 2"],
+    covariances: Float[Tensor, "gaussian 2 2"],
+    opacities: Float[Tensor, " gaussian"],
+    constants: RenderingConstants,
+) -> Float[Tensor, "gaussian pixel"]:
+    """min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
+    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    determinant = (a * c - b * b).clamp(min=1e-10)
+    dx, dy = (pixels - centers[:, None]).unbind(-1)
+    a, b, c, determinant = (t[:, None] for t in (a, b, c, determinant))
+    sigma = 0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / determinant
+    alpha = (opacities[:, None] * torch.exp(-sigma)).clamp(max=constants.max_alpha)
+    return torch.where((alpha >= constants.min_alpha) & (sigma >= 0), alpha, torch.zeros_like(alpha))
+
+
+def composite(
+    alphas: Float[Tensor, "gaussian pixel"], constants: RenderingConstants
+) -> Float[Tensor, "gaussian pixel"]:
+    """Weights alpha_i * prod_{j<i} (1 - alpha_j), front to back, until the transmittance would be used up.
+
+    The Gaussian that would bring it to min_transmittance or below takes no part, nor does any behind it.
+    """
+    after = torch.cumprod(1 - alphas, dim=0)
+    before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
+    return torch.where(after > constants.min_transmittance, alphas * before, torch.zeros_like(alphas))

@@ -1,0 +1,51 @@
+"""What a data module yields: images with their cameras, for a reference view and its targets."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.geometry.cameras import Cameras
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class Views(TensorDataclass):
+    """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1)."""
+
+    images: Float[Tensor, "*batch 3 height width"]
+    cameras: Cameras
+    masks: Float[Tensor, "*batch 1 height width"]
+
+
+@dataclass(frozen=True)
+class SceneBatch(TensorDataclass):
+    """Scenes with one reference view and several target views each.
+
+    World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
+    optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
+    """
+
+    reference: Views
+    targets: Views
+    depth_range: Float[Tensor, "*batch 2"]
+    names: str | tuple[str, ...]
+
+    def all_views(self) -> Views:
+        """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
+        reference, targets = self.reference, self.targets
+        cameras = Cameras(
+            _prepend(reference.cameras.world_to_camera, targets.cameras.world_to_camera, axis=-3),
+            _prepend(reference.cameras.intrinsics, targets.cameras.intrinsics, axis=-3),
+            reference.cameras.image_size,
+        )
+        return Views(
+            _prepend(reference.images, targets.images, axis=-4),
+            cameras,
+            _prepend(reference.masks, targets.masks, axis=-4),
+        )
+
+
+def _prepend(one: Tensor, many: Tensor, axis: int) -> Tensor:
+    return torch.cat([one.unsqueeze(axis), many], dim=axis)

@@ -1,0 +1,79 @@
+"""Frozen dataclasses of tensors that travel as one thing: between devices, into batches, through indexing."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T", bound="TensorDataclass")
+
+
+class TensorDataclass:
+    """Base of the frozen dataclasses whose fields are tensors, nested tensor dataclasses, or static values.
+
+    Static values (image sizes, names, None) are carried along unchanged. A TypeVar stands where `typing.Self`
+    would be expected because beartype's import hook does not accept `Self` here.
+    """
+
+    def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
+        """The same dataclass with `function` applied to every tensor, nested ones included."""
+
+        def apply(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return function(value)
+            return value.map(function) if isinstance(value, TensorDataclass) else value
+
+        return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})  # type: ignore[type-var, arg-type]
+
+    def to(self: T, *args: Any, **kwargs: Any) -> T:
+        """Like `torch.Tensor.to`, for every tensor; integer and boolean tensors keep their dtype."""
+        dtype_only_for_floats = {k: v for k, v in kwargs.items() if k != "dtype"}
+        places = [a for a in args if not isinstance(a, torch.dtype)]
+
+        def move(tensor: Tensor) -> Tensor:
+            if tensor.is_floating_point():
+                return tensor.to(*args, **kwargs)
+            return tensor.to(*places, **dtype_only_for_floats) if places or dtype_only_for_floats else tensor
+
+        return self.map(move)
+
+    def pin_memory(self: T) -> T:
+        """Copy every tensor into page-locked memory (called by `torch.utils.data.DataLoader`)."""
+        return self.map(lambda tensor: tensor.pin_memory())
+
+    def detach(self: T) -> T:
+        """Cut every tensor off the autograd graph."""
+        return self.map(torch.Tensor.detach)
+
+    def __getitem__(self: T, index: Any) -> T:
+        """Index the leading batch axes of every tensor alike."""
+        return self.map(lambda tensor: tensor[index])
+
+
+def stack(items: Sequence[T]) -> T:
+    """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
+
+    Strings are collected into a tuple, one for each item; any other static value must be the same in all items.
+
+    Raises:
+        ValueError: no items, or static values that differ.
+    """
+    if not items:
+        raise ValueError("cannot stack an empty sequence")
+    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}  # type: ignore[arg-type]
+    return replace(items[0], **merged)  # type: ignore[type-var]
+
+
+def _merge(values: list[Any]) -> Any:
+    first = values[0]
+    if isinstance(first, Tensor):
+        return torch.stack(values)
+    if isinstance(first, TensorDataclass):
+        return stack(values)
+    if isinstance(first, str):
+        return tuple(values)
+    if any(value != first for value in values):
+        raise ValueError(f"static values differ between the items of a batch: {values}")
+    return first
