@@ -8,7 +8,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.geometry.cameras import transform_points
-from completesplat.geometry.rotations import matrix_to_quaternion, quaternion_multiply, quaternion_to_matrix
+from completesplat.geometry.rotations import (
+    matrix_to_quaternion,
+    normalize_quaternion,
+    quaternion_multiply,
+    quaternion_to_matrix,
+)
 from completesplat.tensors import TensorDataclass
 
 
@@ -39,8 +44,9 @@ class Gaussians(TensorDataclass):
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "Gaussians":
         """Move the Gaussians by a rotation and translation (the upper left block must be a rotation)."""
         rotation = matrix_to_quaternion(matrix[..., :3, :3])[..., None, :]
-        means = transform_points(matrix, self.means)
-        return replace(self, means=means, quaternions=quaternion_multiply(rotation, self.quaternions))
+        # Normalised first, because a zero quaternion would stay zero instead of taking the rotation.
+        quaternions = quaternion_multiply(rotation, normalize_quaternion(self.quaternions))
+        return replace(self, means=transform_points(matrix, self.means), quaternions=quaternions)
 
     def keep(self, mask: Bool[Tensor, " gaussian"]) -> "Gaussians":
         """The marked Gaussians of one unbatched set."""

@@ -1,7 +1,7 @@
 """Frozen dataclasses of tensors that travel as one thing: between devices, into batches, through indexing."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 T = TypeVar("T", bound="TensorDataclass")
 
 
+@dataclass(frozen=True)
 class TensorDataclass:
     """Base of the frozen dataclasses whose fields are tensors, nested tensor dataclasses, or static values.
 
@@ -25,12 +26,12 @@ class TensorDataclass:
                 return function(value)
             return value.map(function) if isinstance(value, TensorDataclass) else value
 
-        return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})  # type: ignore[type-var, arg-type]
+        return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
         """Like `torch.Tensor.to`, for every tensor; integer and boolean tensors keep their dtype."""
         dtype_only_for_floats = {k: v for k, v in kwargs.items() if k != "dtype"}
-        places = [a for a in args if not isinstance(a, torch.dtype)]
+        places: list[Any] = [a.device if isinstance(a, Tensor) else a for a in args if not isinstance(a, torch.dtype)]
 
         def move(tensor: Tensor) -> Tensor:
             if tensor.is_floating_point():
@@ -62,8 +63,8 @@ def stack(items: Sequence[T]) -> T:
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")
-    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}  # type: ignore[arg-type]
-    return replace(items[0], **merged)  # type: ignore[type-var]
+    merged = {field.name: _merge([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    return replace(items[0], **merged)
 
 
 def _merge(values: list[Any]) -> Any:

@@ -19,7 +19,8 @@ def orbit(
     stops one step short of `degrees`, so that a full turn loops smoothly.
 
     Returns:
-        Cameras with a leading axis of `frames`, turning to the right as seen from above.
+        Cameras with a leading axis of `frames`, each to the right of the one before: for a positive angle the path
+        runs counter-clockwise as seen from above.
     """
     axis = torch.nn.functional.normalize(up, dim=-1)
     angles = torch.arange(frames, dtype=up.dtype, device=up.device) / frames * math.radians(degrees)

@@ -37,18 +37,21 @@ class RenderingConstants:
 class Rendering(TensorDataclass):
     """Rendered views before a background: colour and depth are sums weighted by each Gaussian's contribution.
 
-    `depth` is the accumulated depth (gsplat's "D"): divide by alpha for the expected depth.
+    The batch shape of what a rasterizer returns is [batch view]. `depth` is the accumulated depth (gsplat's "D"):
+    divide by alpha for the expected depth.
     """
 
-    color: Float[Tensor, "batch view 3 height width"]
-    depth: Float[Tensor, "batch view 1 height width"]
-    alpha: Float[Tensor, "batch view 1 height width"]
+    color: Float[Tensor, "*batch 3 height width"]
+    depth: Float[Tensor, "*batch 1 height width"]
+    alpha: Float[Tensor, "*batch 1 height width"]
 
-    def over(self, background: Float[Tensor, "#batch #view 3 #height #width"] | float) -> Tensor:
-        """The image in front of a background colour: [batch view 3 height width]."""
+    def over(
+        self, background: Float[Tensor, "*#batch 3 #height #width"] | float
+    ) -> Float[Tensor, "*batch 3 height width"]:
+        """The image in front of a background colour or picture."""
         return self.color + (1 - self.alpha) * background
 
-    def expected_depth(self) -> Float[Tensor, "batch view 1 height width"]:
+    def expected_depth(self) -> Float[Tensor, "*batch 1 height width"]:
         """Mean depth of what is seen at a pixel; 0 where nothing is."""
         return self.depth / self.alpha.clamp(min=1e-10)
 

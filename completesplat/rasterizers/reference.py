@@ -9,12 +9,16 @@ from completesplat.geometry.cameras import Cameras, pixel_centers, transform_poi
 from completesplat.rasterizers.protocol import Rendering, RenderingConstants
 from completesplat.tensors import stack
 
+# In px and px^2. Products of two such numbers are still finite in float32.
+LARGEST_PROJECTION = 1e15
+
 
 class ReferenceRasterizer:
     """Every Gaussian against every pixel. Memory and time grow with their product: for tests and small scenes.
 
-    Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled or not finite take
-    no part at all: they are left out before anything is computed, so their gradients are zero, never NaN.
+    Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled, not finite, or so
+    large or far aside that their projection overflows take no part at all: they are left out before anything is
+    computed, so their gradients are zero, never NaN.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -45,8 +49,12 @@ def visible_in_depth_order(
     gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
 ) -> tuple[Tensor, Tensor]:
     """Mask of the Gaussians that can be drawn, and the order of those by depth (ties keep their order)."""
-    depths = transform_points(camera.world_to_camera, gaussians.means)[:, 2].detach()
-    visible = gaussians.finite() & depths.isfinite() & (depths > constants.near_plane)
+    with torch.no_grad():
+        centers, depths, covariances = project_gaussians(gaussians, camera, constants)
+    # Comparisons with NaN are false, so that whatever the projection made of bad values is left out here.
+    drawable = (depths > constants.near_plane) & depths.isfinite() & (gaussians.opacities >= constants.min_alpha)
+    bounded = torch.cat([centers, covariances.flatten(-2)], dim=-1).abs().le(LARGEST_PROJECTION).all(-1)
+    visible = gaussians.finite() & drawable & bounded
     return visible, torch.argsort(depths[visible], stable=True)
 
 
@@ -94,10 +102,12 @@ def alphas_at(
 ) -> Float[Tensor, "gaussian pixel"]:
     """min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
-    determinant = (a * c - b * b).clamp(min=1e-10)
+    # The determinant of M + blur * 1 is at least blur * (trace of M + blur) for a covariance M; the difference of
+    # products loses that to rounding when a Gaussian is large and flat.
+    determinant = torch.maximum(a * c - b * b, constants.blur * (a + c - constants.blur)).clamp(min=1e-10)
+    a, b, c = (t[:, None] for t in (a / determinant, b / determinant, c / determinant))
     dx, dy = (pixels - centers[:, None]).unbind(-1)
-    a, b, c, determinant = (t[:, None] for t in (a, b, c, determinant))
-    sigma = 0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / determinant
+    sigma = 0.5 * (c * dx * dx + a * dy * dy) - b * dx * dy
     alpha = (opacities[:, None] * torch.exp(-sigma)).clamp(max=constants.max_alpha)
     return torch.where((alpha >= constants.min_alpha) & (sigma >= 0), alpha, torch.zeros_like(alpha))
 

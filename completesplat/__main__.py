@@ -1,0 +1,5 @@
+"""`python -m completesplat` is the `completesplat` command."""
+
+from completesplat.cli import main
+
+main()

@@ -1,0 +1,44 @@
+"""The Variational AutoReconstructor as one module."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.splatter_image import SplatterImage
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class Reconstruction(TensorDataclass):
+    """What a reconstruction model predicts from one image; regression baselines have no posterior."""
+
+    splatter_image: SplatterImage
+    posterior: Posterior | None
+
+
+class VariationalAutoReconstructor(nn.Module):
+    """Encoder and reconstructor (paper, Section 3.2 and Figure 3).
+
+    In training a latent is drawn from the posterior, and the skip features of a sample are zeroed, all of them at
+    once, with probability `skip_dropout` (supplement, "Skip connection"; the probability is not stated in the
+    paper). In evaluation the posterior's mode is used, with full skips.
+    """
+
+    def __init__(self, encoder: Encoder, reconstructor: Reconstructor, skip_dropout: float = 0.5) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.reconstructor = reconstructor
+        self.skip_dropout = skip_dropout
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
+        """Reconstruct from sRGB images in [0, 1]."""
+        posterior, features = self.encoder(images)
+        if not self.training:
+            return Reconstruction(self.reconstructor(posterior.mode(), features), posterior)
+        kept = (torch.rand(len(images), device=images.device) >= self.skip_dropout).float()
+        return Reconstruction(self.reconstructor(posterior.sample(), features, kept), posterior)

@@ -1,0 +1,43 @@
+"""The distribution over latent codes that the encoder predicts."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.tensors import TensorDataclass
+
+LOG_VARIANCE_RANGE = (-30.0, 20.0)
+"""Clamp of Stable Diffusion's VAE (CompVis `ldm/modules/distributions/distributions.py`)."""
+
+
+@dataclass(frozen=True)
+class Posterior(TensorDataclass):
+    """Diagonal Gaussian q(h | image)."""
+
+    mean: Float[Tensor, "batch channel height width"]
+    log_variance: Float[Tensor, "batch channel height width"]
+
+    @property
+    def std(self) -> Float[Tensor, "batch channel height width"]:
+        return torch.exp(0.5 * self.log_variance)
+
+    def sample(self, generator: torch.Generator | None = None) -> Float[Tensor, "batch channel height width"]:
+        """h = mu + epsilon * sigma, the reparameterisation trick (paper, Section 3.2)."""
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+        return self.mean + noise * self.std
+
+    def mode(self) -> Float[Tensor, "batch channel height width"]:
+        """The most probable latent."""
+        return self.mean
+
+    def kl(self) -> Float[Tensor, " batch"]:
+        """KL divergence to the standard normal, summed over the latent: 0.5 sum(mu^2 + sigma^2 - 1 - log sigma^2)."""
+        return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance).sum(dim=(1, 2, 3))
+
+
+def from_moments(moments: Float[Tensor, "batch channel height width"]) -> Posterior:
+    """Split the encoder's output into mean and (clamped) log-variance, in float32."""
+    mean, log_variance = moments.float().chunk(2, dim=1)
+    return Posterior(mean, log_variance.clamp(*LOG_VARIANCE_RANGE))

@@ -1,0 +1,76 @@
+"""Stable Diffusion's VAE decoder with a Splatter Image head and weighted skips from the encoder."""
+
+from collections.abc import Sequence
+
+import torch
+from diffusers.models.autoencoders import vae
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
+
+
+class Reconstructor(nn.Module):
+    """Latent -> Splatter Image. The last convolution has M * 15 channels instead of 3.
+
+    A skip takes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
+    convolution and adds them to the input of the up block of the same resolution. The merge operator is not stated
+    in the paper; zero initialisation leaves pretrained decoder weights intact at step 0.
+
+    Args:
+        parameterization: layers and activations of the Splatter Image.
+        channels: width of each level, from full resolution down; equal to the encoder's.
+        layers_per_block: residual blocks per level of the encoder (the decoder has one more, as in Stable Diffusion).
+        latent_channels: channels of the latent.
+        norm_groups: groups of the group normalisation.
+        skip_levels: encoder levels with a skip. The paper's model has level 0; its ablations none, or 0 and 1.
+    """
+
+    def __init__(
+        self,
+        parameterization: Parameterization,
+        channels: Sequence[int] = (128, 256, 512, 512),
+        layers_per_block: int = 2,
+        latent_channels: int = 4,
+        norm_groups: int = 32,
+        skip_levels: Sequence[int] = (0,),
+    ) -> None:
+        super().__init__()
+        self.parameterization = parameterization
+        self.post_quant_conv = nn.Conv2d(latent_channels, latent_channels, 1)
+        self.network = vae.Decoder(
+            in_channels=latent_channels,
+            out_channels=parameterization.channels,
+            up_block_types=("UpDecoderBlock2D",) * len(channels),
+            block_out_channels=tuple(channels),
+            layers_per_block=layers_per_block,
+            norm_num_groups=norm_groups,
+        )
+        initialize_head(self.network.conv_out, parameterization)
+        # The up block that works at level l's resolution takes in the channels of the next coarser level.
+        inputs = {level: channels[min(level + 1, len(channels) - 1)] for level in skip_levels}
+        self.skips = nn.ModuleDict({str(level): _zero_conv(channels[level], inputs[level]) for level in skip_levels})
+
+    def forward(
+        self,
+        latent: Float[Tensor, "batch channel latent_height latent_width"],
+        features: Sequence[Float[Tensor, "batch _ _ _"]],
+        skip_weight: Float[Tensor, " batch"] | float = 1.0,
+    ) -> SplatterImage:
+        """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one, or one per sample)."""
+        network = self.network
+        weight = torch.as_tensor(skip_weight, dtype=latent.dtype, device=latent.device).view(-1, 1, 1, 1)
+        hidden = network.mid_block(network.conv_in(self.post_quant_conv(latent)))
+        for level, block in zip(reversed(range(len(network.up_blocks))), network.up_blocks, strict=True):
+            if str(level) in self.skips:
+                hidden = hidden + weight * self.skips[str(level)](features[level])
+            hidden = block(hidden)
+        output = network.conv_out(network.conv_act(network.conv_norm_out(hidden)))
+        return from_channels(output.float(), self.parameterization)
+
+
+def _zero_conv(inputs: int, outputs: int) -> nn.Conv2d:
+    conv = nn.Conv2d(inputs, outputs, 1)
+    nn.init.zeros_(conv.weight)
+    nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
+    return conv

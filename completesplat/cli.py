@@ -1,0 +1,46 @@
+"""The `completesplat` command: picks the verb, reports refusals in one line."""
+
+import sys
+
+VERBS = {
+    "data": "make data sets (data toy)",
+    "fit": "train a model, one stage at a time",
+    "test": "score a checkpoint on held-out scenes",
+    "predict": "draw complete scenes from one photograph",
+    "bench": "time the rasterizer backends (bench rasterizers)",
+}
+USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
+    f"  {verb:9} {description}" for verb, description in VERBS.items()
+)
+
+
+def main() -> None:
+    """Entry point. Exit status 0 only when all of it worked, 2 for a refused input."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(USAGE)
+        return
+    if arguments[0] == "--version":
+        from completesplat import __version__
+
+        print(f"completesplat {__version__}")
+        return
+    if arguments[0] not in VERBS:
+        sys.exit(_refuse(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}"))
+
+    from completesplat.commands import launch, refusal
+
+    try:
+        launch(arguments[0], arguments[1:])
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except Exception as error:
+        message = refusal(error)
+        if message is None:
+            raise
+        sys.exit(_refuse(message))
+
+
+def _refuse(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return 2

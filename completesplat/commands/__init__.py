@@ -1,0 +1,129 @@
+"""The verbs of the command line, one thin file each, and how hydra starts them."""
+
+import json
+import logging
+import os
+import secrets
+import subprocess
+import sys
+import time
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from completesplat import __version__
+from completesplat.errors import CompleteSplatError
+
+RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
+TASKS = ("data", "bench")
+
+
+def launch(verb: str, arguments: list[str]) -> None:
+    """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
+
+    `data` and `bench` have several tasks: `data toy` is short for `data data_task=toy`.
+    """
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
+
+    register_resolvers()
+    # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
+        arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
+    sys.argv = [f"completesplat {verb}", *arguments]
+
+    failures: list[Exception] = []
+
+    def job(config: Any) -> None:
+        try:
+            run_job(verb, config)
+        except Exception as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:
+                raise  # hydra says which job it was, goes on with the others, and raises in the end
+            failures.append(error)
+
+    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
+    if failures:
+        raise failures[0]
+
+
+def conf_folder() -> Path:
+    """The configuration tree: inside an installed package, or beside it in the repository."""
+    package = Path(__file__).parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def register_resolvers() -> None:
+    """Interpolations that `conf/` uses beside hydra's own."""
+    from omegaconf import OmegaConf
+
+    OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
+    OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
+
+
+def best_precision() -> str:
+    """Lightning's precision for networks: bfloat16 where the processor computes in it, else float32."""
+    import torch
+
+    if torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported() else "32-true"
+    return "bf16-mixed" if torch.cpu._is_avx512_bf16_supported() else "32-true"
+
+
+def run_job(verb: str, config: Any) -> None:
+    """Run one job in its own directory, leaving there what is needed to know what was run."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    out = Path(HydraConfig.get().runtime.output_dir)
+    OmegaConf.set_struct(config, False)
+    config.out = str(out)
+    OmegaConf.save(config, out / "config.yaml", resolve=True)
+    record = {
+        "version": __version__,
+        "commit": git_commit(),
+        "command": sys.argv,
+        "overrides": list(HydraConfig.get().overrides.task),
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    (out / "run.json").write_text(json.dumps(record, indent=2) + "\n")
+    logging.captureWarnings(True)
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*isinstance\\(treespec, LeafSpec\\).*")
+    place = import_module(f"completesplat.commands.{verb}").run(config, out)
+    print(place or out)
+
+
+def git_commit() -> str | None:
+    """The commit of the source, marked when there are changes on top; None where there is no repository."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout
+
+    try:
+        if not git("ls-files", "."):  # an installed package inside somebody else's repository
+            return None
+        return git("rev-parse", "HEAD").strip() + ("-dirty" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def refusal(error: BaseException) -> str | None:
+    """One line for an error that the user can put right; None for a fault of the program."""
+    from hydra.errors import HydraException, InstantiationException
+    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+    chain: BaseException | None = error
+    while chain is not None:
+        if isinstance(chain, CompleteSplatError):
+            return " ".join(str(chain).split())
+        chain = chain.__cause__
+    if isinstance(error, MissingMandatoryValue):
+        return f"{error.full_key} is needed: give {error.full_key}=VALUE"
+    if isinstance(error, HydraException | OmegaConfBaseException) and not isinstance(error, InstantiationException):
+        return " ".join(str(error).split())
+    return None

@@ -1,0 +1,45 @@
+"""`completesplat test`: score a checkpoint beside two naive predictors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from completesplat.errors import WeightsError
+
+
+def run(config: Any, out: Path) -> None:
+    """Write `metrics.json` and print the table."""
+    from hydra.utils import instantiate
+    from lightning import seed_everything
+
+    from completesplat.reports.evaluation_table import evaluation_table, show
+    from completesplat.training.checkpoints import load_part
+
+    run_config = config_of_run(Path(config.ckpt), list(config.overrides))
+    seed_everything(config.seed, verbose=False)
+    data = instantiate(run_config.data, _convert_="all")
+    # The weights come from this checkpoint, whatever the run started from.
+    initial = {"autoreconstructor_checkpoint": None} if "autoreconstructor_checkpoint" in run_config.model else {}
+    module = instantiate(run_config.model, _convert_="all", **initial)
+    load_part(module, config.ckpt, prefix="")
+    trainer = instantiate(config.trainer, logger=False, _convert_="all")
+    trainer.test(module, datamodule=data, verbose=False)
+    results = module.evaluation.results()
+    (out / "metrics.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+    show(evaluation_table(results))
+
+
+def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
+    """The configuration saved beside a checkpoint's folder, with changes.
+
+    Raises:
+        WeightsError: the checkpoint or its run's configuration is missing.
+    """
+    from omegaconf import OmegaConf
+
+    path = checkpoint.parent.parent / "config.yaml"
+    if not checkpoint.is_file():
+        raise WeightsError(f"{checkpoint}: no such checkpoint")
+    if not path.is_file():
+        raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
+    return OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(overrides))

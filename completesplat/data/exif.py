@@ -1,0 +1,76 @@
+"""What the EXIF record of a photograph tells: which way is up, and the field of view."""
+
+import math
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any
+
+from PIL import ExifTags, Image
+
+ORIENTATION = ExifTags.Base.Orientation
+# How the stored picture becomes upright (EXIF 2.32, tag 0x0112; 1 is upright already).
+TRANSPOSITIONS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+FULL_FRAME_WIDTH = 36.0  # mm
+MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUnit; 4 and 5 are in common use
+
+
+def read_exif(picture: Image.Image) -> dict[int, Any]:
+    """All EXIF tags of a picture that is decoded and still open; a damaged record counts as none.
+
+    Pillow turns a TIFF upright when it decodes it, and takes the orientation out of its record.
+    """
+    try:
+        exif = picture.getexif()
+        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    except Exception:  # Pillow's parser raises nearly anything on a damaged record.
+        return {}
+
+
+def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:
+    """Field of view in degrees of the largest centred square, or None if the record does not tell.
+
+    The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the picture stands
+    for the 36 mm of a full frame), else FocalLength * FocalPlaneXResolution, brought from the recorded pixel size
+    to the actual one. Then fov = 2 atan(shorter side / (2 focal)). A picture that was cut or stitched after it was
+    taken has another field of view than its record says.
+    """
+    focal = _focal_from_full_frame(exif, max(size)) or _focal_from_sensor(exif, max(size))
+    if focal is None:
+        return None
+    fov = math.degrees(2 * math.atan(min(size) / (2 * focal)))
+    return fov if 1 < fov < 170 else None
+
+
+def _focal_from_full_frame(exif: Mapping[int, Any], longer_side: int) -> float | None:
+    equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    return equivalent and equivalent / FULL_FRAME_WIDTH * longer_side
+
+
+def _focal_from_sensor(exif: Mapping[int, Any], longer_side: int) -> float | None:
+    focal = _positive(exif.get(ExifTags.Base.FocalLength))
+    resolution = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
+    unit = exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)
+    if focal is None or resolution is None or unit not in MILLIMETRES:
+        return None
+    recorded = [_positive(exif.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    scale = longer_side / max(side or longer_side for side in recorded) if all(recorded) else 1.0
+    return focal * resolution / MILLIMETRES[unit] * scale
+
+
+def _positive(value: Any) -> float | None:
+    """A finite number above 0, or None for anything else (0 stands for "unknown", 0/0 occurs)."""
+    if not isinstance(value, Real):
+        return None
+    try:
+        number = float(value)
+    except (ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None

@@ -1,0 +1,196 @@
+"""A small analytic ray tracer: ellipsoids and cone frusta on a patterned ground inside a coloured dome.
+
+Shading is Lambertian, so a point looks the same from everywhere. The kernels carry no annotations because run-time
+type checkers would hide them from numba, and share one file because numba's cache watches only the caller's.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from completesplat.data.toy.ingredients import BANDS, CHECKS, ELLIPSOID, WAVES
+
+GROUND, DOME = -1, -2
+SELF_INTERSECTION = 1e-6
+# The patch is where the horizontal cosine between normal and patch direction exceeds this: never seen from the front.
+PATCH_EDGE = 0.72
+
+kernel = njit(cache=True, nogil=True, error_model="numpy")
+# Inlined, because passing a tuple of arrays to a numba function costs as much as meeting a sphere.
+inlined = njit(nogil=True, error_model="numpy", inline="always")
+
+
+@inlined
+def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
+    """Nearest hit (distance, local normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
+    nearest, nx, ny, nz = np.inf, 0.0, 0.0, 0.0
+    a = dx * dx + dz * dz - taper * taper * dy * dy
+    b = ox * dx + oz * dz - taper * dy * (1 + taper * oy)
+    c = ox * ox + oz * oz - (1 + taper * oy) ** 2
+    square = b * b - a * c
+    if square > 0 and abs(a) > 1e-12:
+        for sign in (-1.0, 1.0):
+            t = (-b + sign * math.sqrt(square)) / a
+            y = oy + t * dy
+            if SELF_INTERSECTION < t < nearest and abs(y) <= 1:
+                nearest, nx, ny, nz = t, ox + t * dx, -taper * (1 + taper * y), oz + t * dz
+    if abs(dy) > 1e-12:
+        for cap in (-1.0, 1.0):
+            t = (cap - oy) / dy
+            x, z = ox + t * dx, oz + t * dz
+            if SELF_INTERSECTION < t < nearest and x * x + z * z <= (1 + taper * cap) ** 2:
+                nearest, nx, ny, nz = t, 0.0, cap, 0.0
+    return nearest, nx, ny, nz
+
+
+@inlined
+def _hit_ball(ox, oy, oz, dx, dy, dz):
+    """Nearest hit (distance, normal) of the unit ball, from outside."""
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
+    t = (-b - math.sqrt(square)) / a if square > 0 else -1.0
+    if t <= SELF_INTERSECTION:
+        return np.inf, 0.0, 0.0, 0.0
+    return t, ox + t * dx, oy + t * dy, oz + t * dz
+
+
+@inlined
+def hit_object(geometry, ox, oy, oz, dx, dy, dz):
+    """Nearest part along a ray of unit direction: distance, part (or -1), world normal."""
+    nearest, part, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
+    along = ox * dx + oy * dy + oz * dz
+    if ox * ox + oy * oy + oz * oz - along * along > geometry.bounding_radius**2:
+        return nearest, part, nx, ny, nz
+    m = geometry.to_local
+    for i in range(len(geometry.kinds)):
+        px = m[i, 0, 0] * ox + m[i, 0, 1] * oy + m[i, 0, 2] * oz + m[i, 0, 3]
+        py = m[i, 1, 0] * ox + m[i, 1, 1] * oy + m[i, 1, 2] * oz + m[i, 1, 3]
+        pz = m[i, 2, 0] * ox + m[i, 2, 1] * oy + m[i, 2, 2] * oz + m[i, 2, 3]
+        qx = m[i, 0, 0] * dx + m[i, 0, 1] * dy + m[i, 0, 2] * dz
+        qy = m[i, 1, 0] * dx + m[i, 1, 1] * dy + m[i, 1, 2] * dz
+        qz = m[i, 2, 0] * dx + m[i, 2, 1] * dy + m[i, 2, 2] * dz
+        if geometry.kinds[i] == ELLIPSOID:
+            t, lx, ly, lz = _hit_ball(px, py, pz, qx, qy, qz)
+        else:
+            t, lx, ly, lz = _hit_frustum(px, py, pz, qx, qy, qz, geometry.tapers[i])
+        if t < nearest:
+            nearest, part = t, i
+            # Normals transform by the transpose of the map into the local frame.
+            nx = m[i, 0, 0] * lx + m[i, 1, 0] * ly + m[i, 2, 0] * lz
+            ny = m[i, 0, 1] * lx + m[i, 1, 1] * ly + m[i, 2, 1] * lz
+            nz = m[i, 0, 2] * lx + m[i, 1, 2] * ly + m[i, 2, 2] * lz
+    if part >= 0:
+        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+        nx, ny, nz = nx / norm, ny / norm, nz / norm
+    return nearest, part, nx, ny, nz
+
+
+@inlined
+def _soft_sign(x):
+    return x / math.sqrt(1 + x * x)
+
+
+@inlined
+def _pattern(kind, frequency, phase, x, y, z):
+    """Mixing weight of the second colour, 0 to 1, at a local point."""
+    if kind == BANDS:
+        return 0.5 + 0.5 * _soft_sign(5 * math.sin(frequency * y + phase))
+    if kind == CHECKS:
+        around = math.sin(round(frequency / 2) * math.atan2(x, z) + phase)
+        return 0.5 + 0.5 * _soft_sign(8 * around * math.sin(frequency * y + phase))
+    if kind == WAVES:
+        first = math.sin(frequency * (x + 0.6 * z) + phase)
+        return 0.5 + 0.25 * (first + math.sin(1.3 * frequency * (y - 0.5 * x + 0.3 * z) + 2 * phase))
+    return 0.0
+
+
+@inlined
+def _object_color(geometry, patch, part, x, y, z, nx, nz):
+    m = geometry.to_local
+    lx = m[part, 0, 0] * x + m[part, 0, 1] * y + m[part, 0, 2] * z + m[part, 0, 3]
+    ly = m[part, 1, 0] * x + m[part, 1, 1] * y + m[part, 1, 2] * z + m[part, 1, 3]
+    lz = m[part, 2, 0] * x + m[part, 2, 1] * y + m[part, 2, 2] * z + m[part, 2, 3]
+    if part == patch.part and patch.heights[0] < ly < patch.heights[1]:
+        facing = nx * patch.facing[0] + nz * patch.facing[2]
+        if facing > PATCH_EDGE:
+            middle = 0.5 * (patch.heights[0] + patch.heights[1])
+            rim = facing < 0.8 or abs(ly - middle) > 0.4 * (patch.heights[1] - patch.heights[0])
+            return (0.95, 0.95, 0.95) if rim else (patch.color[0], patch.color[1], patch.color[2])
+    w = _pattern(geometry.textures[part, 0], geometry.textures[part, 1], geometry.textures[part, 2], lx, ly, lz)
+    c = geometry.colors
+    return (
+        c[part, 0, 0] + w * (c[part, 1, 0] - c[part, 0, 0]),
+        c[part, 0, 1] + w * (c[part, 1, 1] - c[part, 0, 1]),
+        c[part, 0, 2] + w * (c[part, 1, 2] - c[part, 0, 2]),
+    )
+
+
+@inlined
+def _ground_color(around, x, z):
+    kind, frequency, angle = around.ground_texture[0], around.ground_texture[1], around.ground_texture[2]
+    cos, sin = math.cos(angle), math.sin(angle)
+    wave = math.sin(frequency * (cos * x + sin * z))
+    if kind == CHECKS:
+        wave *= math.sin(frequency * (cos * z - sin * x))
+    w = 0.5 + 0.5 * _soft_sign(6 * wave)
+    c = around.ground_colors
+    return c[0, 0] + w * (c[1, 0] - c[0, 0]), c[0, 1] + w * (c[1, 1] - c[0, 1]), c[0, 2] + w * (c[1, 2] - c[0, 2])
+
+
+@inlined
+def _dome_color(around, x, y, z):
+    cos_turn, sin_turn = math.cos(around.turn), math.sin(around.turn)
+    level = math.sqrt(x * x + z * z) + 1e-12
+    sin, cos = (x * cos_turn - z * sin_turn) / level, (z * cos_turn + x * sin_turn) / level
+    sin_fourfold = 4 * sin * cos * (1 - 2 * sin * sin)
+    hue = 2 * math.pi * (around.hue + 0.17 * sin)
+    rise = max(0.0, min(1.0, (y - around.ground) / around.dome_radius))
+    value = 0.68 + 0.1 * _soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
+    cos_hue, sin_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue), 0.2 * (1 - 0.5 * rise) * math.sin(hue)
+    # A third of a turn apart: red, green, blue.
+    half_root_3 = 0.8660254037844386
+    return value + cos_hue, value - 0.5 * cos_hue + half_root_3 * sin_hue, value - 0.5 * cos_hue - half_root_3 * sin_hue
+
+
+@inlined
+def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
+    """Colour, distance and what is seen (a part, GROUND or DOME) along a ray of unit direction inside the dome."""
+    t, seen, nx, ny, nz = hit_object(geometry, ox, oy, oz, dx, dy, dz)
+    b = ox * dx + oy * dy + oz * dz
+    dome = -b + math.sqrt(max(0.0, b * b - (ox * ox + oy * oy + oz * oz) + around.dome_radius**2))
+    if seen < 0:
+        t, seen = dome, DOME
+    if dy < 0 and (around.ground - oy) / dy < t:
+        t, seen, nx, ny, nz = (around.ground - oy) / dy, GROUND, 0.0, 1.0, 0.0
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    if seen == DOME:
+        red, green, blue = _dome_color(around, x, y, z)
+        return red, green, blue, t, seen
+    if seen == GROUND:
+        red, green, blue = _ground_color(around, x, z)
+    else:
+        red, green, blue = _object_color(geometry, patch, seen, x, y, z, nx, nz)
+    lx, ly, lz = around.light[0], around.light[1], around.light[2]
+    direct = max(0.0, nx * lx + ny * ly + nz * lz)
+    if direct > 0:
+        shift = 1e-4
+        shadow = hit_object(geometry, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
+        direct *= 0.35 if shadow[1] >= 0 else 1.0
+    # Light from the sky above keeps the unlit side from going flat.
+    level = around.ambient * (0.75 + 0.25 * ny) + (1 - around.ambient) * direct
+    return red * level, green * level, blue * level, t, seen
+
+
+@kernel
+def trace(geometry, around, patch, origins, directions):
+    """Colours [ray 3], distances [ray] and what is seen [ray] along rays of unit direction."""
+    colors, distances = np.empty_like(origins), np.empty(len(origins))
+    seen = np.empty(len(origins), dtype=np.int64)
+    for i in range(len(origins)):
+        ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        red, green, blue, distances[i], seen[i] = _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz)
+        colors[i, 0], colors[i, 1], colors[i, 2] = red, green, blue
+    return colors, distances, seen

@@ -1,0 +1,63 @@
+"""Pictures on their way from files to square tensors: decoding, the principal-point crop, resizing."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from completesplat.data.checks import require_file
+from completesplat.errors import DataError
+
+
+class Square(NamedTuple):
+    """A square part of an image, in pixels, with fractions."""
+
+    left: float
+    top: float
+    side: float
+
+
+def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -> Square:
+    """Largest square centred on the principal point (x, y) within an image of (height, width).
+
+    Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`).
+
+    Raises:
+        DataError: the principal point is not inside the image.
+    """
+    (x, y), (height, width) = center, image_size
+    half = min(x, y, width - x, height - y)
+    if not half > 0:
+        raise DataError(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
+    return Square(x - half, y - half, 2 * half)
+
+
+def read_square(
+    path: Path, image_size: tuple[int, int], square: Square, size: int, mode: str
+) -> UInt8[Tensor, "channel size size"]:
+    """A square part of an image file, resized to `size`.
+
+    Args:
+        image_size: (height, width) that the file must have.
+        mode: "RGB" (resized with Lanczos' filter) or "L" (bilinearly, for masks).
+
+    Raises:
+        DataError: a file that is missing, no image, or of another size.
+    """
+    try:
+        with Image.open(require_file(path)) as file:
+            image = file.convert(mode)
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise DataError(f"not a readable image: {path} ({error})") from None
+    if image.size != image_size[::-1]:
+        raise DataError(f"{path} has {image.height} x {image.width} pixels, its annotation says {image_size}")
+    box = (square.left, square.top, square.left + square.side, square.top + square.side)
+    resampling = Image.Resampling.LANCZOS if mode == "RGB" else Image.Resampling.BILINEAR
+    # Rounding may put a full-size box a hair outside, which Pillow refuses.
+    box = tuple(np.clip(box, 0, [image.width, image.height] * 2).tolist())
+    pixels = np.asarray(image.resize((size, size), resampling, box=box))
+    return torch.from_numpy(pixels.reshape(size, size, -1).transpose(2, 0, 1).copy())

@@ -1,0 +1,1 @@
+"""Latent diffusion: conditioning, denoiser, guidance and sampling. Knows latents only, no Gaussians."""

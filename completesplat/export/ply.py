@@ -1,0 +1,142 @@
+"""Gaussians as a `.ply` file in the layout of the original 3D Gaussian Splatting code.
+
+One `vertex` element, binary little endian, all float32, in this order: x y z, nx ny nz (zeros), f_dc_0..2 =
+(rgb - 0.5) / C0, opacity = logit of alpha, scale_0..2 = natural logarithm of sigma, rot_0..3 = (w, x, y, z).
+Metadata stands in comments of the header, because viewers stumble over further elements.
+
+The file keeps the coordinates as they are given; nothing is turned. In this project's camera frames +y points down
+(OpenCV), and the caller chooses the frame.
+"""
+
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.errors import PlyError
+from completesplat.export.atomic import atomic_path
+from completesplat.export.ply_header import Element, read_header
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.rotations import normalize_quaternion
+
+SH_C0 = 0.28209479177387814  # the constant of the DC harmonic, 1 / (2 sqrt(pi))
+SMALLEST_ALPHA = 1e-6
+AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
+MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
+WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+
+log = logging.getLogger(__name__)
+
+
+def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
+    """Write one unbatched set of Gaussians; the file appears whole or not at all.
+
+    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians with a value that is not finite (also
+    when it overflows float32) or with a scale that is not positive are left out, with a line in the log.
+    Reading the file with `read_ply` and writing it again gives the same bytes, except for clamped opacities.
+
+    Args:
+        path: the file.
+        gaussians: in any one frame; quaternions of any length.
+        comments: metadata for the header, a line each; characters outside ASCII are escaped.
+
+    Returns:
+        How many Gaussians the file holds.
+    """
+    table = _table(gaussians)
+    # The logarithm of a scale that is not positive is not finite either.
+    kept = table[gaussians.finite().cpu() & table.isfinite().all(-1)]
+    left_out = len(table) - len(kept)
+    if left_out:
+        log.warning("%s: left out %d of %d Gaussians (not finite, or no extent)", path, left_out, len(table))
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(kept), comments))
+        file.write(kept.numpy().astype("<f4").tobytes())
+    return len(kept)
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read a binary little-endian 3DGS `.ply`, of this project or another.
+
+    Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
+    become 0, as in the renderers of such files.
+
+    Raises:
+        PlyError: no such file, another format, a property missing, a size that differs from what the header
+            declares (checked before anything is allocated), or values that are not finite.
+    """
+    try:
+        if not Path(path).is_file():
+            raise PlyError("no such file")
+        with Path(path).open("rb") as file:
+            elements, data_start = read_header(file)
+            declared = data_start + sum(element.size for element in elements)
+            actual = os.fstat(file.fileno()).st_size
+            if actual != declared:
+                raise PlyError(f"the header declares {declared} bytes, the file has {actual}")
+            columns = _columns(file.read(actual - data_start), elements)
+    except OSError as error:
+        raise PlyError(f"{path}: {error.strerror or error}") from error
+    except PlyError as error:
+        raise PlyError(f"{path}: {error}") from None
+    gaussians = _gaussians(columns)
+    damaged = int((~gaussians.finite()).sum())
+    if damaged:
+        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
+    return gaussians
+
+
+def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
+    """One row for each Gaussian; computed in float64, so that the stored float32 is the nearest one."""
+    means, quaternions, scales, opacities, colors = (
+        t.detach().cpu().double()
+        for t in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
+    )
+    logits = opacities.clamp(SMALLEST_ALPHA, 1 - SMALLEST_ALPHA).logit()[:, None]
+    # A quaternion that is of unit length up to float32 rounding is kept: normalising it again would move its bits.
+    is_unit = (quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
+    rotations = torch.where(is_unit, quaternions, normalize_quaternion(quaternions))
+    rows = [means, torch.zeros_like(means), (colors - 0.5) / SH_C0, logits, scales.log(), rotations]
+    return torch.cat(rows, dim=-1).float()
+
+
+def _header(count: int, comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    # A line break inside a comment would start a header line of its own.
+    lines += [f"comment {' '.join(comment.split())}" for comment in (AXES_COMMENT, *comments)]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in WRITTEN), "end_header", ""]
+    return "\n".join(lines).encode("ascii", "backslashreplace")
+
+
+def _columns(data: bytes, elements: Sequence[Element]) -> dict[str, np.ndarray]:
+    """The required properties of the vertices, each as float64."""
+    offset = 0
+    for element in elements:
+        if element.name == "vertex":
+            missing = [name for name in REQUIRED if name not in (element.dtype.names or ())]
+            if missing:
+                raise PlyError(f"no property {', '.join(missing)}: not a 3D Gaussian Splatting file")
+            vertices = np.frombuffer(data, element.dtype, element.count, offset)
+            return {name: vertices[name].astype(np.float64) for name in REQUIRED}
+        offset += element.size
+    raise PlyError("no element vertex")
+
+
+def _gaussians(columns: dict[str, np.ndarray]) -> Gaussians:
+    def gather(names: Sequence[str]) -> Float[Tensor, "gaussian channel"]:
+        return torch.from_numpy(np.stack([columns[name] for name in names], axis=-1))
+
+    return Gaussians(
+        means=gather(MEANS).float(),
+        quaternions=gather(QUATERNIONS).float(),
+        scales=gather(SCALES).exp().float(),
+        opacities=gather(["opacity"])[:, 0].sigmoid().float(),
+        colors=(0.5 + SH_C0 * gather(COLORS)).clamp(min=0).float(),
+    )

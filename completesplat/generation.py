@@ -1,0 +1,217 @@
+"""From one image to complete scenes. No Lightning here: this is the part that other programs use.
+
+model = CompleteSplat.from_pretrained("outputs/demo/weights")
+scenes = model("photo.jpg", samples=4, seed=0)
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from completesplat.data.photograph import Photograph, read_photograph
+from completesplat.errors import WeightsError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+
+CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+TRUSTED_PACKAGES = ("completesplat.", "diffusers.")
+
+
+@dataclass(frozen=True)
+class Latents:
+    """Frozen encodings of a batch of images: a draw of the scaled latent, and the skip features."""
+
+    latent: Float[Tensor, "batch channel _ _"]
+    features: list[Tensor]
+
+
+class CompleteSplat(nn.Module):
+    """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
+
+    The four parts are given as configurations (`_target_` and arguments, as in `conf/`), so that they can be written
+    beside the weights and built again by `from_pretrained`.
+
+    Args:
+        autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
+        image_size: side of the square images, in pixels.
+    """
+
+    latent_scale: Tensor
+    fov_degrees: Tensor
+    depth_range: Tensor
+    up: Tensor
+
+    def __init__(
+        self,
+        autoreconstructor: Mapping[str, Any],
+        conditioning: Mapping[str, Any],
+        denoiser: Mapping[str, Any],
+        sampler: Mapping[str, Any],
+        image_size: int,
+    ) -> None:
+        super().__init__()
+        self.architecture = {
+            "autoreconstructor": dict(autoreconstructor),
+            "conditioning": dict(conditioning),
+            "denoiser": dict(denoiser),
+            "sampler": dict(sampler),
+            "image_size": image_size,
+        }
+        self.image_size = image_size
+        self.autoreconstructor = _build(autoreconstructor).requires_grad_(False)
+        self.conditioning = _build(conditioning)
+        self.denoiser = _build(denoiser)
+        self.sampler = _build(sampler)
+        # Measured on the training set by the training stage; the last three serve photographs of unknown cameras.
+        self.register_buffer("latent_scale", torch.tensor(1.0))
+        self.register_buffer("fov_degrees", torch.tensor(50.0))
+        self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
+        self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
+
+    def train(self, mode: bool = True) -> "CompleteSplat":
+        """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""
+        super().train(mode)
+        self.autoreconstructor.eval()
+        return self
+
+    @torch.no_grad()
+    def encode(self, images: Float[Tensor, "batch 3 height width"]) -> Latents:
+        """Draw each image's scaled latent from the frozen posterior ("we also sample latent codes", supplement)."""
+        posterior, features = self.autoreconstructor.encoder(images)
+        return Latents(posterior.sample() * self.latent_scale, features)
+
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: int = 1,
+        skip_weight: float = 1.0,
+        guidance_weight: float = 0.0,
+        steps: int | None = None,
+        seed: int = 0,
+    ) -> Gaussians:
+        """Draw `samples` scenes for each image, all in one batch.
+
+        Returns:
+            Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
+            The draw depends on the seed, the batch size and the number of samples.
+        """
+        conditioning = self.conditioning(images)
+        _, features = self.autoreconstructor.encoder(images)
+        latent_shape = (len(images) * samples, self.denoiser.latent_channels, *conditioning.shape[-2:])
+        noise = torch.randn(latent_shape, generator=torch.Generator().manual_seed(seed)).to(images.device)
+        repeated = conditioning.repeat_interleave(samples, dim=0)
+        latent = self.sampler(self.denoiser, noise, repeated, guidance_weight, steps) / self.latent_scale
+        features = [feature.repeat_interleave(samples, dim=0) for feature in features]
+        splatter_image = self.autoreconstructor.reconstructor(latent, features, skip_weight)
+        repeated_cameras = cameras.map(lambda tensor: tensor.repeat_interleave(samples, dim=0))
+        return splatter_image.gaussians(repeated_cameras, depth_range.repeat_interleave(samples, dim=0))
+
+    def forward(
+        self,
+        image: Photograph | Path | str,
+        samples: int = 1,
+        skip_weight: float = 1.0,
+        guidance_weight: float = 0.0,
+        steps: int | None = None,
+        seed: int = 0,
+    ) -> list[Gaussians]:
+        """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
+
+        Args:
+            image: a file, or a photograph read with `completesplat.data.photograph.read_photograph`.
+            samples: how many scenes to draw.
+            skip_weight: 1 is most faithful to the photograph, 0 most free (supplement, "Diverse Sampling").
+            guidance_weight: share of the unconditional prediction; more gives more diverse samples.
+            steps: denoising steps; the sampler's own number by default.
+            seed: the same seed and number of samples give the same scenes.
+
+        Raises:
+            ImageError: the file is not a readable image.
+        """
+        photograph = image if isinstance(image, Photograph) else self.read(image)
+        device = self.latent_scale.device
+        scenes = self.eval().generate(
+            photograph.image[None].to(device),
+            self.camera(photograph)[None],
+            self.depth_range[None],
+            samples,
+            skip_weight,
+            guidance_weight,
+            steps,
+            seed,
+        )
+        return [scenes[i] for i in range(samples)]
+
+    def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
+        """Read a photograph at the model's size; an unknown field of view is taken to be the training set's."""
+        return read_photograph(Path(path), self.image_size, fov_degrees, self.fov_degrees.item())
+
+    def camera(self, photograph: Photograph) -> Cameras:
+        """The camera that took a photograph, at the origin of the world."""
+        device = self.latent_scale.device
+        intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(device)
+        return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
+
+    def save_pretrained(self, path: Path | str) -> None:
+        """Write `config.json` and `model.safetensors` into a folder."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        save_file({key: value.contiguous().cpu() for key, value in self.state_dict().items()}, folder / WEIGHTS_FILE)
+        (folder / CONFIG_FILE).write_text(json.dumps(self.architecture, indent=2) + "\n")
+
+    @classmethod
+    def from_pretrained(cls, path: Path | str) -> "CompleteSplat":
+        """Build the model that `save_pretrained` wrote, in evaluation mode on the CPU.
+
+        Raises:
+            WeightsError: files are missing, unreadable, or do not belong together.
+        """
+        folder = Path(path)
+        for name in (CONFIG_FILE, WEIGHTS_FILE):
+            if not (folder / name).is_file():
+                raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
+        try:
+            model = cls(**json.loads((folder / CONFIG_FILE).read_text()))
+            model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+        except WeightsError:
+            raise
+        except Exception as error:
+            reason = str(error).strip().splitlines()
+            raise WeightsError(
+                f"{folder}: cannot be loaded: {reason[0] if reason else type(error).__name__}"
+            ) from error
+        return model.eval()
+
+
+def _build(config: Mapping[str, Any]) -> Any:
+    """Instantiate a part, from this package and diffusers only: a config that comes with weights is not trusted."""
+    from hydra.utils import instantiate
+
+    _check_targets(config)
+    return instantiate(dict(config), _convert_="all")
+
+
+def _check_targets(config: Any) -> None:
+    from hydra.utils import get_object
+
+    if isinstance(config, Mapping):
+        for key, value in config.items():
+            if key == "_target_":
+                # The path is checked before it is imported, and the object after: a path can lead out of a package.
+                trusted = str(value).startswith(TRUSTED_PACKAGES)
+                if not trusted or not f"{get_object(value).__module__}.".startswith(TRUSTED_PACKAGES):
+                    raise WeightsError(f"the configuration names {value}, which is no part of a model")
+            _check_targets(value)
+    elif isinstance(config, list | tuple):
+        for value in config:
+            _check_targets(value)

@@ -1,0 +1,39 @@
+"""Image metrics, one value per image, by torchmetrics."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+PSNR_LIMIT = 100.0
+"""Identical images have an infinite PSNR; reported values stop here (dB), so that averages stay finite."""
+
+
+def psnr(
+    predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
+) -> Float[Tensor, " image"]:
+    """Peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
+    from torchmetrics.functional.image import peak_signal_noise_ratio
+
+    values = peak_signal_noise_ratio(predicted, true, data_range=1.0, reduction="none", dim=(1, 2, 3))
+    return values.clamp(max=PSNR_LIMIT)
+
+
+def ssim(
+    predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
+) -> Float[Tensor, " image"]:
+    """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1]."""
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    values = structural_similarity_index_measure(predicted, true, data_range=1.0, reduction="none")
+    assert isinstance(values, Tensor)
+    return values
+
+
+def object_only(
+    images: Float[Tensor, "*batch 3 height width"], masks: Float[Tensor, "*batch 1 height width"]
+) -> Float[Tensor, "*batch 3 height width"]:
+    """The image with a black background, by the true mask binarised at 0.5 (supplement, "Objects only").
+
+    The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.
+    """
+    return torch.where(masks > 0.5, images, torch.zeros_like(images))

@@ -1,0 +1,79 @@
+"""How the kernels are compiled by numba, and where the machine code is kept."""
+
+import hashlib
+import inspect
+import logging
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba import config as numba_config
+
+logger = logging.getLogger(__name__)
+
+# Neither "nnan" nor "ninf": with them the optimiser may remove the tests for values that are not finite.
+# error_model="numpy" is needed for speed: Python's error for a division by zero stops vectorisation.
+OPTIONS: dict[str, Any] = {
+    "fastmath": {"contract", "nsz", "arcp", "reassoc", "afn"},
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+}
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile an entry point on its first call; later processes load it from the cache."""
+    function = _original(function)
+    directory = _cache_directory()
+    if directory is None:
+        return numba.njit(**OPTIONS)(function)
+    with _numba_cache_in(directory):
+        return numba.njit(cache=True, **OPTIONS)(function)
+
+
+def helper(function: Callable) -> Callable:
+    """A part of a kernel that is always inlined."""
+    return numba.njit(forceinline=True, **OPTIONS)(_original(function))
+
+
+def _original(function: Callable) -> Callable:
+    """The function under the wrappers of a type checker, which numba could not compile."""
+    return inspect.unwrap(function)
+
+
+@cache
+def _cache_directory() -> Path | None:
+    """The first writable folder: $NUMBA_CACHE_DIR, beside the sources, then the user's cache; None if there is none.
+
+    numba invalidates a cached function when its own file changes, but not when a helper in another file does.
+    So the folder's name carries a digest of all kernel sources.
+    """
+    here = Path(__file__).parent
+    user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "completesplat"
+    bases = [Path(numba_config.CACHE_DIR)] if numba_config.CACHE_DIR else [here / "__pycache__", user_cache]
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(here.glob("*.py")))).hexdigest()
+    for base in bases:
+        folder = base / f"kernels-{digest[:12]}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        return folder
+    logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
+    return None
+
+
+@contextmanager
+def _numba_cache_in(directory: Path) -> Iterator[None]:
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(directory)
+    try:
+        yield
+    finally:
+        numba_config.CACHE_DIR = before

@@ -1,0 +1,175 @@
+"""The kernels in their order, over all scenes and views of a batch, on several threads."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from completesplat.rasterizers.kernels import layout
+from completesplat.rasterizers.kernels.blocks import WORD_BITS
+from completesplat.rasterizers.kernels.buffers import Buffers
+from completesplat.rasterizers.kernels.composite import STATE_VECTORS, composite
+from completesplat.rasterizers.kernels.composite_backward import STATE_VECTORS as BACKWARD_STATE_VECTORS
+from completesplat.rasterizers.kernels.composite_backward import composite_backward
+from completesplat.rasterizers.kernels.project import prepare, project
+from completesplat.rasterizers.kernels.project_backward import project_backward
+from completesplat.rasterizers.kernels.simd import LANES
+from completesplat.rasterizers.kernels.threads import parallel
+from completesplat.rasterizers.protocol import RenderingConstants
+
+# A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
+# sums over bands depend on where the bands end, and results must not depend on the number of threads.
+FEWEST_TASKS = 8
+VIEWS_AT_ONCE = 8  # without gradients, where the projected Gaussians are not kept
+CHUNK = 2048  # Gaussians to a task of the projection's backward pass
+
+
+class Parameters(NamedTuple):
+    """Arrays [batch gaussian ...] of a `Gaussians`, or the gradients with respect to them; float32, contiguous."""
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+
+class Images(NamedTuple):
+    """Arrays [batch view channel height width] of a `Rendering`, or the gradients with respect to them."""
+
+    color: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+
+    def view(self, batch: int, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The three images of one view, as the kernels take them: [3 height width], [height width] twice."""
+        return self.color[batch, view], self.depth[batch, view, 0], self.alpha[batch, view, 0]
+
+
+class Drawing:
+    """A batch of scenes in all its views: drawn once, and taken back through the chain rule if need be.
+
+    Args:
+        parameters: of the Gaussians.
+        cameras: [batch view 20], see `layout`.
+        image_size: height and width in pixels.
+        constants: of the rendering.
+        keep: whether `backward` will be called.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        cameras: np.ndarray,
+        image_size: tuple[int, int],
+        constants: RenderingConstants,
+        keep: bool,
+    ) -> None:
+        self.parameters, self.cameras, self.constants = parameters, cameras, constants
+        self.height, self.width = image_size
+        self.scenes, self.views = cameras.shape[:2]
+        self.count = parameters.means.shape[1]
+        # Alphas below 2^-120 count as zero in any case: float32 cannot hold much smaller ones.
+        self.log2_min_alpha = math.log2(max(constants.min_alpha, 2.0**-120))
+        self.thresholds = (
+            np.float32(constants.max_alpha),
+            np.float32(self.log2_min_alpha),
+            np.float32(constants.min_transmittance),
+        )
+        self.buffers = Buffers()
+        self.prepared = self.buffers.empty((self.scenes, self.count, layout.PREPARED_WIDTH))
+        self.held = self.scenes * self.views if keep else min(self.scenes * self.views, VIEWS_AT_ONCE)
+        self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
+        self.visible = self.buffers.empty((self.held, self.count), np.uint8)
+        self.visible_counts = np.zeros(self.held, np.int64)
+        self.bands = self._bands()
+
+    def _bands(self) -> list[tuple[int, int]]:
+        """First and end block row of each band of a view."""
+        rows = -(-self.height // layout.BLOCK)
+        count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
+        return [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
+
+    def draw(self) -> Images:
+        """Project and composite every view."""
+        shape = (self.scenes, self.views)
+        images = Images(
+            *(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1))
+        )
+        parallel(self._prepare, self.scenes)
+        for start in range(0, self.scenes * self.views, self.held or 1):
+            number = min(self.held, self.scenes * self.views - start)
+            parallel(lambda slot, start=start: self._project(start + slot, slot), number)
+            parallel(lambda task, start=start: self._composite(start, task, images), number * len(self.bands))
+        return images
+
+    def backward(self, images: Images, gradients: Images) -> Parameters:
+        """Gradients with respect to the parameters, given those with respect to the images that `draw` returned."""
+        buffers = Buffers()
+        bands, views = len(self.bands), self.scenes * self.views
+        sums = buffers.empty((self.scenes, self.views, bands, self.count, layout.GRADIENT_WIDTH))
+        parallel(lambda task: self._composite_backward(task, images, gradients, sums), views * bands)
+        result = Parameters(*(np.empty_like(x) for x in self.parameters))
+        chunks = -(-self.count // CHUNK)
+        parallel(lambda task: self._project_backward(*divmod(task, chunks), sums, result), self.scenes * chunks)
+        return result
+
+    def _prepare(self, scene: int) -> None:
+        prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
+
+    def _project(self, view: int, slot: int) -> None:
+        buffers = Buffers()
+        scene, camera = divmod(view, self.views)
+        self.visible_counts[slot] = project(
+            self.parameters.means[scene],
+            self.parameters.colors[scene],
+            self.prepared[scene],
+            self.cameras[scene, camera],
+            self.height,
+            self.width,
+            float(self.constants.blur),
+            float(self.constants.near_plane),
+            buffers.empty((self.count, layout.RECORD_WIDTH)),
+            buffers.empty((2, self.count), np.uint32),
+            buffers.empty((2, self.count), np.int32),
+            self.records[slot],
+            self.visible[slot],
+        )
+
+    def _composite(self, start: int, task: int, images: Images) -> None:
+        slot, band = divmod(task, len(self.bands))
+        self._run(composite, STATE_VECTORS, slot, band, images.view(*divmod(start + slot, self.views)))
+
+    def _composite_backward(self, task: int, images: Images, gradients: Images, sums: np.ndarray) -> None:
+        slot, band = divmod(task, len(self.bands))
+        scene, view = divmod(slot, self.views)
+        arrays = (*images.view(scene, view), *gradients.view(scene, view), sums[scene, view, band])
+        self._run(composite_backward, BACKWARD_STATE_VECTORS, slot, band, arrays)
+
+    def _run(self, kernel, state_vectors: int, slot: int, band: int, arrays: tuple[np.ndarray, ...]) -> None:
+        buffers = Buffers()
+        first, end = self.bands[band]
+        columns = -(-self.width // layout.BLOCK)
+        state = buffers.empty(((end - first) * columns * state_vectors * LANES,))
+        open_words = buffers.empty((end - first, -(-columns // WORD_BITS)), np.uint64)
+        spans = buffers.empty((2 * (end - first + LANES),))
+        count = self.visible_counts[slot]
+        kernel(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
+
+    def _project_backward(self, scene: int, chunk: int, sums: np.ndarray, result: Parameters) -> None:
+        views = slice(scene * self.views, (scene + 1) * self.views)
+        means, quaternions, scales, opacities, _ = (x[scene] for x in self.parameters)
+        project_backward(
+            means,
+            quaternions,
+            scales,
+            opacities,
+            self.prepared[scene],
+            self.cameras[scene],
+            float(self.constants.blur),
+            self.visible[views],
+            sums[scene],
+            chunk * CHUNK,
+            min((chunk + 1) * CHUNK, self.count),
+            *(x[scene] for x in result),
+        )

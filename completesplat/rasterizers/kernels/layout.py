@@ -1,0 +1,46 @@
+"""Columns of the arrays that travel between kernels.
+
+prepared   [gaussian 12] float32: what does not depend on the view
+records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
+gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's own row
+camera     [20] float64
+
+With d = pixel - centre, the exponent of a Gaussian is sigma = ln(2) * (u^2 + v^2), where u = U * (d_x - SHEAR * d_y)
+and v = V * d_y (the Cholesky factors of the inverse covariance): a sum of squares, which cannot turn negative by
+rounding, and whose row bounds follow directly. Alpha is then 2^(LOG2_OPACITY - u^2 - v^2).
+"""
+
+# prepared
+ROOT = 0  # 9 columns, row-major: R(quaternion) diag(scales), whose square is the covariance
+LOG2_OPACITY_PREPARED = 9
+REACH = 10  # the largest u^2 + v^2 at which alpha is not below min_alpha; negative if the Gaussian is left out
+PREPARED_WIDTH = 12
+
+# records
+CENTER_X, CENTER_Y, U, SHEAR, V, LOG2_OPACITY = 0, 1, 2, 3, 4, 5
+RED, GREEN, BLUE, DEPTH = 6, 7, 8, 9
+INVERSE_U = 10
+RIGHTMOST_Y = 11  # d_y of the ellipse's right-most point; its left-most is at minus this
+EXTENT_Y = 12  # half the ellipse's height
+ROWS = 13  # as int32: first block row, and the last one shifted up by 16 bits
+INDEX = 14  # as int32: the Gaussian's row in the scene
+RECORD_WIDTH = 16
+
+# gradients
+SUM_COLOR = 0  # 3 columns; the weights' sums against the gradients of the three colour images
+SUM_DEPTH = 3
+SUM_S = 4  # s is -dL/dsigma at a pixel
+SUM_SU, SUM_SV, SUM_SUU, SUM_SUV, SUM_SVV = 5, 6, 7, 8, 9
+REACHED = 10  # 1 if any pixel was reached; the other columns are undefined where this is 0
+GRADIENT_WIDTH = 16
+
+# camera
+ROTATION = 0  # 9 columns, row-major
+TRANSLATION = 9
+FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y = 12, 13, 14, 15
+MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # between which x/z and y/z enter the Jacobian
+CAMERA_WIDTH = 20
+
+# images are worked on in blocks of 4 x 4 pixels, one SIMD lane each, row-major
+BLOCK = 4
+BLOCK_SHIFT = 2

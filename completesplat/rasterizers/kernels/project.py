@@ -1,0 +1,153 @@
+"""Scene parameters to the visible Gaussians of one view, packed in depth order."""
+
+import math
+
+import numpy as np
+
+from completesplat.rasterizers.kernels import layout
+from completesplat.rasterizers.kernels.compilation import helper, kernel
+from completesplat.rasterizers.kernels.projection import (
+    LN2,
+    ONE,
+    camera_point,
+    covariance_2d,
+    image_jacobian,
+    nine,
+    rotation_matrix,
+    row_times_matrix,
+    unit_quaternion,
+)
+from completesplat.rasterizers.kernels.simd import load, store
+
+Array = np.ndarray
+
+HALF = np.float64(0.5)
+LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
+# Blocks are chosen for alphas down to 2^-SLACK of the threshold (about 1e-4 relative): rounding in this choice must
+# not lose a pixel. What counts is the test at the pixel itself.
+SLACK = np.float64(1e-4)
+# Ellipses larger than this are left out: the square of their extent in px has to fit in float32.
+LARGEST_EXTENT = np.float64(1e18)
+
+RADIX_BITS = 11
+BUCKETS = 1 << RADIX_BITS
+PASSES = 3  # of 11 bits: enough for the 31 bits of a positive float32
+
+
+@helper
+def all_finite(row):
+    for value in row.flat:
+        if not abs(value) <= LARGEST_FLOAT32:
+            return False
+    return True
+
+
+@kernel
+def prepare(
+    means: Array, quaternions: Array, scales: Array, opacities: Array, colors: Array, log2_min_alpha: float,
+    prepared: Array,
+) -> None:  # fmt: skip
+    """Fill `prepared`; Gaussians with a value that is not finite, or too transparent ever to be seen, are marked."""
+    for i in range(means.shape[0]):
+        finite = all_finite(means[i]) and all_finite(quaternions[i]) and all_finite(scales[i]) and all_finite(colors[i])
+        if not (finite and opacities[i] > 0 and opacities[i] <= LARGEST_FLOAT32):
+            prepared[i, layout.REACH] = -1
+            continue
+        w, x, y, z, _ = unit_quaternion(quaternions, i)
+        rotation = rotation_matrix(w, x, y, z)
+        for entry in range(9):
+            prepared[i, layout.ROOT + entry] = rotation[entry] * scales[i, entry % 3]
+        log2_opacity = math.log2(np.float64(opacities[i]))
+        prepared[i, layout.LOG2_OPACITY_PREPARED] = log2_opacity
+        visible = log2_opacity >= log2_min_alpha
+        prepared[i, layout.REACH] = log2_opacity - log2_min_alpha + SLACK if visible else -ONE
+
+
+@kernel
+def project(
+    means: Array, colors: Array, prepared: Array, camera: Array, height: int, width: int, blur: float,
+    near_plane: float, unsorted: Array, keys: Array, order: Array, records: Array, visible: Array,
+) -> int:  # fmt: skip
+    """Project, cull and sort the Gaussians of one scene for one camera.
+
+    Args:
+        unsorted: scratch like `records`.
+        keys, order: scratch [2 gaussian], uint32 and int32.
+        records: receives the visible Gaussians, front to back.
+        visible: [gaussian] uint8, receives 1 for these.
+
+    Returns:
+        How many are visible.
+    """
+    count = 0
+    rotation = nine(camera, layout.ROTATION)
+    integers = unsorted.view(np.int32)
+    for i in range(means.shape[0]):
+        visible[i] = 0
+        reach = np.float64(prepared[i, layout.REACH])
+        if not reach > 0:
+            continue
+        x, y, z = camera_point(camera, rotation, means, i)
+        if not (z > near_plane and z <= LARGEST_FLOAT32):
+            continue
+        inverse_z = ONE / z
+        slope_x, slope_y = x * inverse_z, y * inverse_z
+        center_x = camera[layout.FOCAL_X] * slope_x + camera[layout.PRINCIPAL_X]
+        center_y = camera[layout.FOCAL_Y] * slope_y + camera[layout.PRINCIPAL_Y]
+        row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
+        root = nine(prepared[i], layout.ROOT)
+        xx, xy, yy, determinant = covariance_2d(row_times_matrix(row_x, root), row_times_matrix(row_y, root), blur)
+        # sigma = ln(2) * reach is an ellipse with these half extents.
+        extent_x, extent_y = math.sqrt(2 * LN2 * reach * xx), math.sqrt(2 * LN2 * reach * yy)
+        top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
+        # Written so that a NaN culls as well.
+        inside = center_x + extent_x >= HALF and center_x - extent_x <= width - HALF and top < bottom + ONE
+        if not (inside and extent_x <= LARGEST_EXTENT and extent_y <= LARGEST_EXTENT):
+            continue
+        inverse_yy = ONE / yy
+        inverse_u = math.sqrt(2 * LN2 * determinant * inverse_yy)
+        unsorted[count, layout.CENTER_X], unsorted[count, layout.CENTER_Y] = center_x, center_y
+        unsorted[count, layout.U], unsorted[count, layout.INVERSE_U] = ONE / inverse_u, inverse_u
+        unsorted[count, layout.SHEAR] = xy * inverse_yy
+        unsorted[count, layout.V] = math.sqrt(reach) / extent_y
+        unsorted[count, layout.LOG2_OPACITY] = prepared[i, layout.LOG2_OPACITY_PREPARED]
+        for channel in range(3):
+            unsorted[count, layout.RED + channel] = colors[i, channel]
+        unsorted[count, layout.DEPTH] = z
+        unsorted[count, layout.RIGHTMOST_Y] = xy / xx * extent_x
+        unsorted[count, layout.EXTENT_Y] = extent_y
+        integers[count, layout.ROWS] = (int(top) >> layout.BLOCK_SHIFT) | (int(bottom) >> layout.BLOCK_SHIFT << 16)
+        integers[count, layout.INDEX] = i
+        keys[0, count] = np.float32(z).view(np.uint32)
+        visible[i] = 1
+        count += 1
+    radix_sort(keys, order, count)
+    unsorted_flat, records_flat = unsorted.reshape(-1), records.reshape(-1)
+    for j in range(count):
+        source = np.int64(order[PASSES % 2, j]) * layout.RECORD_WIDTH
+        store(records_flat, j * layout.RECORD_WIDTH, load(unsorted_flat, source))
+    return count
+
+
+@helper
+def radix_sort(keys, order, count):
+    """Stable sort of keys[0, :count] (bits of positive floats sort like integers); order[PASSES % 2] is the result."""
+    starts = np.zeros((PASSES, BUCKETS), np.int32)
+    for i in range(count):
+        order[0, i] = i
+        for digit in range(PASSES):
+            starts[digit, (keys[0, i] >> np.uint32(RADIX_BITS * digit)) & np.uint32(BUCKETS - 1)] += 1
+    for digit in range(PASSES):
+        total = 0
+        for bucket in range(BUCKETS):
+            size = starts[digit, bucket]
+            starts[digit, bucket] = total
+            total += size
+        source, target = digit % 2, 1 - digit % 2
+        for i in range(count):
+            key = keys[source, i]
+            bucket = (key >> np.uint32(RADIX_BITS * digit)) & np.uint32(BUCKETS - 1)
+            position = starts[digit, bucket]
+            starts[digit, bucket] = position + 1
+            keys[target, position] = key
+            order[target, position] = order[source, i]

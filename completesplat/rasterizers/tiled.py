@@ -1,0 +1,101 @@
+"""The fast CPU backend: compiled kernels with a hand-written backward pass, float32."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers.kernels import layout
+from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
+from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+
+SMALLEST_BLUR = 1e-5  # px^2; it keeps the reference's clamp on the determinant (1e-10) out of reach
+
+
+class TiledRasterizer:
+    """The same function as `ReferenceRasterizer`, for float32 tensors in main memory, hundreds of times faster.
+
+    Gradients reach the parameters of the Gaussians, not the cameras. Results do not depend on the number of threads
+    (`torch.set_num_threads`). The kernels are compiled on first use, which takes some seconds once per machine.
+
+    Raises:
+        CompleteSplatError: constants that it cannot honour; on a call, tensors of another dtype or device, or cameras
+            that require a gradient.
+    """
+
+    def __init__(self, constants: RenderingConstants | None = None) -> None:
+        self.constants = constants or RenderingConstants()
+        if not self.constants.blur >= SMALLEST_BLUR:
+            raise CompleteSplatError(f"the tiled rasterizer needs a blur of at least {SMALLEST_BLUR} px^2")
+        if not (self.constants.near_plane >= 0 and self.constants.min_transmittance >= 0):
+            raise CompleteSplatError("the tiled rasterizer needs near_plane and min_transmittance of at least 0")
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Render scenes [batch] from cameras [batch view]."""
+        _check(gaussians, cameras)
+        parameters = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
+        packed = pack_cameras(cameras, self.constants.frustum_margin)
+        return Rendering(*_Rasterize.apply(*parameters, packed, cameras.image_size, self.constants))
+
+
+def _check(gaussians: Gaussians, cameras: Cameras) -> None:
+    tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            found = f"{name} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
+            raise CompleteSplatError(f"the tiled rasterizer takes float32 tensors on the CPU, but {found}")
+    if torch.is_grad_enabled() and (cameras.world_to_camera.requires_grad or cameras.intrinsics.requires_grad):
+        raise CompleteSplatError(
+            "the tiled rasterizer has no gradient with respect to cameras: use the reference rasterizer for this"
+        )
+
+
+def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
+    """Cameras as the kernels take them, [batch view 20] float64 (see `kernels/layout.py`)."""
+    matrices = cameras.world_to_camera.detach().double().numpy()
+    intrinsics = cameras.intrinsics.detach().double().numpy()
+    packed = np.empty((*matrices.shape[:2], layout.CAMERA_WIDTH))
+    packed[..., layout.ROTATION : layout.ROTATION + 9] = matrices[..., :3, :3].reshape(*matrices.shape[:2], 9)
+    packed[..., layout.TRANSLATION : layout.TRANSLATION + 3] = matrices[..., :3, 3]
+    height, width = cameras.image_size
+    for axis, extent in ((0, width), (1, height)):
+        focal, principal = intrinsics[..., axis, axis], intrinsics[..., axis, 2]
+        beyond = frustum_margin * 0.5 * extent / focal
+        packed[..., layout.FOCAL_X + axis] = focal
+        packed[..., layout.PRINCIPAL_X + axis] = principal
+        packed[..., layout.MIN_SLOPE_X + 2 * axis] = -principal / focal - beyond
+        packed[..., layout.MAX_SLOPE_X + 2 * axis] = (extent - principal) / focal + beyond
+    return packed
+
+
+class _Rasterize(torch.autograd.Function):
+    """(means, quaternions, scales, opacities, colors, packed cameras, image size, constants) to three images."""
+
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        tensors = [tensor.detach().contiguous() for tensor in arguments[:5]]
+        drawing = Drawing(_arrays(Parameters, tensors), *arguments[5:], keep=any(ctx.needs_input_grad))
+        images = tuple(torch.from_numpy(image) for image in drawing.draw())
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*arguments[:5], *images)
+        ctx.drawing = drawing
+        return images
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        images = ctx.saved_tensors[5:]
+        given = [
+            torch.zeros_like(image) if gradient is None else gradient.contiguous()
+            for image, gradient in zip(images, image_gradients, strict=True)
+        ]
+        gradients = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, given))
+        return *(torch.from_numpy(gradient) for gradient in gradients), None, None, None
+
+
+def _arrays(kind: Any, tensors: Any) -> Any:
+    return kind(*(tensor.detach().numpy() for tensor in tensors))

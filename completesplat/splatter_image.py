@@ -1,0 +1,147 @@
+"""Splatter Images: M layers of 15 raw values a pixel, and the activations that turn them into Gaussians.
+
+All activations of the project live here (paper, supplement A.1; values and initialisation of Szymanowicz et al.,
+"Splatter Image", `gaussian_predictor.py`). Per layer and pixel, in this order: depth 1, offset 3, opacity 1,
+scale 3, rotation 4, colour 3. Gaussians are in the reference camera's frame, ordered by layer, row, column.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pixel_rays
+from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.tensors import TensorDataclass
+
+SH_C0 = 0.28209479177387814
+"""The zeroth spherical harmonic, 1 / (2 sqrt(pi)): colours are predicted as its coefficient."""
+
+
+class Group(NamedTuple):
+    """Raw values that belong together: their number, and gain and bias of the head that predicts them."""
+
+    channels: int
+    gain: float
+    bias: float
+
+
+GROUPS = {
+    "depth": Group(1, 1.0, 0.0),
+    "offset": Group(3, 0.1, 0.0),
+    "opacity": Group(1, 1.0, -2.0),
+    "scale": Group(3, 0.003, math.log(0.02)),
+    "rotation": Group(4, 1.0, 0.0),
+    "color": Group(3, 5.0, 0.0),
+}
+CHANNELS = sum(group.channels for group in GROUPS.values())
+
+
+def independent_depths(
+    raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
+) -> Float[Tensor, "*batch layer height width"]:
+    """z = near + (far - near) * sigmoid(raw) for every layer: the plain reading of the paper."""
+    return near + (far - near) * raw.sigmoid()
+
+
+def incremental_depths(
+    raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
+) -> Float[Tensor, "*batch layer height width"]:
+    """The first layer as `independent_depths`; each further one lies exp(raw) behind the last (Flash3D)."""
+    first = independent_depths(raw[..., :1, :, :], near, far)
+    steps = raw[..., 1:, :, :].clamp(-10, 6).exp()
+    return torch.cat([first, steps], dim=-3).cumsum(dim=-3)
+
+
+LAYER_DEPTHS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
+    "independent": independent_depths,
+    "incremental": incremental_depths,
+}
+
+
+@dataclass(frozen=True)
+class Parameterization:
+    """How raw values are read.
+
+    Attributes:
+        layers: M, Gaussians per pixel (2 in the paper).
+        layer_depths: relation between the depths of one pixel's layers, a key of `LAYER_DEPTHS`.
+        smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
+            (the paper does not state one; the clamp has no gradient outside, full gradient inside).
+    """
+
+    layers: int = 2
+    layer_depths: str = "independent"
+    smallest_scale: float = 1e-4
+    largest_scale: float = 2.0
+
+    @property
+    def channels(self) -> int:
+        """Channels of the network's output: M * 15."""
+        return self.layers * CHANNELS
+
+
+@dataclass(frozen=True)
+class SplatterImage(TensorDataclass):
+    """Raw network output for every layer and pixel of a reference image."""
+
+    raw: Float[Tensor, "*batch layer 15 height width"]
+    parameterization: Parameterization
+
+    def split(self) -> dict[str, Float[Tensor, "*batch layer channel height width"]]:
+        """The raw values by group, in the order of `GROUPS`."""
+        parts = self.raw.split([group.channels for group in GROUPS.values()], dim=-3)
+        return dict(zip(GROUPS, parts, strict=True))
+
+    def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> Gaussians:
+        """Activate the raw values and place each Gaussian on its pixel's ray (supplement A.1).
+
+        Args:
+            cameras: the reference cameras [*batch], of which only the intrinsics matter.
+            depth_range: near and far along the optical axis, in scene units.
+
+        Returns:
+            layers * height * width Gaussians in the reference cameras' frames.
+        """
+        parts, settings = self.split(), self.parameterization
+        near, far = (x[..., None, None, None] for x in depth_range.unbind(-1))
+        depth = LAYER_DEPTHS[settings.layer_depths](parts["depth"].squeeze(-3), near, far)
+        rays = rearrange(pixel_rays(cameras), "... height width xyz -> ... 1 xyz height width")
+        log_scale = parts["scale"].clamp(math.log(settings.smallest_scale), math.log(settings.largest_scale))
+
+        def flat(values: Tensor) -> Tensor:
+            return rearrange(values, "... layer channel height width -> ... (layer height width) channel")
+
+        return Gaussians(
+            means=flat(rays * depth.unsqueeze(-3) + parts["offset"]),
+            quaternions=normalize_quaternion(flat(parts["rotation"])),
+            scales=flat(log_scale.exp()),
+            opacities=flat(parts["opacity"].sigmoid()).squeeze(-1),
+            colors=flat((0.5 + SH_C0 * parts["color"]).clamp(min=0)),
+        )
+
+
+def from_channels(
+    output: Float[Tensor, "batch channel height width"], parameterization: Parameterization
+) -> SplatterImage:
+    """Read a network's output, whose channels are ordered by layer, then by group."""
+    return SplatterImage(output.unflatten(1, (parameterization.layers, CHANNELS)), parameterization)
+
+
+@torch.no_grad()
+def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None:
+    """Initialise a network's last convolution as Splatter Image does, group by group (xavier gain, constant bias)."""
+    assert head.bias is not None
+    row = 0
+    for _ in range(parameterization.layers):
+        for group in GROUPS.values():
+            rows = slice(row, row + group.channels)
+            nn.init.xavier_uniform_(head.weight[rows], gain=group.gain)
+            nn.init.constant_(head.bias[rows], group.bias)
+            row += group.channels

@@ -1,0 +1,42 @@
+"""Stage 1: a reconstruction model trained from posed images alone (paper, Section 3.2)."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.gaussians import Gaussians
+from completesplat.losses import Prediction, WeightedSum
+from completesplat.scene import SceneBatch
+from completesplat.training.scene_module import SceneModule
+
+
+class ReconstructionModule(SceneModule):
+    """Reconstruct, render the reference and all targets, compare (paper, Eq. 1).
+
+    Args:
+        model: images -> `Reconstruction`: the Variational AutoReconstructor or a baseline.
+        loss: weighted terms by name.
+        **rendering_and_optimization: see `SceneModule`.
+    """
+
+    def __init__(self, model: nn.Module, loss: WeightedSum, **rendering_and_optimization: Any) -> None:
+        super().__init__(**rendering_and_optimization)
+        self.model = model
+        self.loss = loss
+
+    def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
+        reconstruction = self.model(scenes.reference.images)
+        with torch.autocast(self.device.type, enabled=False):
+            gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+            prediction = Prediction(self.render(gaussians, scenes), reconstruction)
+            total, values = self.loss(prediction, scenes.all_views())
+        logged = {f"train/{name}": value for name, value in values.items()}
+        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        return total
+
+    def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Gaussians from the posterior's mode: nothing is drawn, so the seed has no effect."""
+        splatter_image = self.model(scenes.reference.images).splatter_image
+        return splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

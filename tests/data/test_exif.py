@@ -1,0 +1,126 @@
+import math
+import warnings
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps, TiffImagePlugin
+
+from completesplat.data.photograph import read_photograph
+from completesplat.errors import CompleteSplatError
+
+SIZE = 16
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif", "a.webp"])
+def test_exif_orientation(tmp_path, orientation, name):
+    upright = np.zeros((2, 3, 3), np.uint8)
+    upright[0] = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
+    upright[1] = [[255, 255, 255], [0, 0, 0], [255, 255, 0]]
+    upright = Image.fromarray(upright.repeat(32, 0).repeat(32, 1))
+    # The inverse of what the orientation asks for gives the stored picture (5 to 8 are wider than high when upright).
+    exif = Image.Exif()
+    exif[0x0112] = {6: 8, 8: 6}.get(orientation, orientation)
+    upright.info["exif"] = exif.tobytes()
+    stored = ImageOps.exif_transpose(upright)
+    exif[0x0112] = orientation
+    options = {"quality": 100, "subsampling": 0} if name == "a.jpg" else {"lossless": True} if name == "a.webp" else {}
+    stored.info.clear()
+    stored.save(tmp_path / name, exif=exif, **options)
+    got = read_photograph(tmp_path / name, 64).image.permute(1, 2, 0).numpy()
+    difference = np.abs(got - np.float32(upright)[:, 16:80] / 255)
+    # JPEG smears across an edge, never through a whole block of 8 px.
+    assert difference.max() == 0 if name != "a.jpg" else difference[4:28, 20:44].max() < 0.02
+
+
+def exif_of(**tags):
+    exif = Image.Exif()
+    exif[0x010F] = "maker"  # Pillow writes no record that holds nothing but the inner one
+    inner = exif.get_ifd(0x8769)
+    numbers = {
+        "equivalent": 0xA405,
+        "focal": 0x920A,
+        "resolution": 0xA20E,
+        "unit": 0xA210,
+        "width": 0xA002,
+        "height": 0xA003,
+    }
+    for name, value in tags.items():
+        inner[numbers[name]] = value
+    return exif
+
+
+def fov_of(tmp_path, exif, size=(60, 40), name="a.jpg", **options):
+    # Pillow does not store the inner record of an Exif object in a TIFF, but does so for a plain mapping.
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[0x8769] = dict(exif.get_ifd(0x8769))
+    options_for_tiff = {"tiffinfo": tags} if name == "a.tif" else {"exif": exif}
+    Image.new("RGB", size).save(tmp_path / name, **options_for_tiff)
+    return read_photograph(tmp_path / name, SIZE, **options)
+
+
+def degrees(millimetres, focal):
+    return math.degrees(2 * math.atan(millimetres / 2 / focal))
+
+
+@pytest.mark.parametrize("size", [(60, 40), (40, 60)])
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp"])
+def test_full_frame_focal_length_sees_24_mm_on_the_short_side_of_3_to_2(tmp_path, size, name):
+    photograph = fov_of(tmp_path, exif_of(equivalent=50), size, name)
+    assert photograph.fov_source == "exif"
+    assert photograph.fov_degrees == pytest.approx(degrees(24, 50))
+
+
+def test_the_field_of_view_is_that_of_the_square(tmp_path):
+    assert fov_of(tmp_path, exif_of(equivalent=28), (80, 80)).fov_degrees == pytest.approx(degrees(36, 28))
+    assert fov_of(tmp_path, exif_of(equivalent=28), (80, 60)).fov_degrees == pytest.approx(degrees(27, 28))
+
+
+def test_focal_length_with_the_resolution_of_the_sensor(tmp_path):
+    # 6000 x 4000 px on a sensor of 36 x 24 mm, stored at 1/100 of that size.
+    rational = TiffImagePlugin.IFDRational
+    sensor = {"focal": rational(35), "width": 6000, "height": 4000}
+    for unit, length in ((2, 25.4), (3, 10)):
+        exif = exif_of(resolution=rational(int(6000 / 36 * length * 1000), 1000), unit=unit, **sensor)
+        assert fov_of(tmp_path, exif).fov_degrees == pytest.approx(degrees(24, 35), rel=1e-4)
+    exif = exif_of(focal=rational(35), resolution=rational(60, 36), unit=4)
+    assert fov_of(tmp_path, exif).fov_degrees == pytest.approx(degrees(24, 35), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {},
+        {"equivalent": 0},
+        {"focal": TiffImagePlugin.IFDRational(4)},
+        {"focal": TiffImagePlugin.IFDRational(0, 0), "resolution": TiffImagePlugin.IFDRational(100)},
+        {"focal": TiffImagePlugin.IFDRational(4), "resolution": TiffImagePlugin.IFDRational(100), "unit": 1},
+        {"equivalent": 60_000},
+    ],
+)
+def test_without_a_usable_focal_length_the_default_stands(tmp_path, tags):
+    photograph = fov_of(tmp_path, exif_of(**tags), default_fov_degrees=61.0)
+    assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default")
+
+
+def test_a_given_field_of_view_comes_first(tmp_path):
+    photograph = fov_of(tmp_path, exif_of(equivalent=50), fov_degrees=33.0)
+    assert (photograph.fov_degrees, photograph.fov_source) == (33.0, "given")
+
+
+@pytest.mark.parametrize("fov", [0.0, -5.0, 180.0, float("nan")])
+def test_an_impossible_field_of_view_is_refused(tmp_path, fov):
+    with pytest.raises(CompleteSplatError, match="field of view"):
+        fov_of(tmp_path, exif_of(), fov_degrees=fov)
+
+
+def test_a_damaged_exif_record_is_none(tmp_path):
+    for record in (
+        b"Exif\0\0garbage",
+        b"Exif\0\0II*\0\xff\xff\xff\x7f",
+        b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50,
+    ):
+        Image.new("RGB", (SIZE, SIZE)).save(tmp_path / "a.jpg", exif=record)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert read_photograph(tmp_path / "a.jpg", SIZE).fov_source == "default"

@@ -1,0 +1,160 @@
+"""Toy objects on disk: determinism, layout, splits, and geometry that agrees between views."""
+
+import gzip
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+
+from completesplat.data.co3d_annotations import camera_from_viewpoint
+from completesplat.data.toy import write_objects
+from completesplat.data.toy.scene import PATCH_COLORS, draw_scene, render_frame
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import pixel_centers, project, unproject
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def annotations_of(root: Path) -> list[dict]:
+    return json.loads(gzip.decompress((root / "toy_objects" / "frame_annotations.jgz").read_bytes()))
+
+
+def read_depth(root: Path, annotation: dict) -> np.ndarray:
+    """As CO3D's `load_16big_png_depth` does it: the bits of a 16-bit picture are float16."""
+    with Image.open(root / annotation["depth"]["path"]) as png:
+        bits = np.frombuffer(np.array(png, dtype=np.uint16), dtype=np.float16)
+        return bits.astype(np.float32).reshape(png.size[::-1]) * annotation["depth"]["scale_adjustment"]
+
+
+def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
+    trees = {}
+    for name, seed, workers in (("one", 3, 1), ("two", 3, 2), ("other", 4, 1)):
+        write_objects(tmp_path / name, scenes=3, frames=2, size=16, seed=seed, workers=workers, progress=False)
+        trees[name] = files_of(tmp_path / name)
+    assert trees["one"] == trees["two"]
+    pictures = [path for path in trees["one"] if path.endswith("frame000001.jpg")]
+    assert len(pictures) == 3
+    assert not {trees["one"][path] for path in pictures} & set(trees["other"].values())
+
+
+def test_more_scenes_begin_with_the_same_scenes():
+    first, again = (draw_scene(np.random.default_rng([0, 5]), frames=3) for _ in range(2))
+    assert np.array_equal(render_frame(first, 1, 16)[0], render_frame(again, 1, 16)[0])
+
+
+def test_a_complete_set_is_kept_and_other_content_refused(tmp_path, capsys):
+    settings = {"scenes": 1, "frames": 2, "size": 8, "seed": 0, "workers": 1}
+    category = write_objects(tmp_path, **settings, progress=False)
+    before = {path: path.stat().st_mtime_ns for path in category.rglob("*")}
+    assert write_objects(tmp_path, **settings, progress=True) == category
+    assert "already" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in category.rglob("*")} == before
+    with pytest.raises(DataError, match="toy_objects"):
+        write_objects(tmp_path, **{**settings, "seed": 1}, progress=False)
+    with pytest.raises(DataError, match="frames"):
+        write_objects(tmp_path / "new", **{**settings, "frames": 1}, progress=False)
+
+
+def test_an_interrupted_run_is_made_anew(tmp_path):
+    (tmp_path / ".toy_objects.unfinished" / "00000_bear").mkdir(parents=True)
+    category = write_objects(tmp_path, scenes=1, frames=2, size=8, seed=0, workers=1, progress=False)
+    assert (category / "toy.json").is_file()
+    assert [path.name for path in tmp_path.iterdir()] == ["toy_objects"]
+
+
+def test_splits_share_no_sequence_and_list_every_frame(toy_root):
+    lists = json.loads((toy_root / "toy_objects" / "set_lists" / "set_lists_fewview_train.json").read_text())
+    names = {split: {name for name, _, _ in entries} for split, entries in lists.items()}
+    assert {split: len(members) for split, members in names.items()} == {"train": 2, "val": 1, "test": 1}
+    assert len(names["train"] | names["val"] | names["test"]) == 4
+    listed = {(name, number, path) for entries in lists.values() for name, number, path in entries}
+    annotated = {(a["sequence_name"], a["frame_number"], a["image"]["path"]) for a in annotations_of(toy_root)}
+    assert listed == annotated
+    assert all((toy_root / path).is_file() for _, _, path in listed)
+
+
+def test_depth_of_one_view_predicts_another_views_depth(toy_root):
+    """Points seen in frame 0 project into frame 1 at the depth that is stored there, unless something hides them."""
+    first, second = annotations_of(toy_root)[:2]
+    cameras = [camera_from_viewpoint(a["viewpoint"], a["image"]["size"]) for a in (first, second)]
+    depths = [torch.from_numpy(read_depth(toy_root, a)).double() for a in (first, second)]
+    pixels = pixel_centers(32, 32, dtype=torch.float64).flatten(0, 1)
+    points = unproject(cameras[0], pixels, depths[0].flatten())
+    seen_at, expected = project(cameras[1], points)
+    inside = (expected > 0) & (seen_at > 0.5).all(-1) & (seen_at < 31.5).all(-1)
+    stored = torch.nn.functional.grid_sample(
+        depths[1][None, None], seen_at[inside][None, None] / 16 - 1, align_corners=False
+    ).flatten()
+    error = stored / expected[inside] - 1
+    assert inside.sum() > 200
+    # A point may be hidden in the second view, but not float in front of it; interpolation blurs the outlines.
+    assert (error < 0.02).double().mean() > 0.95
+    assert (error.abs() < 0.02).double().mean() > 0.6
+
+
+def test_points_lie_on_the_object(toy_root):
+    """Where the mask is full, the nearest depth of the projected point cloud is the depth map's."""
+    annotation = annotations_of(toy_root)[0]
+    camera = camera_from_viewpoint(annotation["viewpoint"], annotation["image"]["size"])
+    depth, folder = read_depth(toy_root, annotation), toy_root / "toy_objects" / annotation["sequence_name"]
+    vertices = PlyData.read(str(folder / "pointcloud.ply"))["vertex"]
+    points = torch.from_numpy(np.stack([vertices[axis] for axis in "xyz"], axis=-1)).double()
+    pixels, along = project(camera, points)
+    column, row = pixels.floor().long().unbind(-1)
+    mask = np.asarray(Image.open(toy_root / annotation["mask"]["path"]))
+    assert (mask[row, column] > 0).mean() > 0.98
+    gap = along.numpy() - depth[row, column]
+    full = mask[row, column] == 255
+    assert (gap[full] > -0.1 * annotation["depth"]["scale_adjustment"]).mean() > 0.97
+    assert (np.abs(gap[full]) < 0.05 * annotation["depth"]["scale_adjustment"]).mean() > 0.3
+
+
+def test_masks_are_soft_at_the_outline_and_mass_is_their_sum(toy_root):
+    for annotation in annotations_of(toy_root):
+        mask = np.asarray(Image.open(toy_root / annotation["mask"]["path"])) / 255
+        assert mask.min() == 0
+        assert mask.max() == 1
+        assert ((mask > 0) & (mask < 1)).any()
+        assert annotation["mask"]["mass"] == pytest.approx(mask.sum(), abs=0.002 * mask.size)
+
+
+@pytest.mark.parametrize("index", range(12))
+def test_the_patch_is_hidden_from_the_first_frame_and_seen_from_another(index):
+    """The patch is found by rendering a scene twice, with two patch colours."""
+    scene = draw_scene(np.random.default_rng([1, index]), frames=12)
+    repainted = scene.patch._replace(color=1 - scene.patch.color)
+
+    def changed(frame: int) -> int:
+        other = render_frame(type(scene)(**{**vars(scene), "patch": repainted}), frame, 32)[0]
+        return int((np.abs(other - render_frame(scene, frame, 32)[0]).max(axis=-1) > 0.05).sum())
+
+    assert changed(0) == 0
+    assert max(changed(frame) for frame in (5, 6, 7)) > 10
+    assert scene.patch_color in PATCH_COLORS
+
+
+def test_all_sides_of_an_object_differ():
+    """From behind, an object is far from its front picture: more than a tenth of its pixels change strongly."""
+    for index in range(4):
+        scene = draw_scene(np.random.default_rng([2, index]), frames=4)
+        (front, mask, _), (back, _, _) = render_frame(scene, 0, 32), render_frame(scene, 2, 32)
+        assert (np.abs(front - back).max(axis=-1) > 0.25)[mask > 0.9].mean() > 0.1
+
+
+def test_both_families_and_all_patch_colors_occur():
+    scenes = [draw_scene(np.random.default_rng([0, index]), frames=2) for index in range(40)]
+    assert {scene.family for scene in scenes} == {"bear", "hydrant"}
+    assert {scene.patch_color for scene in scenes} == set(PATCH_COLORS)
+
+
+def test_the_hidden_attribute_is_recorded(toy_root):
+    folders = {annotation["sequence_name"] for annotation in annotations_of(toy_root)}
+    records = {name: json.loads((toy_root / "toy_objects" / name / "toy.json").read_text()) for name in folders}
+    assert all(name.endswith(record["family"]) for name, record in records.items())
+    assert all(record["patch_color"] in PATCH_COLORS for record in records.values())

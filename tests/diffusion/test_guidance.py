@@ -1,0 +1,46 @@
+import pytest
+import torch
+
+from completesplat.diffusion.guidance import guided_noise
+
+LATENT = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
+FEATURES = torch.randn(2, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+STEP = torch.tensor([5, 7])
+
+
+class Counting:
+    """A denoiser that depends on all of its inputs and counts its calls and samples."""
+
+    def __init__(self) -> None:
+        self.calls = self.samples = 0
+
+    def __call__(self, latent, timestep, conditioning):
+        self.calls, self.samples = self.calls + 1, self.samples + len(latent)
+        return latent * 2 + conditioning.sum(1, keepdim=True) + timestep.view(-1, 1, 1, 1)
+
+
+def conditional():
+    return Counting()(LATENT, STEP, FEATURES)
+
+
+def unconditional():
+    return Counting()(LATENT, STEP, torch.zeros_like(FEATURES))
+
+
+def test_weight_zero_is_the_conditional_prediction_in_one_call():
+    denoise = Counting()
+    torch.testing.assert_close(guided_noise(denoise, LATENT, STEP, FEATURES, 0.0), conditional())
+    assert (denoise.calls, denoise.samples) == (1, 2)
+
+
+def test_weight_one_is_the_unconditional_prediction_in_one_call():
+    denoise = Counting()
+    torch.testing.assert_close(guided_noise(denoise, LATENT, STEP, FEATURES, 1.0), unconditional())
+    assert (denoise.calls, denoise.samples) == (1, 2)
+
+
+@pytest.mark.parametrize("weight", [0.2, 0.5])
+def test_between_it_is_linear_and_the_customary_scale_is_one_minus_the_weight(weight):
+    guided = guided_noise(Counting(), LATENT, STEP, FEATURES, weight)
+    customary = unconditional() + (1 - weight) * (conditional() - unconditional())
+    torch.testing.assert_close(guided, customary)

@@ -1,0 +1,225 @@
+import dataclasses
+import re
+import time
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from completesplat.errors import PlyError
+from completesplat.export.ply import read_ply, write_ply
+from completesplat.gaussians import Gaussians, concatenate
+
+C0 = 0.5 / np.sqrt(np.pi)
+# The layout of the original code.
+NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+NAMES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def random_gaussians(count=500, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator, dtype=dtype)
+
+    return Gaussians(
+        means=rand(count, 3) * 8 - 4,
+        quaternions=rand(count, 4) * 2 - 1,
+        scales=10 ** (rand(count, 3) * 5 - 4),
+        opacities=rand(count) * 0.998 + 0.001,
+        colors=rand(count, 3),
+    )
+
+
+def with_line(data, old, new):
+    assert data.count(old) == 1
+    return data.replace(old, new)
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A good file of ten Gaussians, and its bytes."""
+    path = tmp_path / "good.ply"
+    write_ply(path, random_gaussians(10))
+    return path, path.read_bytes()
+
+
+def test_plyfile_reads_the_layout_and_the_stated_formulas(tmp_path):
+    gaussians = random_gaussians(dtype=torch.float64)
+    assert write_ply(tmp_path / "a.ply", gaussians) == 500
+    ply = PlyData.read(tmp_path / "a.ply")
+    vertex = ply["vertex"]
+    assert [element.name for element in ply.elements] == ["vertex"]
+    assert [p.name for p in vertex.properties] == NAMES
+    assert {p.val_dtype for p in vertex.properties} == {"f4"}
+    assert (ply.text, ply.byte_order) == (False, "<")
+    alpha = gaussians.opacities.numpy()
+    unit = gaussians.quaternions / gaussians.quaternions.norm(dim=-1, keepdim=True)
+    expected = {
+        "x": gaussians.means[:, 0].numpy(),
+        "z": gaussians.means[:, 2].numpy(),
+        "ny": np.zeros(500),
+        "f_dc_1": (gaussians.colors[:, 1].numpy() - 0.5) / C0,
+        "opacity": np.log(alpha) - np.log1p(-alpha),
+        "scale_2": np.log(gaussians.scales[:, 2].numpy()),
+        "rot_0": unit[:, 0].numpy(),
+        "rot_3": unit[:, 3].numpy(),
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(vertex[name], values.astype(np.float32), rtol=2e-7, atol=1e-7, err_msg=name)
+
+
+def test_write_read_write_gives_the_same_bytes(tmp_path):
+    edges = Gaussians(
+        means=torch.zeros(4, 3),
+        quaternions=torch.tensor([[0, 0, 0, 0], [2, 0, 0, 0], [1e-3, 1e-3, 0, 0], [-1, 1, -1, 1]]).float(),
+        scales=torch.tensor([[1, 0.99, 1.01], [1e-7, 1e-20, 2], [50, 1e6, 0.5], [1 / 3, 3, 2 / 3]]),
+        opacities=torch.tensor([0.5, 2e-6, 1 - 2e-6, 1 / 3]),
+        colors=torch.tensor([[0, 0.5, 1], [1e-9, 1e-7, 1e-3], [0.9999999, 1.5, 0.25], [0, 0, 0]]),
+    )
+    write_ply(tmp_path / "a.ply", concatenate([random_gaussians(20_000), edges]))
+    write_ply(tmp_path / "b.ply", read_ply(tmp_path / "a.ply"))
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+
+
+def test_reading_returns_what_was_written(tmp_path):
+    gaussians = random_gaussians()
+    write_ply(tmp_path / "a.ply", gaussians)
+    back = read_ply(tmp_path / "a.ply")
+    assert torch.equal(back.means, gaussians.means)
+    torch.testing.assert_close(back.scales, gaussians.scales, rtol=1e-6, atol=0)
+    torch.testing.assert_close(back.opacities, gaussians.opacities, rtol=1e-6, atol=0)
+    torch.testing.assert_close(back.colors, gaussians.colors, rtol=0, atol=1e-7)
+    torch.testing.assert_close(back.covariances(), gaussians.covariances(), rtol=1e-4, atol=1e-6)
+
+
+def test_opacities_of_0_and_1_are_clamped(tmp_path):
+    gaussians = dataclasses.replace(random_gaussians(2), opacities=torch.tensor([0.0, 1.0]))
+    write_ply(tmp_path / "a.ply", gaussians)
+    limit = np.log(1e-6 / (1 - 1e-6))
+    np.testing.assert_allclose(PlyData.read(tmp_path / "a.ply")["vertex"]["opacity"], [limit, -limit], rtol=1e-6)
+
+
+def test_comments_are_kept_one_a_line(tmp_path):
+    write_ply(tmp_path / "a.ply", random_gaussians(3), ["seed 7", "two\nend_header\nlines", "größe"])
+    ply = PlyData.read(tmp_path / "a.ply")
+    assert "+y down" in ply.comments[0]
+    assert ply.comments[1:] == ["seed 7", "two end_header lines", "gr\\xf6\\xdfe"]
+    assert read_ply(tmp_path / "a.ply").count == 3
+
+
+@pytest.mark.parametrize("field", ["means", "quaternions", "scales", "opacities", "colors"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_gaussians_that_are_not_finite_are_left_out(tmp_path, caplog, field, value):
+    good = random_gaussians(6)
+    damaged = getattr(good, field).clone()
+    damaged.view(6, -1)[2, 0] = value
+    assert write_ply(tmp_path / "a.ply", dataclasses.replace(good, **{field: damaged})) == 5
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, good.means[[0, 1, 3, 4, 5]])
+    assert "left out 1 of 6" in caplog.text
+
+
+def test_gaussians_without_extent_or_beyond_float32_are_left_out(tmp_path):
+    good = random_gaussians(5, dtype=torch.float64)
+    scales, means = good.scales.clone(), good.means.clone()
+    scales[0, 1], scales[3, 2], means[4, 0] = 0, -1, 1e300
+    assert write_ply(tmp_path / "a.ply", dataclasses.replace(good, scales=scales, means=means)) == 2
+    assert torch.equal(read_ply(tmp_path / "a.ply").means, good.means[[1, 2]].float())
+
+
+def test_an_empty_set_is_a_file(tmp_path):
+    assert write_ply(tmp_path / "a.ply", random_gaussians(0)) == 0
+    assert read_ply(tmp_path / "a.ply").count == 0
+
+
+def test_further_properties_and_elements_are_passed_over(tmp_path, written):
+    ply = PlyData.read(written[0])
+    old = ply["vertex"].data
+    new = np.zeros(10, [*old.dtype.descr[:9], ("f_rest_0", "<f4"), ("label", "u1"), *old.dtype.descr[9:]])
+    for name in NAMES:
+        new[name] = old[name]
+    new["f_rest_0"] = np.nan
+    camera = PlyElement.describe(np.zeros(3, [("focal", "<f8")]), "camera")
+    for order in ([PlyElement.describe(new, "vertex"), camera], [camera, PlyElement.describe(new, "vertex")]):
+        PlyData(order, byte_order="<").write(tmp_path / "b.ply")
+        assert torch.equal(read_ply(tmp_path / "b.ply").scales, read_ply(written[0]).scales)
+
+
+def test_windows_line_ends_in_the_header_are_read(tmp_path, written):
+    header, data = written[1].split(b"end_header\n", 1)
+    (tmp_path / "b.ply").write_bytes((header + b"end_header\n").replace(b"\n", b"\r\n") + data)
+    assert torch.equal(read_ply(tmp_path / "b.ply").means, read_ply(written[0]).means)
+
+
+BROKEN = {
+    "empty": lambda data: b"",
+    "text": lambda data: b"<html>not a splat</html>\n" * 100,
+    "zeros": lambda data: bytes(200_000),
+    "no line breaks": lambda data: b"a" * 300_000,
+    "endless header": lambda data: data[:40] + b"comment x\n" * 20_000,
+    "huge count": lambda data: with_line(data, b"vertex 10\n", b"vertex 1000000000000\n"),
+    "count of 5000 digits": lambda data: with_line(data, b"vertex 10\n", b"vertex " + b"9" * 5000 + b"\n"),
+    "negative count": lambda data: with_line(data, b"vertex 10\n", b"vertex -10\n"),
+    "one too many": lambda data: with_line(data, b"vertex 10\n", b"vertex 11\n"),
+    "one too few": lambda data: with_line(data, b"vertex 10\n", b"vertex 9\n"),
+    "trailing byte": lambda data: data + b"x",
+    "missing property": lambda data: with_line(data, b"property float rot_3\n", b"property float rot_9\n"),
+    "property named twice": lambda data: with_line(data, b"property float nx\n", b"property float x\n"),
+    "no vertices": lambda data: with_line(data, b"element vertex", b"element edge"),
+    "big endian": lambda data: with_line(data, b"binary_little_endian", b"binary_big_endian"),
+    "ascii": lambda data: with_line(data, b"binary_little_endian", b"ascii"),
+    "list property": lambda data: with_line(data, b"float nx\n", b"list uchar int nx\n"),
+    "unknown type": lambda data: with_line(data, b"property float nx\n", b"property half nx\n"),
+    "property before element": lambda data: with_line(data, b"element vertex 10\n", b"property float x\n"),
+    "not a number": lambda data: data[:-4] + np.float32("nan").tobytes(),
+    "infinite scale": lambda data: data[:-20] + np.float32(1000).tobytes() + data[-16:],
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_files_are_refused_in_one_line_and_at_once(tmp_path, written, name):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(BROKEN[name](written[1]))
+    start = time.perf_counter()
+    with pytest.raises(PlyError, match=re.escape(str(path))) as caught:
+        read_ply(path)
+    assert time.perf_counter() - start < 1
+    assert "\n" not in str(caught.value)
+
+
+def test_every_truncation_is_refused(tmp_path, written):
+    path = tmp_path / "bad.ply"
+    for length in range(0, len(written[1]), 7):
+        path.write_bytes(written[1][:length])
+        with pytest.raises(PlyError):
+            read_ply(path)
+
+
+def test_random_damage_never_raises_anything_else(tmp_path, written):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "bad.ply"
+    for _ in range(500):
+        data = bytearray(written[1])
+        for position in rng.integers(0, rng.choice([500, len(data)]), rng.integers(1, 6)):
+            data[position] = rng.integers(256)
+        path.write_bytes(data)
+        try:
+            gaussians = read_ply(path)
+        except PlyError:
+            continue
+        assert gaussians.finite().all()
+
+
+@pytest.mark.parametrize("name", ["missing.ply", "."])
+def test_a_path_without_a_file_is_refused(tmp_path, name):
+    with pytest.raises(PlyError, match="no such file"):
+        read_ply(tmp_path / name)
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, written, monkeypatch):
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        write_ply(written[0], random_gaussians(99))
+    assert written[0].read_bytes() == written[1]
+    assert [p.name for p in tmp_path.iterdir()] == ["good.ply"]

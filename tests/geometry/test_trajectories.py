@@ -1,0 +1,67 @@
+"""Camera paths: distances, heights, angles and the direction of turning."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+from completesplat.geometry.trajectories import orbit
+
+PIVOT = torch.tensor([0.3, -0.2, 2.5], dtype=torch.float64)
+UP = torch.tensor([0.1, -2.0, 0.2], dtype=torch.float64)  # neither of unit length nor along an axis
+
+
+def reference_camera() -> Cameras:
+    eye = torch.tensor([0.5, -1.0, -0.4], dtype=torch.float64)
+    aim = torch.tensor([0.0, 0.1, 2.0], dtype=torch.float64)
+    return Cameras(look_at(eye, aim, UP), pinhole(60, 64).double(), (64, 64))
+
+
+def horizontal(vectors: Tensor) -> Tensor:
+    axis = UP / UP.norm()
+    return vectors - (vectors @ axis)[:, None] * axis
+
+
+def test_orbit_starts_at_the_reference_and_keeps_distance_and_height() -> None:
+    reference = reference_camera()
+    arms = orbit(reference, PIVOT, UP, frames=17).centers - PIVOT
+    torch.testing.assert_close(arms[0], reference.centers - PIVOT)
+    torch.testing.assert_close(arms.norm(dim=-1), arms[:1].norm(dim=-1).expand(17))
+    torch.testing.assert_close(arms @ UP, (arms[:1] @ UP).expand(17))
+
+
+def test_every_camera_of_an_orbit_sees_the_pivot_in_its_centre_with_up_upwards() -> None:
+    cameras = orbit(reference_camera(), PIVOT, UP, frames=12)
+    pixels, depths = project(cameras, torch.stack([PIVOT, PIVOT + 0.1 * UP]).expand(12, 2, 3))
+    torch.testing.assert_close(pixels[:, 0], torch.full((12, 2), 32.0, dtype=torch.float64))
+    assert (depths > 0).all()
+    assert (pixels[:, 1, 1] < 32).all()
+    torch.testing.assert_close(pixels[:, 1, 0], pixels[:, 0, 0])
+
+
+@pytest.mark.parametrize(("frames", "degrees"), [(8, 360.0), (5, 90.0), (3, -60.0)])
+def test_steps_of_an_orbit_are_even_and_end_one_short(frames: int, degrees: float) -> None:
+    arms = horizontal(orbit(reference_camera(), PIVOT, UP, frames, degrees).centers - PIVOT)
+    following = torch.cat([arms[1:], arms[:1]])
+    cosines = torch.cosine_similarity(arms, following, dim=-1)
+    steps = frames if degrees == 360.0 else frames - 1  # only a full turn closes
+    expected = math.cos(math.radians(degrees / frames))
+    torch.testing.assert_close(cosines[:steps], torch.full((steps,), expected, dtype=torch.float64))
+
+
+def test_orbit_turns_counter_clockwise_seen_from_above() -> None:
+    """Each camera lies to the right of the one before it, and the pivot's front side turns to the left."""
+    cameras = orbit(reference_camera(), PIVOT, UP, frames=36)
+    arms = cameras.centers - PIVOT
+    assert (torch.linalg.cross(arms[:-1], arms[1:]) @ UP > 0).all()
+    right = cameras.world_to_camera[:-1, 0, :3]
+    assert ((right * (arms[1:] - arms[:-1])).sum(-1) > 0).all()
+
+
+def test_orbit_keeps_the_intrinsics_and_the_image_size() -> None:
+    reference = reference_camera()
+    cameras = orbit(reference, PIVOT, UP, frames=4)
+    assert cameras.image_size == (64, 64)
+    assert torch.equal(cameras.intrinsics, reference.intrinsics.expand(4, 3, 3))

@@ -1,0 +1,66 @@
+import pytest
+import torch
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.geometry.cameras import Cameras
+from completesplat.losses import Prediction, WeightedSum
+from completesplat.losses.kl import KullbackLeibler
+from completesplat.losses.mse import MeanSquaredError
+from completesplat.losses.ssim import StructuralDissimilarity
+from completesplat.scene import Views
+from completesplat.splatter_image import Parameterization, SplatterImage
+
+SHAPE = (2, 3, 3, 24, 24)
+
+
+def views(images: torch.Tensor) -> Views:
+    cameras = Cameras(torch.eye(4).expand(2, 3, 4, 4), torch.eye(3).expand(2, 3, 3, 3), (24, 24))
+    return Views(images, cameras, torch.ones(2, 3, 1, 24, 24))
+
+
+def prediction(images: torch.Tensor, with_posterior: bool = True) -> Prediction:
+    posterior = Posterior(torch.ones(2, 4, 1, 1), torch.zeros(2, 4, 1, 1)) if with_posterior else None
+    splatter_image = SplatterImage(torch.zeros(2, 2, 15, 1, 1), Parameterization())
+    return Prediction(images, Reconstruction(splatter_image, posterior))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(SHAPE, generator=generator), torch.rand(SHAPE, generator=generator)
+
+
+def test_mse_closed_form():
+    value = MeanSquaredError()(prediction(torch.full(SHAPE, 0.7)), views(torch.full(SHAPE, 0.2)))
+    assert value.item() == pytest.approx(0.25)
+
+
+def test_ssim_of_equal_images_costs_nothing(pair):
+    assert StructuralDissimilarity()(prediction(pair[0]), views(pair[0])).item() == pytest.approx(0, abs=1e-5)
+
+
+def test_ssim_is_one_minus_torchmetrics_value(pair):
+    """The two libraries differ at the border only: compare smooth images, on which the border has its mean value."""
+    smooth = [torch.nn.functional.avg_pool2d(x.flatten(0, 1), 5, 1, 2, count_include_pad=False) for x in pair]
+    ours = StructuralDissimilarity()(prediction(smooth[0].view(SHAPE)), views(smooth[1].view(SHAPE)))
+    theirs = structural_similarity_index_measure(smooth[0], smooth[1], data_range=1.0)
+    assert ours.item() == pytest.approx(1 - theirs.item(), abs=0.05)
+
+
+def test_kl_is_summed_over_the_latent_and_averaged_over_the_batch(pair):
+    # N(1, 1) against N(0, 1) is 1/2 per element.
+    assert KullbackLeibler()(prediction(pair[0]), views(pair[1])).item() == pytest.approx(2.0)
+    assert KullbackLeibler()(prediction(pair[0], with_posterior=False), views(pair[1])).item() == 0
+
+
+def test_weighted_sum_drops_entries_that_are_none(pair):
+    terms = {
+        "mse": {"weight": 0.8, "term": MeanSquaredError()},
+        "ssim": None,
+        "kl": {"weight": 0.1, "term": KullbackLeibler()},
+    }
+    total, values = WeightedSum(terms)(prediction(pair[0]), views(pair[1]))
+    assert set(values) == {"mse", "kl"}
+    assert total.item() == pytest.approx(0.8 * values["mse"].item() + 0.1 * values["kl"].item())

@@ -1,0 +1,159 @@
+"""The reference rasterizer: where single Gaussians land and how they mix, in closed form."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers import Rendering, RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians
+
+CONSTANTS = RenderingConstants()
+
+
+def f64(*values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def straight_camera(
+    size: tuple[int, int] = (12, 16), focal: float = 20.0, center: tuple[float, float] = (8, 6)
+) -> Cameras:
+    intrinsics = f64([focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1])
+    return Cameras(torch.eye(4, dtype=torch.float64), intrinsics, size)
+
+
+def at_pixel(
+    camera: Cameras, column: int, row: int, depth: float, opacity: float, color: object = (1, 1, 1)
+) -> Gaussians:
+    """A point-like Gaussian (blur only) on the centre of a pixel of a straight camera."""
+    k = camera.intrinsics
+    mean = f64((column + 0.5 - k[0, 2]) / k[0, 0], (row + 0.5 - k[1, 2]) / k[1, 1], 1) * depth
+    return Gaussians(mean[None], f64([1, 0, 0, 0]), f64([1e-6] * 3), f64(opacity), f64(color))
+
+
+def render(gaussians: Gaussians, camera: Cameras, constants: RenderingConstants = CONSTANTS) -> Rendering:
+    """One scene, one view."""
+    return ReferenceRasterizer(constants)(gaussians[None], camera[None, None])
+
+
+@pytest.mark.parametrize(("column", "row"), [(0, 0), (15, 0), (0, 11), (15, 11), (3, 9), (11, 2)])
+@pytest.mark.parametrize("center", [(8.0, 6.0), (2.25, 9.5), (20.0, -3.0)])
+def test_an_opaque_point_lands_on_its_pixel_with_its_colour(column: int, row: int, center: tuple[float, float]) -> None:
+    camera = straight_camera(center=center)
+    rendering = render(at_pixel(camera, column, row, depth=3, opacity=1, color=(0.2, 0.5, 0.9)), camera)
+    assert rendering.alpha.argmax().item() == row * 16 + column
+    color = rendering.color[0, 0, :, row, column]
+    torch.testing.assert_close(color, 0.999 * f64(0.2, 0.5, 0.9))
+
+
+def test_moving_right_goes_to_higher_columns_and_down_to_higher_rows() -> None:
+    camera = straight_camera(center=(5.5, 4.5))
+    for shift, (row, column) in {(0, 0): (4, 5), (4, 0): (4, 9), (0, 4): (8, 5), (-3, -2): (2, 2)}.items():
+        mean = f64([shift[0] * 2 / 20, shift[1] * 2 / 20, 2])
+        point = Gaussians(mean, f64([1, 0, 0, 0]), f64([1e-6] * 3), f64(1), f64([1, 1, 1]))
+        assert render(point, camera).alpha.argmax().item() == row * 16 + column
+
+
+def test_alpha_of_one_gaussian_in_closed_form() -> None:
+    """A round Gaussian on the optical axis has the 2D variance (f s / z)^2 + blur; its neighbours follow exp."""
+    camera = straight_camera(center=(8.5, 6.5))
+    scale, depth, opacity = 0.1, 2.0, 0.8
+    gaussian = Gaussians(f64([0, 0, depth]), f64([1, 2, 3, 4]), f64([scale] * 3), f64(opacity), f64([1, 0.5, 0]))
+    rendering = render(gaussian, camera)
+    variance = (20 * scale / depth) ** 2 + 0.3
+    for column, row in [(8, 6), (9, 6), (8, 5), (10, 7), (7, 4)]:
+        squared = (column - 8) ** 2 + (row - 6) ** 2
+        expected = opacity * math.exp(-squared / (2 * variance))
+        assert rendering.alpha[0, 0, 0, row, column].item() == pytest.approx(expected, rel=1e-12)
+        assert rendering.depth[0, 0, 0, row, column].item() == pytest.approx(expected * depth, rel=1e-12)
+        assert rendering.color[0, 0, 1, row, column].item() == pytest.approx(expected * 0.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 2, 0]])
+def test_compositing_goes_front_to_back_whatever_the_order_of_input(order: list[int]) -> None:
+    camera = straight_camera()
+    depths, opacities, colors = (2.0, 3.0, 5.0), (0.5, 0.25, 0.75), torch.eye(3).tolist()
+    points = [at_pixel(camera, 4, 7, *values) for values in zip(depths, opacities, colors, strict=True)]
+    rendering = render(concatenate([points[i] for i in order]), camera)
+    color, alpha, depth = (t[0, 0, :, 7, 4] for t in (rendering.color, rendering.alpha, rendering.depth))
+    weights = f64(0.5, 0.5 * 0.25, 0.5 * 0.75 * 0.75)
+    transmittance = 0.5 * 0.75 * 0.25
+    torch.testing.assert_close(color, weights)
+    torch.testing.assert_close(alpha, f64(1 - transmittance))
+    torch.testing.assert_close(depth, (weights @ f64(*depths))[None])
+
+
+def test_expected_depth_is_the_mean_weighted_by_contribution_and_zero_where_nothing_is() -> None:
+    camera = straight_camera()
+    scene = concatenate([at_pixel(camera, 2, 2, 2, 0.5), at_pixel(camera, 2, 2, 4, 0.5)])
+    depth = render(scene, camera).expected_depth()[0, 0, 0]
+    assert depth[2, 2].item() == pytest.approx((0.5 * 2 + 0.25 * 4) / 0.75, rel=1e-12)
+    assert depth[11, 15].item() == 0
+
+
+def test_contributions_below_one_over_255_are_skipped() -> None:
+    camera = straight_camera()
+    faint, seen = (render(at_pixel(camera, 4, 7, 2, opacity), camera) for opacity in (0.9999 / 255, 1.0001 / 255))
+    assert faint.alpha.max() == 0
+    assert seen.alpha[0, 0, 0, 7, 4].item() == pytest.approx(1.0001 / 255, rel=1e-12)
+    opaque = render(at_pixel(camera, 4, 7, 2, 1.0), camera).alpha[0, 0, 0, 7]
+    # exp(-d^2 / 0.6) falls below 1 / 255 between one and two pixels from the centre.
+    assert (opaque > 0).nonzero().flatten().tolist() == [3, 4, 5]
+
+
+def test_one_gaussian_never_hides_more_than_the_largest_alpha() -> None:
+    camera = straight_camera()
+    assert render(at_pixel(camera, 4, 7, 2, 1.0), camera).alpha[0, 0, 0, 7, 4].item() == pytest.approx(0.999, rel=1e-12)
+    constants = RenderingConstants(max_alpha=0.99)
+    capped = render(at_pixel(camera, 4, 7, 2, 1.0), camera, constants)
+    assert capped.alpha[0, 0, 0, 7, 4].item() == pytest.approx(0.99, rel=1e-12)
+
+
+@pytest.mark.parametrize(("second", "takes_part"), [(0.8999, True), (0.9001, False)])
+def test_the_gaussian_that_would_use_up_the_transmittance_takes_no_part(second: float, takes_part: bool) -> None:
+    """After 0.999 the transmittance is 1e-3: the next alpha brings it to 1.001e-4 or to 0.999e-4."""
+    camera = straight_camera()
+    front, middle = at_pixel(camera, 4, 7, 2, 1.0, (1, 0, 0)), at_pixel(camera, 4, 7, 3, second, (0, 1, 0))
+    behind = at_pixel(camera, 4, 7, 4, 0.0005 + 1 / 255, (0, 0, 1))  # would fit by itself, but the pixel has stopped
+    color = render(concatenate([behind, middle, front]), camera).color[0, 0, :, 7, 4]
+    assert color[0].item() == pytest.approx(0.999, rel=1e-12)
+    assert color[1].item() == pytest.approx(0.001 * second if takes_part else 0, rel=1e-9)
+    assert color[2].item() == 0
+
+
+@pytest.mark.parametrize("depth", [-1.0, 0.0, 0.0099, 0.01])
+def test_nothing_is_drawn_up_to_the_near_plane(depth: float) -> None:
+    camera = straight_camera()
+    gaussian = Gaussians(f64([0, 0, depth]), f64([1, 0, 0, 0]), f64([0.1] * 3), f64(0.9), f64([1, 1, 1]))
+    assert render(gaussian, camera).alpha.abs().max() == 0
+    beyond = Gaussians(f64([0, 0, 0.0101]), f64([1, 0, 0, 0]), f64([0.1] * 3), f64(0.9), f64([1, 1, 1]))
+    assert render(beyond, camera).alpha.max() > 0.5
+
+
+@pytest.mark.parametrize(("slope", "clamped"), [(1.3, 1.16), (-9.0, -0.92), (1.15, 1.15), (-0.91, -0.91)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_outside_the_frustum_the_jacobian_is_that_of_the_clamped_direction(
+    slope: float, clamped: float, axis: int
+) -> None:
+    """Extent 16, focal 10, principal point 6.8: the borders' slopes are -0.68 and 0.92, the margin is 0.3 * 0.8."""
+    wide = Cameras(torch.eye(4, dtype=torch.float64), f64([10, 0, 6.8], [0, 10, 6.8], [0, 0, 1]), (16, 16))
+    depth = 2.0
+    mean = torch.zeros(3, dtype=torch.float64)
+    mean[axis], mean[2] = slope * depth, depth
+    gaussian = Gaussians(mean[None], f64([1, 0, 0, 0]), f64([0.1, 0.2, 0.4]), f64(0.5), f64([1, 1, 1]))
+    centers, _, covariances = project_gaussians(gaussian, wide, CONSTANTS)
+    assert centers[0, axis].item() == pytest.approx(10 * slope + 6.8)  # the centre itself is not clamped
+    expected = (10 / depth) ** 2 * (gaussian.scales[0, axis].item() ** 2 + (clamped * 0.4) ** 2) + 0.3
+    assert covariances[0, axis, axis].item() == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 1)])
+def test_images_of_one_row_or_column(size: tuple[int, int]) -> None:
+    camera = straight_camera(size=size, center=(size[1] / 2, size[0] / 2))
+    row, column = size[0] // 2, size[1] // 2
+    alpha = render(at_pixel(camera, column, row, 2, 0.7), camera).alpha
+    assert alpha.shape == (1, 1, 1, *size)
+    assert alpha[0, 0, 0, row, column].item() == pytest.approx(0.7, rel=1e-12)

@@ -1,0 +1,162 @@
+"""Bad Gaussians: the image and all gradients stay finite, and the healthy rest does not notice them."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
+NAN, INF = float("nan"), float("inf")
+DTYPES = [torch.float32, torch.float64]
+
+LEFT_OUT = {
+    "behind the camera": {"means": [0, 0, -1]},
+    "in the camera": {"means": [0, 0, 0]},
+    "on the camera's plane": {"means": [1, 0.5, 0]},
+    "on the near plane": {"means": [0, 0, 0.01]},
+    "mean NaN": {"means": [0, NAN, 2]},
+    "depth NaN": {"means": [0, 0, NAN]},
+    "mean infinite": {"means": [INF, 0, 2]},
+    "depth infinite": {"means": [0, 0, INF]},
+    "mean far aside": {"means": [1e30, 0, 2]},
+    "mean far aside in both axes": {"means": [-1e30, 1e30, 2]},
+    "mean far behind": {"means": [1e30, -1e30, -1e30]},
+    "quaternion NaN": {"quaternions": [NAN, 0, 0, 1]},
+    "quaternion infinite": {"quaternions": [1, INF, 0, 0]},
+    "scale NaN": {"scales": [0.1, NAN, 0.1]},
+    "scale infinite": {"scales": [0.1, 0.1, INF]},
+    "scale whose square overflows": {"scales": [1e30, 1e30, 1e30]},
+    "one scale whose square overflows": {"scales": [1e30, 0.1, 0.1], "quaternions": [1, 2, 3, 4]},
+    "scale whose determinant overflows": {"scales": [1e12, 1e12, 1e12], "quaternions": [1, 2, 3, 4]},
+    "opacity 0": {"opacities": 0},
+    "opacity negative": {"opacities": -1},
+    "opacity NaN": {"opacities": NAN},
+    "color NaN": {"colors": [0.5, 0.5, NAN]},
+    "color infinite": {"colors": [INF, 0.5, 0.5]},
+}
+
+DRAWN = {
+    "zero quaternion": {"quaternions": [0, 0, 0, 0]},
+    "tiny quaternion": {"quaternions": [1e-30, 1e-30, 0, 0]},
+    "zero scale": {"scales": [0, 0, 0]},
+    "one zero scale": {"scales": [0.3, 0, 0.2], "quaternions": [1, 2, 3, 4]},
+    "needle": {"scales": [1e3, 1e-6, 1e-6], "quaternions": [1, 2, 3, 4]},
+    "negative scale": {"scales": [-0.1, -0.2, 0.3]},
+    "scale 1e3": {"scales": [1e3, 1e3, 1e3], "quaternions": [1, 2, 3, 4]},
+    "scale 1e6": {"scales": [1e6, 1e6, 1e6], "quaternions": [1, 2, 3, 4]},
+    "opacity 1": {"opacities": 1},
+    "just beyond the near plane": {"means": [0.004, 0.001, 0.0101]},
+    "just beyond the near plane, far aside": {"means": [50, 0, 0.0101]},
+    "very far on the axis": {"means": [0, 0, 1e30]},
+    "very far in the corner": {"means": [1e30, 1e30, 1e30]},
+}
+
+
+def healthy(count: int, dtype: torch.dtype) -> Gaussians:
+    generator = torch.Generator().manual_seed(count)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(count, *shape, generator=generator, dtype=torch.float64).to(dtype)
+
+    means = torch.cat([rand(2) * 2 - 1, 2 + rand(1) * 2], dim=-1)
+    return Gaussians(means, rand(4) * 2 - 1, 0.02 + 0.3 * rand(3), 0.1 + 0.9 * rand(), rand(3))
+
+
+def one(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
+    values = {
+        "means": [0.1, -0.2, 1.5],
+        "quaternions": [1, 0, 0, 0],
+        "scales": [0.3, 0.2, 0.1],
+        "opacities": 0.8,
+        "colors": [0.2, 0.4, 0.6],
+    } | changes
+    return Gaussians(**{name: torch.tensor([values[name]], dtype=dtype) for name in FIELDS})
+
+
+def render_and_differentiate(gaussians: Gaussians) -> tuple[Tensor, dict[str, Tensor]]:
+    """Colour, depth and alpha in one image, and the gradients of a random linear function of it."""
+    dtype = gaussians.means.dtype
+    intrinsics = torch.tensor([[12.0, 0, 6.5], [0, 12.0, 4.2], [0, 0, 1]], dtype=dtype)
+    cameras = Cameras(torch.eye(4, dtype=dtype)[None, None], intrinsics[None, None], (9, 12))
+    inputs = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
+    inputs |= {"world_to_camera": cameras.world_to_camera.requires_grad_()}
+    inputs |= {"intrinsics": cameras.intrinsics.requires_grad_()}
+    rendering = ReferenceRasterizer()(Gaussians(**{name: inputs[name] for name in FIELDS})[None], cameras)
+    image = torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=2)
+    cotangent = torch.rand(image.shape, generator=torch.Generator().manual_seed(1)).to(dtype)
+    image.backward(cotangent)
+    gradients = {name: value.grad for name, value in inputs.items()}
+    assert all(gradient is not None for gradient in gradients.values())
+    return image.detach(), gradients  # type: ignore[return-value]
+
+
+def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
+    assert image.isfinite().all()
+    assert [name for name, gradient in gradients.items() if not gradient.isfinite().all()] == []
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("kind", LEFT_OUT)
+def test_what_cannot_be_drawn_leaves_no_trace(kind: str, dtype: torch.dtype) -> None:
+    rest = healthy(20, dtype)
+    image, gradients = render_and_differentiate(rest)
+    bad = one(LEFT_OUT[kind], dtype)
+    mixed_image, mixed_gradients = render_and_differentiate(concatenate([rest[:7], bad, rest[7:]]))
+    assert_finite(mixed_image, mixed_gradients)
+    assert torch.equal(mixed_image, image)
+    for name in ("world_to_camera", "intrinsics"):
+        assert torch.equal(mixed_gradients[name], gradients[name])
+    for name in FIELDS:
+        assert not mixed_gradients[name][7].any()
+        assert torch.equal(torch.cat([mixed_gradients[name][:7], mixed_gradients[name][8:]]), gradients[name])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("kind", DRAWN)
+def test_extreme_gaussians_are_drawn_with_finite_values_and_gradients(kind: str, dtype: torch.dtype) -> None:
+    assert_finite(*render_and_differentiate(concatenate([healthy(20, dtype), one(DRAWN[kind], dtype)])))
+    assert_finite(*render_and_differentiate(one(DRAWN[kind], dtype)))
+
+
+def test_the_sign_of_a_scale_and_a_zero_quaternion_have_a_meaning() -> None:
+    """Only the squares of scales enter; a zero quaternion is the identity."""
+    image, _ = render_and_differentiate(one({}, torch.float64))
+    assert image.any()
+    negative, _ = render_and_differentiate(one({"scales": [-0.3, 0.2, -0.1]}, torch.float64))
+    zero, gradients = render_and_differentiate(one({"quaternions": [0, 0, 0, 0]}, torch.float64))
+    assert torch.equal(negative, image)
+    assert torch.equal(zero, image)
+    assert not gradients["quaternions"].any()
+
+
+def test_a_large_flat_gaussian_agrees_with_double_precision() -> None:
+    """A needle of 300 px seen in perspective: its determinant is a difference of nearly equal numbers."""
+    changes: dict[str, object] = {"scales": [40, 1e-4, 1e-4], "quaternions": [1, 0, 0, 0.3]}
+    single, _ = render_and_differentiate(one(changes, torch.float32))
+    double, _ = render_and_differentiate(one(changes, torch.float64))
+    assert double[0, 0, 4].max() > 0.5
+    torch.testing.assert_close(single.double(), double, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count: int, dtype: torch.dtype) -> None:
+    gaussians = concatenate([healthy(0, dtype), *[one(LEFT_OUT["behind the camera"], dtype)] * count])
+    image, gradients = render_and_differentiate(gaussians)
+    assert not image.any()
+    assert gradients["means"].shape == (count, 3)
+    assert not any(gradient.any() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
+    """Equal depths keep their order, and a transmittance that underflows does no harm."""
+    colors = [[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]
+    front, back = (one({"colors": color, "opacities": 0.5}, dtype) for color in colors)
+    image, _ = render_and_differentiate(concatenate([front, back]))
+    swapped, _ = render_and_differentiate(concatenate([back, front]))
+    assert image[0, 0, 0].max() < swapped[0, 0, 0].max()
+    assert_finite(*render_and_differentiate(concatenate([one({"opacities": 1}, dtype)] * 400)))

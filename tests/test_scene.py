@@ -1,0 +1,70 @@
+"""Scenes: the order of views, collation into batches, and the shapes that are checked."""
+
+import pytest
+import torch
+
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.scene import SceneBatch, Views
+from completesplat.tensors import stack
+
+SIZE = (4, 6)
+
+
+def make_views(*batch: int, start: float) -> Views:
+    """Views whose pixels, poses and masks carry the number of the view."""
+    numbers = start + torch.arange(torch.Size(batch).numel(), dtype=torch.float32).reshape(batch)
+    poses = torch.eye(4).repeat(*batch, 1, 1)
+    poses[..., 0, 3] = numbers
+    cameras = Cameras(poses, pinhole(60, 6).repeat(*batch, 1, 1), SIZE)
+    images = numbers[..., None, None, None].expand(*batch, 3, *SIZE)
+    return Views(images, cameras, images[..., :1, :, :] / 100)
+
+
+def make_scene(index: int, targets: int = 3) -> SceneBatch:
+    reference, others = make_views(start=10.0 * index), make_views(targets, start=10.0 * index + 1)
+    return SceneBatch(reference, others, torch.tensor([0.5, 4.0]), f"scene{index}")
+
+
+def test_a_scene_without_batch_axis_puts_the_reference_first() -> None:
+    views = make_scene(2).all_views()
+    expected = torch.tensor([20.0, 21, 22, 23])
+    assert torch.equal(views.images[:, 0, 0, 0], expected)
+    assert torch.equal(views.cameras.world_to_camera[:, 0, 3], expected)
+    assert torch.equal(views.masks[:, 0, 0, 0], expected / 100)
+    assert views.cameras.intrinsics.shape == (4, 3, 3)
+    assert views.cameras.image_size == SIZE
+
+
+def test_a_batch_of_scenes_keeps_scenes_and_views_apart() -> None:
+    batch = stack([make_scene(0), make_scene(1)])
+    assert batch.names == ("scene0", "scene1")
+    assert batch.depth_range.shape == (2, 2)
+    views = batch.all_views()
+    expected = torch.tensor([[0.0, 1, 2, 3], [10, 11, 12, 13]])
+    assert views.images.shape == (2, 4, 3, *SIZE)
+    assert torch.equal(views.images[:, :, 0, 0, 0], expected)
+    assert torch.equal(views.cameras.world_to_camera[:, :, 0, 3], expected)
+    assert torch.equal(views.masks[:, :, 0, 0, 0], expected / 100)
+
+
+def test_all_views_commutes_with_collation() -> None:
+    scenes = [make_scene(0), make_scene(1)]
+    one, other = stack(scenes).all_views(), stack([scene.all_views() for scene in scenes])
+    assert torch.equal(one.images, other.images)
+    assert torch.equal(one.cameras.world_to_camera, other.cameras.world_to_camera)
+    assert torch.equal(one.masks, other.masks)
+
+
+def test_scenes_with_different_image_sizes_do_not_collate() -> None:
+    scene = make_scene(0)
+    small = Views(torch.zeros(3, 2, 2), Cameras(torch.eye(4), pinhole(60, 2), (2, 2)), masks=torch.zeros(1, 2, 2))
+    other = SceneBatch(small, scene.targets, scene.depth_range, "small")
+    with pytest.raises((ValueError, RuntimeError)):
+        stack([scene, other])
+
+
+def test_wrong_shapes_are_refused_when_types_are_checked() -> None:
+    """Guards the set-up of the tests themselves: annotations of the package are enforced here."""
+    scene = make_scene(0)
+    with pytest.raises(TypeError):
+        Views(torch.zeros(4, *SIZE), scene.reference.cameras, torch.zeros(1, *SIZE))
