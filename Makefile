@@ -33,7 +33,7 @@ bench: $(READY) ## Time the rasterizer backends side by side
 	$(BIN)/completesplat bench rasterizers
 
 notebooks: $(READY) ## Run every notebook from top to bottom
-	$(BIN)/python -m jupyter execute --inplace notebooks/*.ipynb
+	$(BIN)/jupyter execute notebooks/*.ipynb
 
 clean: ## Remove everything that can be made again, the environment included
 	rm -rf .venv outputs multirun build dist .pytest_cache .mypy_cache .ruff_cache *.egg-info

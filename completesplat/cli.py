@@ -3,7 +3,7 @@
 import sys
 
 VERBS = {
-    "data": "make data sets (data toy)",
+    "data": "make data sets",
     "fit": "train a model, one stage at a time",
     "test": "score a checkpoint on held-out scenes",
     "predict": "draw complete scenes from one photograph",

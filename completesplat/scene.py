@@ -1,6 +1,6 @@
 """What a data module yields: images with their cameras, for a reference view and its targets."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -31,6 +31,10 @@ class SceneBatch(TensorDataclass):
     targets: Views
     depth_range: Float[Tensor, "*batch 2"]
     names: str | tuple[str, ...]
+
+    def __getitem__(self, index: int | slice) -> "SceneBatch":
+        """One scene of a batch, or some of them."""
+        return replace(super().__getitem__(index), names=self.names[index])
 
     def all_views(self) -> Views:
         """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""

@@ -1,8 +1,10 @@
 """Fixtures that several folders of tests use."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from support import SMALL, call
 
 from completesplat.data.toy import write_objects
 
@@ -13,3 +15,32 @@ def toy_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("toy")
     write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
     return root
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Both stages, trained for two steps: run directories of the real thing, with no skill."""
+
+    toy: Path
+    var: Path
+    diffusion: Path
+
+    @property
+    def weights(self) -> Path:
+        return self.diffusion / "weights"
+
+    def photograph(self) -> Path:
+        return sorted(self.toy.glob("*/*/images/*.jpg"))[0]
+
+
+@pytest.fixture(scope="session")
+def pipeline(toy_root, tmp_path_factory):
+    runs = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(runs)
+        fit = ["fit", f"data.root={toy_root}", *SMALL]
+        assert call(monkeypatch, *fit, "experiment=toy_var", f"out={runs / 'var'}") == 0
+        stage1 = runs / "var/checkpoints/last.ckpt"
+        stage2 = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={stage1}", "sampler.steps=2"]
+        assert call(monkeypatch, *fit, *stage2, f"out={runs / 'diffusion'}") == 0
+    return Pipeline(toy_root, runs / "var", runs / "diffusion")

@@ -90,11 +90,17 @@ def run_job(verb: str, config: Any) -> None:
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     (out / "run.json").write_text(json.dumps(record, indent=2) + "\n")
-    logging.captureWarnings(True)
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*isinstance\\(treespec, LeafSpec\\).*")
-    place = import_module(f"completesplat.commands.{verb}").run(config, out)
-    print(place or out)
+    quieten()
+    import_module(f"completesplat.commands.{verb}").run(config, out)
+    print(out)
+
+
+def quieten() -> None:
+    """Keep Lightning's hints about its products and settings out of the output; its errors and progress stay."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in (".*does not have many workers.*", ".*LeafSpec.*", "Experiment logs directory .* exists.*"):
+        warnings.filterwarnings("ignore", message=message)
 
 
 def git_commit() -> str | None:

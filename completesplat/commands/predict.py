@@ -6,7 +6,7 @@ from typing import Any
 from completesplat.errors import CompleteSplatError
 
 
-def run(config: Any, out: Path) -> Path:
+def run(config: Any, out: Path) -> None:
     """Write the samples' files into `out/<name of the photograph>/`."""
     check_settings(config)
     from hydra.utils import instantiate
@@ -19,9 +19,8 @@ def run(config: Any, out: Path) -> Path:
     photograph = model.read(image, config.fov)
     settings = {name: config[name] for name in ("samples", "skip_weight", "guidance_weight", "steps", "seed")}
     scenes = model(photograph, **settings)
-    folder = out / image.stem
     write_prediction(
-        folder,
+        out / image.stem,
         photograph.image,
         scenes,
         model.camera(photograph),
@@ -37,7 +36,6 @@ def run(config: Any, out: Path) -> Path:
             "depth_range": model.depth_range.tolist(),
         },
     )
-    return folder
 
 
 def check_settings(config: Any) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from numbers import Real
 from typing import Any
 
@@ -23,15 +24,16 @@ MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUni
 
 
 def read_exif(picture: Image.Image) -> dict[int, Any]:
-    """All EXIF tags of a picture that is decoded and still open; a damaged record counts as none.
+    """All EXIF tags of a picture that is decoded and still open, as far as the record is readable.
 
     Pillow turns a TIFF upright when it decodes it, and takes the orientation out of its record.
     """
-    try:
+    tags: dict[int, Any] = {}
+    with suppress(Exception):  # Pillow's parser raises nearly anything on a damaged record.
         exif = picture.getexif()
-        return {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    except Exception:  # Pillow's parser raises nearly anything on a damaged record.
-        return {}
+        tags.update(exif)
+        tags.update(exif.get_ifd(ExifTags.IFD.Exif))
+    return tags
 
 
 def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:

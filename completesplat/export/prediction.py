@@ -15,7 +15,7 @@ from completesplat.export.scene_json import write_scene_json
 from completesplat.export.video import write_video
 from completesplat.export.views import orbit_views
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.rasterizers import Rasterizer
 
 DIRECTIONS = 8
@@ -64,8 +64,14 @@ def write_prediction(
 
 @torch.no_grad()
 def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) -> Float[Tensor, "3"]:
-    """The point on the optical axis at the median depth of the image's central ninth: what a turn goes around."""
+    """The point that a turn goes around: on the optical axis, at the median depth of the image's central ninth.
+
+    Where nothing is seen there, the median depth of all Gaussians stands in.
+    """
     depth = rasterizer(scene[None], reference[None][None]).expected_depth()[0, 0, 0]
     height, width = depth.shape
-    center = depth[height // 3 : -(height // 3), width // 3 : -(width // 3)]
-    return reference.camera_to_world[:3, 3] + reference.camera_to_world[:3, 2] * center.median()
+    center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
+    seen = center[center > 0]
+    if len(seen) == 0:
+        seen = transform_points(reference.world_to_camera, scene.means)[:, 2]
+    return reference.camera_to_world[:3, 3] + reference.camera_to_world[:3, 2] * seen.median()

@@ -1,7 +1,7 @@
 """What every rasterizer takes and gives."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -56,6 +56,7 @@ class Rendering(TensorDataclass):
         return self.depth / self.alpha.clamp(min=1e-10)
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """Renders a batch of scenes, each from several cameras."""
 

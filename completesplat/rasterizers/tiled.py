@@ -78,7 +78,9 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         tensors = [tensor.detach().contiguous() for tensor in arguments[:5]]
-        drawing = Drawing(_arrays(Parameters, tensors), *arguments[5:], keep=any(ctx.needs_input_grad))
+        cameras, image_size, constants = arguments[5:]
+        keep = any(ctx.needs_input_grad)
+        drawing = Drawing(_arrays(Parameters, tensors), cameras, image_size, constants, keep)
         images = tuple(torch.from_numpy(image) for image in drawing.draw())
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*arguments[:5], *images)

@@ -1,6 +1,5 @@
 """The scores of several predictors, side by side."""
 
-from itertools import product
 from typing import Any
 
 from rich.console import Console

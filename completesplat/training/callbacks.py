@@ -3,8 +3,24 @@
 from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import WeightAveraging
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.training.latent_diffusion import LatentDiffusion
+
+
+class ExponentialMovingAverage(WeightAveraging):
+    """Average of the weights over the steps; checkpoints, validation and the end of training use the average.
+
+    Lightning's own `EMAWeightAveraging` computes decay * a + (1 - decay) * b, which lets frozen weights and measured
+    buffers drift by rounding; linear interpolation leaves them exactly as they are.
+
+    Args:
+        decay: weight of the past (not stated by the paper).
+    """
+
+    def __init__(self, decay: float) -> None:
+        super().__init__(multi_avg_fn=get_ema_multi_avg_fn(decay))
 
 
 class ExportWeights(Callback):

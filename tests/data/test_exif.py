@@ -1,10 +1,12 @@
 import math
+import struct
 import warnings
 
 import numpy as np
 import pytest
 from PIL import Image, ImageOps, TiffImagePlugin
 
+from completesplat.data.exif import crop_fov
 from completesplat.data.photograph import read_photograph
 from completesplat.errors import CompleteSplatError
 
@@ -103,6 +105,12 @@ def test_without_a_usable_focal_length_the_default_stands(tmp_path, tags):
     assert (photograph.fov_degrees, photograph.fov_source) == (61.0, "default")
 
 
+def test_infinite_numbers_are_no_focal_length():
+    infinite = {0x920A: 35.0, 0xA20E: 100.0, 0xA002: math.inf, 0xA003: math.inf}
+    assert crop_fov(infinite, (60, 40)) == pytest.approx(degrees(40, 35 * 100 / 25.4))
+    assert crop_fov({0xA405: math.inf}, (60, 40)) is None
+
+
 def test_a_given_field_of_view_comes_first(tmp_path):
     photograph = fov_of(tmp_path, exif_of(equivalent=50), fov_degrees=33.0)
     assert (photograph.fov_degrees, photograph.fov_source) == (33.0, "given")
@@ -114,13 +122,24 @@ def test_an_impossible_field_of_view_is_refused(tmp_path, fov):
         fov_of(tmp_path, exif_of(), fov_degrees=fov)
 
 
-def test_a_damaged_exif_record_is_none(tmp_path):
-    for record in (
-        b"Exif\0\0garbage",
-        b"Exif\0\0II*\0\xff\xff\xff\x7f",
-        b"Exif\0\0MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50,
-    ):
-        Image.new("RGB", (SIZE, SIZE)).save(tmp_path / "a.jpg", exif=record)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert read_photograph(tmp_path / "a.jpg", SIZE).fov_source == "default"
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp"])
+@pytest.mark.parametrize(
+    "record",
+    [b"garbage", b"MM\0*\0\0", b"II*\0\xff\xff\xff\x7f", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50],
+)
+def test_a_damaged_exif_record_is_none(tmp_path, name, record):
+    Image.new("RGB", (SIZE, SIZE)).save(tmp_path / name, exif=b"Exif\0\0" + record)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert read_photograph(tmp_path / name, SIZE).fov_source == "default"
+
+
+def test_a_damaged_inner_record_leaves_the_orientation(tmp_path):
+    # Two entries: orientation 3, and an inner record at a position beyond the end.
+    entries = struct.pack(">HHHIHHHHII", 2, 0x0112, 3, 1, 3, 0, 0x8769, 4, 1, 60_000)
+    picture = np.zeros((SIZE, SIZE), np.uint8)
+    picture[0] = 255
+    Image.fromarray(picture).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\0\0\0\x08" + entries + bytes(4))
+    photograph = read_photograph(tmp_path / "a.png", SIZE)
+    assert photograph.image[:, -1].min() == 1
+    assert photograph.fov_source == "default"

@@ -17,10 +17,11 @@ PICTURE = Image.fromarray(
 
 
 def refuse(path, match):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
         with pytest.raises(ImageError, match=match) as caught:
             read_photograph(path, SIZE)
+    assert not warned
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -46,12 +47,10 @@ def test_truncated_files_are_refused_or_complete(tmp_path, name):
     data = (tmp_path / name).read_bytes()
     for length in [*range(1, len(data) - 24, max(1, len(data) // 40)), *range(len(data) - 24, len(data))]:
         (tmp_path / name).write_bytes(data[:length])
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            try:
-                image = read_photograph(tmp_path / name, SIZE).image
-            except ImageError:
-                continue
+        try:
+            image = read_photograph(tmp_path / name, SIZE).image
+        except ImageError:
+            continue
         # Some formats end in a mark after the last pixel; a picture without it is whole.
         assert length > len(data) - 24
         assert torch.equal(image, whole)

@@ -101,6 +101,12 @@ def test_opacities_of_0_and_1_are_clamped(tmp_path):
     np.testing.assert_allclose(PlyData.read(tmp_path / "a.ply")["vertex"]["opacity"], [limit, -limit], rtol=1e-6)
 
 
+def test_colours_below_0_are_read_as_0(tmp_path):
+    gaussians = dataclasses.replace(random_gaussians(1), colors=torch.tensor([[-0.5, 0.25, 1.5]]))
+    write_ply(tmp_path / "a.ply", gaussians)
+    torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, torch.tensor([[0, 0.25, 1.5]]), rtol=0, atol=1e-6)
+
+
 def test_comments_are_kept_one_a_line(tmp_path):
     write_ply(tmp_path / "a.ply", random_gaussians(3), ["seed 7", "two\nend_header\nlines", "größe"])
     ply = PlyData.read(tmp_path / "a.ply")
@@ -157,7 +163,7 @@ BROKEN = {
     "text": lambda data: b"<html>not a splat</html>\n" * 100,
     "zeros": lambda data: bytes(200_000),
     "no line breaks": lambda data: b"a" * 300_000,
-    "endless header": lambda data: data[:40] + b"comment x\n" * 20_000,
+    "endless header": lambda data: with_line(data, b"end_header\n", b"comment x\n" * 20_000 + b"end_header\n"),
     "huge count": lambda data: with_line(data, b"vertex 10\n", b"vertex 1000000000000\n"),
     "count of 5000 digits": lambda data: with_line(data, b"vertex 10\n", b"vertex " + b"9" * 5000 + b"\n"),
     "negative count": lambda data: with_line(data, b"vertex 10\n", b"vertex -10\n"),

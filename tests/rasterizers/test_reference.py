@@ -8,7 +8,7 @@ from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rendering, RenderingConstants
+from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians
 
 CONSTANTS = RenderingConstants()
@@ -157,3 +157,9 @@ def test_images_of_one_row_or_column(size: tuple[int, int]) -> None:
     alpha = render(at_pixel(camera, column, row, 2, 0.7), camera).alpha
     assert alpha.shape == (1, 1, 1, *size)
     assert alpha[0, 0, 0, row, column].item() == pytest.approx(0.7, rel=1e-12)
+
+
+def test_a_backend_is_recognised_as_a_rasterizer_at_run_time() -> None:
+    """Functions that take a `Rasterizer` are checked when the tests run."""
+    assert isinstance(ReferenceRasterizer(), Rasterizer)
+    assert not isinstance(CONSTANTS, Rasterizer)

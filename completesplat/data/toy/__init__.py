@@ -1,5 +1,23 @@
 """Procedural scenes, ray-traced and written to disk in the layouts of the real data sets."""
 
-from completesplat.data.toy.objects import write_objects
+from pathlib import Path
+from typing import Any
 
-__all__ = ["write_objects"]
+from completesplat.data.toy.objects import write_objects
+from completesplat.errors import DataError
+
+KINDS = {"objects": write_objects}
+
+
+def write(kind: str, out: Path, **settings: Any) -> Path:
+    """Write scenes of a kind (a key of `KINDS`); returns their folder.
+
+    Raises:
+        DataError: there is no such kind, or the folder holds something else.
+    """
+    if kind not in KINDS:
+        raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
+    return KINDS[kind](out, **settings)
+
+
+__all__ = ["write", "write_objects"]

@@ -1,10 +1,13 @@
 """A small analytic ray tracer: ellipsoids and cone frusta on a patterned ground inside a coloured dome.
 
-Shading is Lambertian, so a point looks the same from everywhere. The kernels carry no annotations because run-time
-type checkers would hide them from numba, and share one file because numba's cache watches only the caller's.
+Shading is Lambertian, so a point looks the same from everywhere. All kernels are in this file because numba's cache on
+disk watches only the file of the function that is called.
 """
 
+import inspect
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -16,9 +19,17 @@ SELF_INTERSECTION = 1e-6
 # The patch is where the horizontal cosine between normal and patch direction exceeds this: never seen from the front.
 PATCH_EDGE = 0.72
 
-kernel = njit(cache=True, nogil=True, error_model="numpy")
-# Inlined, because passing a tuple of arrays to a numba function costs as much as meeting a sphere.
-inlined = njit(nogil=True, error_model="numpy", inline="always")
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+
+
+def kernel(function: Callable) -> Callable:
+    """Compiled on the first call and kept on disk; a run-time type checker's wrapper is taken off first."""
+    return njit(cache=True, **OPTIONS)(inspect.unwrap(function))
+
+
+def inlined(function: Callable) -> Callable:
+    """Part of a kernel: passing a tuple of arrays to a numba function costs as much as meeting a sphere."""
+    return njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
 
 
 @inlined
@@ -184,13 +195,26 @@ def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
 
 
 @kernel
-def trace(geometry, around, patch, origins, directions):
-    """Colours [ray 3], distances [ray] and what is seen [ray] along rays of unit direction."""
-    colors, distances = np.empty_like(origins), np.empty(len(origins))
-    seen = np.empty(len(origins), dtype=np.int64)
-    for i in range(len(origins)):
-        ox, oy, oz = origins[i, 0], origins[i, 1], origins[i, 2]
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        red, green, blue, distances[i], seen[i] = _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz)
-        colors[i, 0], colors[i, 1], colors[i, 2] = red, green, blue
-    return colors, distances, seen
+def trace(geometry, around, patch, pose, rays):
+    """Colours [pixel 3], object coverage [pixel] and distances [pixel] seen by a camera of pose `camera_to_world`.
+
+    Colours and coverage are means over each pixel's `rays` [pixel sample 3] (of unit length, in the camera's frame);
+    the distance is the middle ray's.
+    """
+    pixels, samples, _ = rays.shape
+    colors, coverage, distances = np.zeros((pixels, 3)), np.zeros(pixels), np.zeros(pixels)
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    for pixel in range(pixels):
+        for sample in range(samples):
+            x, y, z = rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2]
+            dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
+            dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
+            dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
+            red, green, blue, distance, seen = _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz)
+            colors[pixel, 0] += red / samples
+            colors[pixel, 1] += green / samples
+            colors[pixel, 2] += blue / samples
+            coverage[pixel] += (seen >= 0) / samples
+            if sample == samples // 2:
+                distances[pixel] = distance
+    return colors, coverage, distances

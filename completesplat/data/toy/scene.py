@@ -5,6 +5,7 @@ the CO3D reader brings every scene to); cameras circle at about 2.1, the dome st
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -12,11 +13,11 @@ import torch
 from completesplat.data.toy.ingredients import BANDS, CHECKS, Array, Geometry, Patch, Surroundings
 from completesplat.data.toy.raytracing import trace
 from completesplat.data.toy.shapes import FAMILIES, Part, color, geometry, rotation_about
-from completesplat.geometry.cameras import look_at
+from completesplat.geometry.cameras import invert_rigid, look_at
 
 OBJECT_HALF_SIZE = 0.57
 DOME_RADIUS = 3.5
-SURFACE_RAYS = 8000
+SURFACE_DIRECTIONS, SURFACE_RAYS = 60, 130
 PATCH_COLORS = {
     "red": (0.9, 0.08, 0.1),
     "green": (0.1, 0.7, 0.2),
@@ -24,6 +25,7 @@ PATCH_COLORS = {
     "yellow": (0.98, 0.85, 0.1),
 }
 SAMPLES = 3
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -78,19 +80,20 @@ def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, 
 
     Pixels average SAMPLES^2 rays. Depth is the middle ray's, along the optical axis, in the scene's own lengths.
     """
-    centers = (np.arange(size * SAMPLES) + 0.5) / SAMPLES - size / 2
-    u, v = np.meshgrid(centers, centers)
-    focal = 0.5 * size / np.tan(np.radians(scene.fov_degrees) / 2)
-    rays = np.stack([u, v, np.full_like(u, focal)], axis=-1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = _camera_rays(scene.fov_degrees, size)
     pose = scene.camera_to_world[frame]
-    eyes = np.broadcast_to(pose[:3, 3], rays.shape).copy()
-    colors, distances, seen = trace(scene.geometry, scene.surroundings, scene.patch, eyes, rays @ pose[:3, :3].T)
-    grid = (size, SAMPLES, size, SAMPLES)
-    image = colors.reshape(*grid, 3).mean(axis=(1, 3))
-    coverage = (seen >= 0).reshape(grid).mean(axis=(1, 3))
-    depth = (distances * rays[:, 2]).reshape(grid)[:, SAMPLES // 2, :, SAMPLES // 2]
-    return image, coverage, depth
+    colors, coverage, distances = trace(scene.geometry, scene.surroundings, scene.patch, pose, rays)
+    depth = distances * rays[:, SAMPLES**2 // 2, 2]
+    return colors.reshape(size, size, 3), coverage.reshape(size, size), depth.reshape(size, size)
+
+
+@lru_cache(maxsize=1)
+def _camera_rays(fov_degrees: float, size: int) -> Array:
+    """Unit rays in the camera's frame, [pixel sample 3], rows of pixels from the top."""
+    centers = (np.arange(size * SAMPLES) + 0.5) / SAMPLES - size / 2
+    v, u = (axis.reshape(size, SAMPLES, size, SAMPLES).swapaxes(1, 2) for axis in np.meshgrid(centers, centers)[::-1])
+    rays = np.stack([u, v, np.full_like(u, 0.5 * size / np.tan(np.radians(fov_degrees) / 2))], axis=-1)
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(size * size, SAMPLES**2, 3)
 
 
 def _orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
@@ -102,9 +105,8 @@ def _orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
     level = np.cos(elevation)
     eyes = radius * np.stack([level * np.sin(azimuth), np.sin(elevation), level * np.cos(azimuth)])
     targets = rng.normal(0, 0.03, (frames, 3))
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
-    world_to_camera = look_at(torch.from_numpy(eyes.T.copy()), torch.from_numpy(targets), up)
-    return np.linalg.inv(world_to_camera.numpy())
+    world_to_camera = look_at(torch.from_numpy(eyes.T.copy()), torch.from_numpy(targets), UP)
+    return invert_rigid(world_to_camera).numpy()
 
 
 def _surroundings(rng: np.random.Generator) -> Surroundings:
@@ -128,15 +130,18 @@ def _surroundings(rng: np.random.Generator) -> Surroundings:
 def _surface(
     rng: np.random.Generator, parts: tuple[Part, ...], surroundings: Surroundings, patch: Patch
 ) -> tuple[Array, Array]:
-    """Points on the object that can be seen from above, with their colours: hits of uniformly random lines."""
+    """Points on the object that can be seen from above, with their colours: hits of random, nearly parallel rays."""
     shape = geometry(parts)
-    directions = rng.normal(size=(SURFACE_RAYS, 3))
-    directions[:, 1] = -np.abs(directions[:, 1])
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    offsets = rng.normal(size=(SURFACE_RAYS, 3))
-    offsets -= (offsets * directions).sum(axis=1, keepdims=True) * directions
-    offsets *= np.sqrt(rng.uniform(size=(SURFACE_RAYS, 1))) / np.linalg.norm(offsets, axis=1, keepdims=True)
-    origins = shape.bounding_radius * (offsets - directions)
-    colors, distances, seen = trace(shape, surroundings, patch, origins, directions)
-    points = origins + distances[:, None] * directions
-    return points[seen >= 0], colors[seen >= 0]
+    points, colors = [], []
+    for _ in range(SURFACE_DIRECTIONS):
+        azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1)
+        level = np.sqrt(1 - height**2)
+        outwards = torch.tensor([level * np.sin(azimuth), height, level * np.cos(azimuth)], dtype=torch.float64)
+        pose = invert_rigid(look_at(20 * shape.bounding_radius * outwards, torch.zeros_like(outwards), UP)).numpy()
+        angle, radius = rng.uniform(0, 2 * np.pi, SURFACE_RAYS), np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
+        rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        seen, coverage, distances = trace(shape, surroundings, patch, pose, rays[:, None])
+        points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])
+        colors.append(seen[coverage > 0])
+    return np.concatenate(points), np.concatenate(colors)

@@ -21,7 +21,8 @@ from completesplat.rasterizers.kernels.simd import (
     store,
 )
 
-BLOCK = layout.BLOCK
+BLOCK, BLOCK_SHIFT = layout.BLOCK, layout.BLOCK_SHIFT
+SLACK = np.float32(layout.SLACK)
 WORD_BITS = 64
 WORD_SHIFT = 6
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -59,7 +60,7 @@ def close_block(open_words, row, column):
 
 
 @helper
-def row_spans(records, j, reach, top, bottom, width, spans):
+def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
     """Pixel columns that the ellipse of record j touches in the block rows top..bottom, to spans[:, row - top].
 
     In a row at d_y it reaches from SHEAR d_y - h to SHEAR d_y + h with h^2 = (reach - (V d_y)^2) / U^2. Over the
@@ -68,6 +69,7 @@ def row_spans(records, j, reach, top, bottom, width, spans):
     center_x, center_y = records[j, layout.CENTER_X], records[j, layout.CENTER_Y]
     shear, v, inverse_u = records[j, layout.SHEAR], records[j, layout.V], records[j, layout.INVERSE_U]
     rightmost, extent = records[j, layout.RIGHTMOST_Y], records[j, layout.EXTENT_Y]
+    reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha + SLACK
     limit = np.float32(width)
     for row in range(top, bottom + 1, LANES):
         low = row_tops() + (np.float32(row * BLOCK) - center_y)

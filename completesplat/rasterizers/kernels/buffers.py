@@ -45,6 +45,12 @@ def _take(size: int) -> np.ndarray:
     return np.empty(needed, np.uint8)
 
 
+def release() -> None:
+    """Give the memory that is not in use back to the system."""
+    with _lock:
+        _free.clear()
+
+
 def _forget_lock() -> None:
     """Another thread of the parent may have held the lock at the moment of a fork."""
     global _lock

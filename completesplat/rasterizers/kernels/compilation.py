@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba import config as numba_config
 
+numba_config: Any = numba.config
 logger = logging.getLogger(__name__)
 
 # Neither "nnan" nor "ninf": with them the optimiser may remove the tests for values that are not finite.

@@ -10,6 +10,7 @@ from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import (
     BIT,
     BLOCK,
+    BLOCK_SHIFT,
     WORD_SHIFT,
     ZERO,
     alpha_at,
@@ -58,12 +59,11 @@ def composite(
         top, bottom = max(rows & 0xFFFF, first_row), min(rows >> 16, end_row - 1)
         if bottom < top:
             continue
-        reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha
-        row_spans(records, j, reach, top, bottom, width, spans)
+        row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
         for row in range(top, bottom + 1):
-            first, last = int(spans[row - top]) // BLOCK, int(spans[second + row - top]) // BLOCK
+            first, last = int(spans[row - top]) >> BLOCK_SHIFT, int(spans[second + row - top]) >> BLOCK_SHIFT
             if last < first:
                 continue
             for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):

@@ -11,6 +11,7 @@ from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import (
     BIT,
     BLOCK,
+    BLOCK_SHIFT,
     ONE,
     WORD_SHIFT,
     ZERO,
@@ -73,8 +74,7 @@ def composite_backward(
         if bottom < top or blocks_left == 0:
             gradients[index, layout.REACHED] = ZERO
             continue
-        reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha
-        row_spans(records, j, reach, top, bottom, width, spans)
+        row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
         reached = False
@@ -82,7 +82,7 @@ def composite_backward(
         sum_red, sum_green, sum_blue, sum_z = zero, zero, zero, zero
         sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv = zero, zero, zero, zero, zero, zero
         for row in range(top, bottom + 1):
-            first, last = int(spans[row - top]) // BLOCK, int(spans[second + row - top]) // BLOCK
+            first, last = int(spans[row - top]) >> BLOCK_SHIFT, int(spans[second + row - top]) >> BLOCK_SHIFT
             if last < first:
                 continue
             for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):
@@ -122,9 +122,7 @@ def composite_backward(
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
         if reached:
-            sums = lane_sums(
-                (sum_red, sum_green, sum_blue, sum_z, sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
-            )
+            sums = lane_sums((sum_red, sum_green, sum_blue, sum_z, sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv))
             store(flat_gradients, index * layout.GRADIENT_WIDTH, sums + reached_flag())
         else:
             gradients[index, layout.REACHED] = ZERO

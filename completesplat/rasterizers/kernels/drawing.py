@@ -1,6 +1,8 @@
 """The kernels in their order, over all scenes and views of a batch, on several threads."""
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +21,7 @@ from completesplat.rasterizers.protocol import RenderingConstants
 
 # A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
 # sums over bands depend on where the bands end, and results must not depend on the number of threads.
-FEWEST_TASKS = 8
+FEWEST_TASKS = 4
 VIEWS_AT_ONCE = 8  # without gradients, where the projected Gaussians are not kept
 CHUNK = 2048  # Gaussians to a task of the projection's backward pass
 
@@ -93,14 +95,12 @@ class Drawing:
     def draw(self) -> Images:
         """Project and composite every view."""
         shape = (self.scenes, self.views)
-        images = Images(
-            *(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1))
-        )
+        images = Images(*(np.empty((*shape, channels, self.height, self.width), np.float32) for channels in (3, 1, 1)))
         parallel(self._prepare, self.scenes)
         for start in range(0, self.scenes * self.views, self.held or 1):
             number = min(self.held, self.scenes * self.views - start)
-            parallel(lambda slot, start=start: self._project(start + slot, slot), number)
-            parallel(lambda task, start=start: self._composite(start, task, images), number * len(self.bands))
+            parallel(partial(self._project, start), number)
+            parallel(partial(self._composite, images, start), number * len(self.bands))
         return images
 
     def backward(self, images: Images, gradients: Images) -> Parameters:
@@ -108,18 +108,18 @@ class Drawing:
         buffers = Buffers()
         bands, views = len(self.bands), self.scenes * self.views
         sums = buffers.empty((self.scenes, self.views, bands, self.count, layout.GRADIENT_WIDTH))
-        parallel(lambda task: self._composite_backward(task, images, gradients, sums), views * bands)
+        parallel(partial(self._composite_backward, images, gradients, sums), views * bands)
         result = Parameters(*(np.empty_like(x) for x in self.parameters))
         chunks = -(-self.count // CHUNK)
-        parallel(lambda task: self._project_backward(*divmod(task, chunks), sums, result), self.scenes * chunks)
+        parallel(partial(self._project_backward, result, sums), self.scenes * chunks)
         return result
 
     def _prepare(self, scene: int) -> None:
         prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
 
-    def _project(self, view: int, slot: int) -> None:
+    def _project(self, start: int, slot: int) -> None:
         buffers = Buffers()
-        scene, camera = divmod(view, self.views)
+        scene, camera = divmod(start + slot, self.views)
         self.visible_counts[slot] = project(
             self.parameters.means[scene],
             self.parameters.colors[scene],
@@ -136,17 +136,17 @@ class Drawing:
             self.visible[slot],
         )
 
-    def _composite(self, start: int, task: int, images: Images) -> None:
+    def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         self._run(composite, STATE_VECTORS, slot, band, images.view(*divmod(start + slot, self.views)))
 
-    def _composite_backward(self, task: int, images: Images, gradients: Images, sums: np.ndarray) -> None:
+    def _composite_backward(self, images: Images, gradients: Images, sums: np.ndarray, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         scene, view = divmod(slot, self.views)
         arrays = (*images.view(scene, view), *gradients.view(scene, view), sums[scene, view, band])
         self._run(composite_backward, BACKWARD_STATE_VECTORS, slot, band, arrays)
 
-    def _run(self, kernel, state_vectors: int, slot: int, band: int, arrays: tuple[np.ndarray, ...]) -> None:
+    def _run(self, kernel: Callable, state_vectors: int, slot: int, band: int, arrays: tuple[np.ndarray, ...]) -> None:
         buffers = Buffers()
         first, end = self.bands[band]
         columns = -(-self.width // layout.BLOCK)
@@ -156,7 +156,8 @@ class Drawing:
         count = self.visible_counts[slot]
         kernel(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
-    def _project_backward(self, scene: int, chunk: int, sums: np.ndarray, result: Parameters) -> None:
+    def _project_backward(self, result: Parameters, sums: np.ndarray, task: int) -> None:
+        scene, chunk = divmod(task, -(-self.count // CHUNK))
         views = slice(scene * self.views, (scene + 1) * self.views)
         means, quaternions, scales, opacities, _ = (x[scene] for x in self.parameters)
         project_backward(

@@ -44,3 +44,7 @@ CAMERA_WIDTH = 20
 # images are worked on in blocks of 4 x 4 pixels, one SIMD lane each, row-major
 BLOCK = 4
 BLOCK_SHIFT = 2
+
+# Blocks are chosen for alphas down to 2^-SLACK of the threshold (1e-4 below it): rounding in this choice must not
+# lose a pixel. What counts is the test at the pixel itself.
+SLACK = 1.5e-4

@@ -23,9 +23,6 @@ Array = np.ndarray
 
 HALF = np.float64(0.5)
 LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
-# Blocks are chosen for alphas down to 2^-SLACK of the threshold (about 1e-4 relative): rounding in this choice must
-# not lose a pixel. What counts is the test at the pixel itself.
-SLACK = np.float64(1e-4)
 # Ellipses larger than this are left out: the square of their extent in px has to fit in float32.
 LARGEST_EXTENT = np.float64(1e18)
 
@@ -36,10 +33,10 @@ PASSES = 3  # of 11 bits: enough for the 31 bits of a positive float32
 
 @helper
 def all_finite(row):
-    for value in row.flat:
-        if not abs(value) <= LARGEST_FLOAT32:
-            return False
-    return True
+    finite = True
+    for entry in range(row.shape[0]):
+        finite &= abs(row[entry]) <= LARGEST_FLOAT32
+    return finite
 
 
 @kernel
@@ -60,7 +57,7 @@ def prepare(
         log2_opacity = math.log2(np.float64(opacities[i]))
         prepared[i, layout.LOG2_OPACITY_PREPARED] = log2_opacity
         visible = log2_opacity >= log2_min_alpha
-        prepared[i, layout.REACH] = log2_opacity - log2_min_alpha + SLACK if visible else -ONE
+        prepared[i, layout.REACH] = log2_opacity - log2_min_alpha + layout.SLACK if visible else -ONE
 
 
 @kernel

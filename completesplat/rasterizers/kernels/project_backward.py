@@ -84,8 +84,16 @@ def band_sums(gradients, view, i):
         g = gradients[view, band, i]
         if g[layout.REACHED] != 0:
             reached = 1.0
-            s0 += g[0]; s1 += g[1]; s2 += g[2]; s3 += g[3]; s4 += g[4]  # noqa: E702
-            s5 += g[5]; s6 += g[6]; s7 += g[7]; s8 += g[8]; s9 += g[9]  # noqa: E702
+            s0 += g[0]
+            s1 += g[1]
+            s2 += g[2]
+            s3 += g[3]
+            s4 += g[4]
+            s5 += g[5]
+            s6 += g[6]
+            s7 += g[7]
+            s8 += g[8]
+            s9 += g[9]
     return s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, reached
 
 
@@ -146,9 +154,7 @@ def view_gradients(means, prepared, camera, blur, i, sums):
 
 
 @helper
-def point_gradient(
-    camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y
-):
+def point_gradient(camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y):
     """Gradient with respect to the mean in camera coordinates, through its pixel position and the Jacobian."""
     focal_x, focal_y = camera[layout.FOCAL_X], camera[layout.FOCAL_Y]
     min_x, max_x = camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X]

@@ -1,0 +1,78 @@
+import subprocess
+import sys
+import time
+
+import pytest
+
+from completesplat import __version__
+from completesplat.cli import VERBS
+
+
+def test_help_lists_the_verbs(command):
+    finished = command("--help")
+    assert finished.status == 0
+    assert all(f"  {verb} " in finished.out for verb in VERBS)
+
+
+def test_help_needs_no_heavy_import():
+    """In a process of its own, by what is imported rather than by the clock."""
+    program = "import sys; sys.argv = ['completesplat', '--help']; from completesplat.cli import main; main(); "
+    program += "print([m for m in ('torch', 'lightning', 'hydra', 'diffusers', 'numpy') if m in sys.modules])"
+    start = time.perf_counter()
+    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert output.splitlines()[-1] == "[]"
+    assert time.perf_counter() - start < 10  # a hang, not a benchmark
+
+
+def test_version(command):
+    assert command("--version").out == f"completesplat {__version__}\n"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verbs_help_shows_its_settings(command, verb):
+    finished = command(verb, "--help")
+    assert finished.status == 0
+    assert f"completesplat {verb}: " in finished.out
+    assert "out: " in finished.out
+
+
+def test_fits_help_shows_the_groups(command):
+    finished = command("fit", "--help")
+    for group in ("autoreconstructor", "data", "denoiser", "experiment", "loss", "model", "rasterizer", "sampler"):
+        assert f"{group}: " in finished.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nonsense"], "no verb 'nonsense'"),
+        (["fit", "nonsense=1"], "nonsense"),
+        (["fit", "experiment=nonsense"], "nonsense"),
+        (
+            ["fit", "experiment=toy_diffusion", "data.root=nowhere", "data.scenes=0"],
+            "model.autoreconstructor_checkpoint",
+        ),
+        (["predict"], "image is needed"),
+        (["predict", "image=x.jpg"], "weights is needed"),
+        (["predict", "image=x.jpg", "weights=nowhere"], "nowhere: no config.json here"),
+        (["predict", "image=x.jpg", "weights=nowhere", "skip_weight=1.5"], "skip_weight=1.5"),
+        (["predict", "image=x.jpg", "weights=nowhere", "samples=0"], "samples=0"),
+        (["test"], "ckpt is needed"),
+        (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
+        (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),
+        (["data", "nonsense"], "nonsense"),
+    ],
+)
+def test_refusals_are_one_line_and_status_two(command, arguments, said):
+    finished = command(*arguments)
+    assert finished.status == 2
+    assert finished.err.startswith("error: ")
+    assert finished.err.count("\n") == 1
+    assert said in finished.err
+
+
+def test_two_launches_in_one_second_do_not_share_a_directory():
+    program = "from completesplat.commands import RUN_NAME; print(RUN_NAME)"
+    processes = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    names = [process.communicate()[0].strip() for process in processes]
+    assert len(set(names)) == 2

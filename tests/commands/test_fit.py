@@ -1,0 +1,82 @@
+import csv
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from support import SMALL, strict_json
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_a_run_directory_is_complete(pipeline, stage):
+    run = getattr(pipeline, stage)
+    config = OmegaConf.load(run / "config.yaml")
+    assert config.out == str(run)
+    assert OmegaConf.to_container(config, resolve=True)["trainer"]["max_steps"] == 2
+    metrics = strict_json(run / "metrics.json")
+    assert metrics["steps"] == 2
+    assert "val/psnr_novel" in metrics
+    with open(run / "metrics.csv") as file:
+        assert "val/psnr_novel" in next(csv.reader(file))
+    record = strict_json(run / "run.json")
+    assert record["command"][0] == "completesplat fit"
+    assert record["commit"] is None or len(record["commit"].removesuffix("-dirty")) == 40
+    assert (run / "checkpoints/last.ckpt").is_file()
+
+
+def test_checkpoints_hold_plain_tensors_only(pipeline):
+    for run in (pipeline.var, pipeline.diffusion):
+        contents = torch.load(run / "checkpoints/last.ckpt", map_location="cpu", weights_only=True)
+        assert contents["global_step"] == 2
+
+
+def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
+    stage1 = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    stage2 = torch.load(pipeline.diffusion / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    for name, value in stage1.items():
+        kept = stage2[name.replace("model.", "completesplat.autoreconstructor.", 1)]
+        torch.testing.assert_close(kept, value, rtol=0, atol=0)
+    assert stage2["completesplat.latent_scale"] not in (0, 1)
+    near, far = stage2["completesplat.depth_range"]
+    assert 0 < near < far
+    assert stage2["completesplat.up"][1] < -0.5  # the toy cameras stand upright
+
+
+def test_a_run_is_continued_from_its_checkpoint(command, pipeline, tmp_path):
+    resume = f"resume={pipeline.var / 'checkpoints/last.ckpt'}"
+    settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=3", "experiment=toy_var"]
+    assert command("fit", *settings, resume, f"out={tmp_path / 'more'}").status == 0
+    assert strict_json(tmp_path / "more" / "metrics.json")["steps"] == 3
+
+
+def test_a_sweep_leaves_a_complete_directory_for_each_job(command, pipeline, tmp_path):
+    settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
+    finished = command("fit", "-m", *settings, "seed=0,1", f"out={tmp_path / 'sweep'}")
+    assert finished.status == 0
+    runs = sorted(path.parent for path in (tmp_path / "sweep").glob("*/config.yaml"))
+    assert len(runs) == 2
+    assert [OmegaConf.load(run / "config.yaml").seed for run in runs] == [0, 1]
+    weights = []
+    for run in runs:
+        assert strict_json(run / "metrics.json")["steps"] == 1
+        assert (run / "metrics.csv").is_file()
+        weights.append(torch.load(run / "checkpoints/last.ckpt", weights_only=True)["state_dict"])
+    assert any((weights[0][name] != weights[1][name]).any() for name in weights[0])
+
+
+def test_the_seed_decides_the_weights(command, pipeline, tmp_path):
+    settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=2", "seed=0"]
+    assert command("fit", *settings, f"out={tmp_path / 'again'}").status == 0
+    again = torch.load(tmp_path / "again/checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    first = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    for name, value in first.items():
+        torch.testing.assert_close(again[name], value, rtol=0, atol=0)
+
+
+def test_weights_of_another_architecture_are_refused(command, pipeline, tmp_path):
+    stage1 = pipeline.var / "checkpoints/last.ckpt"
+    finished = command(
+        "fit", "experiment=toy_diffusion", f"data.root={pipeline.toy}", *SMALL, f"out={tmp_path / 'other'}",
+        f"model.autoreconstructor_checkpoint={stage1}", "autoreconstructor.reconstructor.skip_levels=[0,1]",
+    )  # fmt: skip
+    assert finished.status == 2
+    assert "weights of another architecture" in finished.err.splitlines()[-1]

@@ -1,0 +1,29 @@
+import pytest
+from support import strict_json
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, stage):
+    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
+    finished = command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}", "trainer.accelerator=cpu")
+    assert finished.status == 0
+    assert finished.out.splitlines()[-1] == str(tmp_path / "scores")
+    metrics = strict_json(tmp_path / "scores" / "metrics.json")
+    assert list(metrics) == ["model", "mean_image", "copy_reference"]
+    for scores in metrics.values():
+        for region in ("full", "object"):
+            for view in ("novel", "reference"):
+                assert 0 < scores[region][view]["psnr"] <= 100
+                assert -1 <= scores[region][view]["ssim"] <= 1
+        assert scores["scenes"] > 0
+        assert scores["views"] == scores["scenes"] * 2
+    assert metrics["copy_reference"]["full"]["reference"]["psnr"] == 100
+    assert "copy_reference" in finished.out
+
+
+def test_the_runs_configuration_can_be_changed(command, pipeline, tmp_path):
+    checkpoint = pipeline.var / "checkpoints/last.ckpt"
+    change = "overrides=[data.evaluation_targets=1]"
+    assert command("test", f"ckpt={checkpoint}", change, f"out={tmp_path / 'one'}").status == 0
+    model = strict_json(tmp_path / "one" / "metrics.json")["model"]
+    assert model["views"] == model["scenes"]

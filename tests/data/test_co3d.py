@@ -1,0 +1,193 @@
+"""The data module on toy objects: shapes, frames of reference, protocols and repeatability."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from PIL import Image
+from plyfile import PlyData
+
+from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.co3d_annotations import object_placement
+from completesplat.data.toy import write_objects
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import project
+from completesplat.scene import SceneBatch
+
+
+def module(root: Path, **settings) -> CO3DDataModule:
+    data = CO3DDataModule(str(root), "toy_objects", **{"image_size": 16, "batch_size": 2, "targets": 2, **settings})
+    data.setup()
+    return data
+
+
+def epoch(loader, number: int) -> list[SceneBatch]:
+    loader.sampler.set_epoch(number)
+    return list(loader)
+
+
+def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
+    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
+        views = batch.all_views()
+        return [views.images, views.masks, views.cameras.world_to_camera, views.cameras.intrinsics, batch.depth_range]
+
+    return len(one) == len(other) and all(
+        a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def test_training_batches_have_the_stated_shapes(toy_root):
+    data = module(toy_root, references_per_sequence=3)
+    batches = epoch(data.train_dataloader(), 0)
+    assert [len(batch.names) for batch in batches] == [2, 2, 2]
+    batch = batches[0]
+    assert batch.reference.images.shape == (2, 3, 16, 16)
+    assert batch.targets.images.shape == (2, 2, 3, 16, 16)
+    assert batch.targets.masks.shape == (2, 2, 1, 16, 16)
+    assert batch.targets.cameras.world_to_camera.shape == (2, 2, 4, 4)
+    assert batch.reference.cameras.image_size == (16, 16)
+    assert batch.depth_range.shape == (2, 2)
+    assert batch.reference.images.dtype == batch.reference.cameras.world_to_camera.dtype == torch.float32
+    assert 0 <= batch.reference.images.min() < batch.reference.images.max() <= 1
+
+
+def test_the_world_is_the_reference_frame(toy_root):
+    for batch in epoch(module(toy_root).train_dataloader(), 0):
+        identity = torch.eye(4).expand(2, 4, 4)
+        torch.testing.assert_close(batch.reference.cameras.world_to_camera, identity, atol=1e-6, rtol=0)
+
+
+def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
+    """The point cloud, brought into the reference frame, spans 0.57 and projects onto every view's mask."""
+    store = module(toy_root, depth_before=1.0, depth_after=2.0).store("test")
+    scene = store.scene(0, 0, [1, 2, 3])
+    cloud = store.sequences[0].point_cloud
+    center, factor = object_placement(cloud)
+    vertices = PlyData.read(str(cloud))["vertex"]
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
+    assert np.abs(points - center.numpy()).max() * factor == pytest.approx(0.57)
+    pose = store.sequences[0].frames[0].camera.world_to_camera.numpy()
+    local = torch.from_numpy((points @ pose[:3, :3].T + pose[:3, 3]) * factor).float()
+    for view in range(3):
+        pixels = project(scene.targets.cameras[view], local)[0].long()
+        mask = scene.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]]
+        assert (mask > 0).float().mean() > 0.97
+    middle = local.mean(dim=0)[2].item()
+    assert scene.depth_range.tolist() == pytest.approx([middle - 1, middle + 2], abs=1e-4)
+    assert 1.8 < middle < 2.4
+
+
+def test_the_near_end_stays_in_front_of_the_camera(toy_root):
+    near, far = module(toy_root, depth_before=50.0).store("test").scene(0, 0, [1]).depth_range.tolist()
+    assert 0 < near < far
+
+
+def test_pictures_are_the_files_where_nothing_is_resized(toy_root):
+    store = module(toy_root, image_size=32).store("train")
+    scene = store.scene(1, 2, [0])
+    frame = store.sequences[1].frames[2]
+    expected = torch.from_numpy(np.asarray(Image.open(frame.image)).copy()).permute(2, 0, 1) / 255
+    torch.testing.assert_close(scene.reference.images, expected)
+    mask = torch.from_numpy(np.asarray(Image.open(frame.mask)).copy())[None] / 255
+    torch.testing.assert_close(scene.reference.masks, mask)
+
+
+def test_epochs_differ_and_can_be_repeated(toy_root):
+    data = module(toy_root, references_per_sequence=4)
+    loader = data.train_dataloader()
+    first = epoch(loader, 0)
+    assert not equal(first, epoch(loader, 1))
+    assert equal(first, epoch(module(toy_root, references_per_sequence=4).train_dataloader(), 0))
+    assert not equal(first, epoch(module(toy_root, references_per_sequence=4, seed=1).train_dataloader(), 0))
+
+
+def test_an_item_draws_other_views_in_another_epoch(toy_root):
+    items = module(toy_root, references_per_sequence=4).train_dataloader().dataset
+    assert not equal([items[0, i] for i in range(8)], [items[1, i] for i in range(8)])
+    assert equal([items[1, i] for i in range(8)], [items[1, i] for i in range(8)])
+
+
+def test_neither_workers_nor_the_cache_change_what_is_drawn(toy_root):
+    plain = module(toy_root, references_per_sequence=4, cache=False).train_dataloader()
+    loader = module(toy_root, references_per_sequence=4, workers=2).train_dataloader()
+    for number in (0, 1):
+        assert equal(epoch(plain, number), epoch(loader, number))
+
+
+def test_evaluation_goes_from_the_first_frame_to_all_others(toy_root):
+    data = module(toy_root)
+    for loader, split in ((data.test_dataloader(), "test"), (data.val_dataloader(), "val")):
+        (batch,) = list(loader)
+        expected = data.store(split).scene(0, 0, [1, 2, 3])
+        assert batch.names == (data.store(split).sequences[0].name,)
+        assert torch.equal(batch.reference.images[0], expected.reference.images)
+        assert torch.equal(batch.targets.images[0], expected.targets.images)
+    (batch,) = list(module(toy_root, evaluation_targets=1).test_dataloader())
+    assert batch.targets.images.shape[1] == 1
+
+
+def test_evaluation_scenes_of_unequal_length_come_one_by_one(toy_root):
+    data = module(toy_root, evaluation_batch_size=2)
+    members = data.store("train").sequences
+    shorter = type(members[0])("shorter", members[0].frames[:3], members[0].point_cloud)
+    data.store("test").sequences.append(shorter)
+    assert [batch.targets.images.shape[:2] for batch in data.test_dataloader()] == [(1, 3), (1, 2)]
+
+
+class Recorder(LightningModule):
+    """Keeps the first reference image of every epoch, trains nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.seen: list[torch.Tensor] = []
+
+    def training_step(self, batch: SceneBatch, index: int) -> torch.Tensor:
+        if index == 0:
+            self.seen.append(batch.reference.images)
+        return self.weight * 0
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_lightning_tells_the_sampler_the_epoch(toy_root, workers):
+    data = module(toy_root, workers=workers, references_per_sequence=2)
+    recorder = Recorder()
+    Trainer(
+        max_epochs=3, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, limit_val_batches=0,
+    ).fit(recorder, datamodule=data)  # fmt: skip
+    loader = module(toy_root, references_per_sequence=2).train_dataloader()
+    for number, image in enumerate(recorder.seen):
+        assert torch.equal(image, epoch(loader, number)[0].reference.images)
+    assert len(recorder.seen) == 3
+
+
+def test_typical_camera_is_the_mean_of_the_training_frames(toy_root):
+    data = module(toy_root, depth_before=1.0, depth_after=2.0)
+    fov, (near, far) = data.typical_camera()
+    scenes = [data.store("train").scene(i, f, [0]) for i in range(2) for f in range(4)]
+    ranges = torch.stack([scene.depth_range for scene in scenes])
+    assert (near, far) == pytest.approx(tuple(ranges.mean(dim=0).tolist()))
+    # Half of the image over the focal length is the tangent of half of the angle.
+    angles = [2 * np.degrees(np.arctan(8 / scene.reference.cameras.intrinsics[0, 0].item())) for scene in scenes]
+    assert fov == pytest.approx(np.mean(angles))
+
+
+def test_mean_image_is_the_mean_of_the_training_frames(toy_root):
+    data = module(toy_root)
+    images = [data.store("train").scene(i, f, [0]).reference.images for i in range(2) for f in range(4)]
+    torch.testing.assert_close(data.mean_image(), torch.stack(images).mean(dim=0))
+
+
+def test_an_empty_split_is_refused_where_it_is_needed(tmp_path):
+    write_objects(tmp_path, scenes=1, frames=2, size=8, seed=0, workers=1, progress=False)
+    data = CO3DDataModule(str(tmp_path), "toy_objects")
+    for stage in ("fit", "validate", "test"):
+        with pytest.raises(DataError, match="fewview_train"):
+            data.setup(stage)
