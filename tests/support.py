@@ -5,8 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
 
 from completesplat import cli
+from completesplat.commands import conf_folder, register_resolvers
+from completesplat.generation import CompleteSplat
 
 SMALL = [
     "trainer.max_steps=2",
@@ -36,3 +41,26 @@ def strict_json(path: Path):
         raise ValueError(f"{path} holds {name}")
 
     return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def compose_config(verb: str, *overrides: str):
+    """The configuration of a verb, as the command line would compose it."""
+    register_resolvers()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        return compose(verb, overrides=list(overrides))
+
+
+def tiny_generator() -> CompleteSplat:
+    """An untrained generator from the configs, with skips that pass something on."""
+    config = compose_config(
+        "fit",
+        "model=latent_diffusion",
+        "model.autoreconstructor_checkpoint=null",
+        "data.image_size=32",
+        "sampler.steps=2",
+    )
+    torch.manual_seed(0)
+    model = instantiate(config.model.completesplat, _convert_="all")
+    for skip in model.autoreconstructor.reconstructor.skips.values():
+        torch.nn.init.normal_(skip.weight, std=0.1)
+    return model.eval()

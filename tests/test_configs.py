@@ -4,12 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
-from support import SMALL, call
+from omegaconf import OmegaConf
+from support import SMALL, call, compose_config
 
-from completesplat.commands import conf_folder, register_resolvers
+from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
 
 CONF = conf_folder()
@@ -19,12 +18,6 @@ NEEDED = ["model.autoreconstructor_checkpoint=null"]
 
 def options(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("*.yaml") if not path.stem.startswith("_"))
-
-
-def config_of(verb: str, *overrides: str) -> DictConfig:
-    register_resolvers()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(verb, overrides=["hydra.verbose=false", *overrides])
 
 
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
@@ -44,13 +37,13 @@ def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith("co3d_") and not needed else []
     needed += NEEDED if option in ("latent_diffusion", "toy_diffusion") else []
-    config = config_of("fit", f"{group}={option}", *needed)
+    config = compose_config("fit", f"{group}={option}", *needed)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_composes_and_says_what_it_does(verb):
-    config = config_of(verb)
+    config = compose_config(verb)
     assert config.verb == verb
     assert config.description
     assert config.out.startswith(f"outputs/{verb}/")
@@ -62,7 +55,7 @@ PARTS = ["autoreconstructor", "conditioning", "denoiser", "sampler", "rasterizer
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g, o in EVERY_OPTION if g in PARTS])
 def test_every_part_instantiates_from_its_config(group, option):
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
-    config = config_of("fit", f"{group}={option}", *needed)
+    config = compose_config("fit", f"{group}={option}", *needed)
     with torch.device("meta" if option == "stable_diffusion" else "cpu"):
         part = instantiate(config[group], _convert_="all")
     assert part is not None
@@ -71,7 +64,7 @@ def test_every_part_instantiates_from_its_config(group, option):
 @pytest.mark.parametrize("group", ["optimizer", "schedule", "callbacks", "logger", "trainer"])
 def test_what_surrounds_a_model_instantiates_from_its_config(group):
     for option in options(group):
-        config = config_of("fit", f"{group}={option}", "out=/nowhere")
+        config = compose_config("fit", f"{group}={option}", "out=/nowhere")
         made = instantiate(config[group], _convert_="all")
         if group in ("callbacks", "logger"):
             assert all(made.values())
@@ -83,18 +76,18 @@ def test_what_surrounds_a_model_instantiates_from_its_config(group):
 
 def test_all_rasterizers_share_the_default_constants():
     for option in options("rasterizer"):
-        constants = instantiate(config_of("fit", f"rasterizer={option}").rasterizer.constants)
+        constants = instantiate(compose_config("fit", f"rasterizer={option}").rasterizer.constants)
         assert constants == RenderingConstants()
 
 
 def test_the_papers_numbers():
-    config = config_of("fit", "autoreconstructor=stable_diffusion", "denoiser=stable_diffusion")
+    config = compose_config("fit", "autoreconstructor=stable_diffusion", "denoiser=stable_diffusion")
     assert config.autoreconstructor.reconstructor.parameterization.layers == 2
     assert config.autoreconstructor.reconstructor.skip_levels == [0]
     assert (config.loss.terms.mse.weight, config.loss.terms.ssim.weight) == (0.8, 0.2)
     assert config.optimizer.lr == 5e-5
     assert config.sampler.steps == 50
-    assert config_of("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
+    assert compose_config("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
 
 
 @pytest.mark.parametrize("experiment", options("experiment"))

@@ -1,6 +1,7 @@
 """Stable Diffusion's VAE encoder, unchanged, which also hands out its features before each downsampling."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from diffusers.models.autoencoders import vae
 from jaxtyping import Float
@@ -48,7 +49,7 @@ class Encoder(nn.Module):
         Returns:
             The posterior, and each level's features before its downsampling (level 0 at full resolution).
         """
-        network = self.network
+        network: Any = self.network
         hidden = network.conv_in(images * 2 - 1)
         features = []
         for block in network.down_blocks:

@@ -10,6 +10,7 @@ from torch.utils.data import DataLoader
 
 from completesplat.data.co3d_annotations import CO3DSequence, read_category
 from completesplat.data.co3d_scenes import EpochSampler, EvaluationScenes, SceneStore, TrainingScenes
+from completesplat.data.typical_camera import TypicalCamera, typical_camera
 from completesplat.errors import DataError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
@@ -131,13 +132,11 @@ class CO3DDataModule(LightningDataModule):
             pin_memory=torch.cuda.is_available(),
         )
 
-    def typical_camera(self) -> tuple[float, tuple[float, float]]:
-        """Mean field of view in degrees and mean (near, far) of the training frames."""
+    def typical_camera(self) -> TypicalCamera:
+        """The mean camera of the training frames."""
         store = self.store("train")
-        focal = torch.cat([store.cameras(i)[0].intrinsics[:, 0, 0] for i in range(len(store.sequences))])
-        near, far = torch.cat([store.depth_ranges(i) for i in range(len(store.sequences))]).mean(dim=0).tolist()
-        fov = 2 * torch.atan(0.5 * self.image_size / focal).mean().rad2deg().item()
-        return fov, (near, far)
+        sequences = range(len(store.sequences))
+        return typical_camera([store.cameras(i)[0] for i in sequences], [store.depth_ranges(i) for i in sequences])
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
         """Mean of all training pictures: the guess of a model that knows nothing about its input."""

@@ -1,6 +1,7 @@
 """The denoiser eps_theta(h_t, phi_ref, t): Stable Diffusion's UNet on [conditioning, noisy latent]."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from diffusers import UNet2DModel
@@ -56,4 +57,5 @@ class Denoiser(nn.Module):
         conditioning: Float[Tensor, "batch features height width"],
     ) -> Float[Tensor, "batch channel height width"]:
         """Predict the noise in h_t (paper, Eq. 3)."""
-        return self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample.float()
+        network: Any = self.network
+        return network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample.float()

@@ -59,9 +59,10 @@ class LatentDiffusion(SceneModule):
         batches = (scenes.reference.images for _, scenes in zip(range(self.scale_batches), loader, strict=False))
         scale = measure_scale(lambda images: parts.encode(images.to(self.device)).latent, batches)
         parts.latent_scale.fill_(scale)
-        fov_degrees, depth_range = data.typical_camera()
-        parts.fov_degrees.fill_(fov_degrees)
-        parts.depth_range.copy_(torch.tensor(depth_range))
+        camera = data.typical_camera()
+        parts.fov_degrees.fill_(camera.fov_degrees)
+        parts.depth_range.copy_(torch.tensor(camera.depth_range))
+        parts.up.copy_(torch.tensor(camera.up))
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat

@@ -170,7 +170,7 @@ def test_lightning_tells_the_sampler_the_epoch(toy_root, workers):
 
 def test_typical_camera_is_the_mean_of_the_training_frames(toy_root):
     data = module(toy_root, depth_before=1.0, depth_after=2.0)
-    fov, (near, far) = data.typical_camera()
+    fov, (near, far), _ = data.typical_camera()
     scenes = [data.store("train").scene(i, f, [0]) for i in range(2) for f in range(4)]
     ranges = torch.stack([scene.depth_range for scene in scenes])
     assert (near, far) == pytest.approx(tuple(ranges.mean(dim=0).tolist()))

@@ -1,7 +1,5 @@
 """The tiled rasterizer is the reference, faster: the same images and gradients on random scenes."""
 
-from collections.abc import Iterator
-
 import pytest
 import torch
 from torch import Tensor
@@ -109,9 +107,9 @@ def assert_agrees(gaussians: Gaussians, cameras: Cameras, constants: RenderingCo
         assert (gradient - expected).norm() <= 1e-4 * expected.norm(), name
 
 
-def shapes() -> Iterator[tuple[int, tuple[int, int]]]:
+def shapes() -> list[tuple[int, tuple[int, int]]]:
     sizes = [(13, 17), (16, 16), (9, 23), (31, 6), (1, 40)]
-    yield from enumerate(sizes * 4)
+    return list(enumerate(sizes * 4))
 
 
 @pytest.mark.parametrize(("seed", "size"), shapes())

@@ -18,14 +18,12 @@ from completesplat.rasterizers.kernels.projection import (
     unit_quaternion,
 )
 from completesplat.rasterizers.kernels.simd import load, store
+from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 Array = np.ndarray
 
 HALF = np.float64(0.5)
 LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
-# Ellipses larger than this are left out: the square of their extent in px has to fit in float32.
-LARGEST_EXTENT = np.float64(1e18)
-
 RADIX_BITS = 11
 BUCKETS = 1 << RADIX_BITS
 PASSES = 3  # of 11 bits: enough for the 31 bits of a positive float32
@@ -98,8 +96,9 @@ def project(
         extent_x, extent_y = math.sqrt(2 * LN2 * reach * xx), math.sqrt(2 * LN2 * reach * yy)
         top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
         # Written so that a NaN culls as well.
+        bounded = max(abs(center_x), abs(center_y), xx, yy) <= LARGEST_PROJECTION
         inside = center_x + extent_x >= HALF and center_x - extent_x <= width - HALF and top < bottom + ONE
-        if not (inside and extent_x <= LARGEST_EXTENT and extent_y <= LARGEST_EXTENT):
+        if not (bounded and inside):
             continue
         inverse_yy = ONE / yy
         inverse_u = math.sqrt(2 * LN2 * determinant * inverse_yy)
