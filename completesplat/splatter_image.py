@@ -74,14 +74,12 @@ class Parameterization:
         layer_depths: relation between the depths of one pixel's layers, a key of `LAYER_DEPTHS`.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper does not state one; the clamp has no gradient outside, full gradient inside).
-        initial_scale: of the head's bias, in scene units (0.02 in Splatter Image, at 128 px).
     """
 
     layers: int = 2
     layer_depths: str = "independent"
     smallest_scale: float = 1e-4
     largest_scale: float = 2.0
-    initial_scale: float = 0.02
 
     @property
     def channels(self) -> int:
@@ -142,9 +140,8 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
     assert head.bias is not None
     row = 0
     for _ in range(parameterization.layers):
-        for name, group in GROUPS.items():
+        for group in GROUPS.values():
             rows = slice(row, row + group.channels)
             nn.init.xavier_uniform_(head.weight[rows], gain=group.gain)
-            bias = math.log(parameterization.initial_scale) if name == "scale" else group.bias
-            nn.init.constant_(head.bias[rows], bias)
+            nn.init.constant_(head.bias[rows], group.bias)
             row += group.channels

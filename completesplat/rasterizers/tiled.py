@@ -43,6 +43,14 @@ class TiledRasterizer:
 
 
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
+    batch, view = cameras.world_to_camera.shape[:2]
+    count = gaussians.count
+    # The kernels do not check bounds: an array that is too small would be read beyond its end.
+    expected = Gaussians(*(torch.empty(batch, count, *width, device="meta") for width in ((3,), (4,), (3,), (), (3,))))
+    for name, tensor in vars(gaussians).items():
+        if tensor.shape != vars(expected)[name].shape:
+            shapes = f"{list(vars(expected)[name].shape)}, not {list(tensor.shape)}"
+            raise CompleteSplatError(f"{name} of {batch} scenes of {count} Gaussians should be {shapes}")
     tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":

@@ -123,7 +123,7 @@ def attenuate(transmittance, alpha, min_transmittance):
 
 @helper
 def open_pixels(row, column, height, width, state, offset):
-    """Transmittances of a fresh block: 1, but 0 for the lanes that lie outside the image."""
+    """Transmittances of a fresh block: 1, but 0 for the lanes outside the image, which must not keep it open."""
     if (row + 1) * BLOCK <= height and (column + 1) * BLOCK <= width:
         store(state, offset, splat(ONE))
         return
