@@ -13,6 +13,7 @@ from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
 from completesplat.rasterizers.protocol import Rendering, RenderingConstants
 
+WIDTHS: dict[str, list[int]] = {"means": [3], "quaternions": [4], "scales": [3], "opacities": [], "colors": [3]}
 SMALLEST_BLUR = 1e-5  # px^2; it keeps the reference's clamp on the determinant (1e-10) out of reach
 
 
@@ -23,8 +24,8 @@ class TiledRasterizer:
     (`torch.set_num_threads`). The kernels are compiled on first use, which takes some seconds once per machine.
 
     Raises:
-        CompleteSplatError: constants that it cannot honour; on a call, tensors of another dtype or device, or cameras
-            that require a gradient.
+        CompleteSplatError: constants that it cannot honour; on a call, tensors of another dtype, device or number of
+            scenes, or cameras that require a gradient.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -43,14 +44,13 @@ class TiledRasterizer:
 
 
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
-    batch, view = cameras.world_to_camera.shape[:2]
-    count = gaussians.count
     # The kernels do not check bounds: an array that is too small would be read beyond its end.
-    expected = Gaussians(*(torch.empty(batch, count, *width, device="meta") for width in ((3,), (4,), (3,), (), (3,))))
-    for name, tensor in vars(gaussians).items():
-        if tensor.shape != vars(expected)[name].shape:
-            shapes = f"{list(vars(expected)[name].shape)}, not {list(tensor.shape)}"
-            raise CompleteSplatError(f"{name} of {batch} scenes of {count} Gaussians should be {shapes}")
+    for name, widths in WIDTHS.items():
+        shape = [cameras.world_to_camera.shape[0], gaussians.count, *widths]
+        if list(getattr(gaussians, name).shape) != shape:
+            raise CompleteSplatError(
+                f"{name} should have the shape {shape}, not {list(getattr(gaussians, name).shape)}"
+            )
     tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":

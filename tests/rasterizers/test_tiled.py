@@ -206,6 +206,8 @@ def test_refusals() -> None:
         TiledRasterizer()(gaussians, cameras.to("meta"))
     with pytest.raises(CompleteSplatError, match="reference rasterizer"):
         TiledRasterizer()(gaussians, cameras.map(lambda tensor: tensor.requires_grad_()))
+    with pytest.raises(CompleteSplatError, match=r"means should have the shape \[2, 60, 3\], not \[1, 60, 3\]"):
+        TiledRasterizer()(gaussians, cameras.map(lambda tensor: tensor.repeat(2, 1, 1, 1)))
     with pytest.raises(CompleteSplatError, match="blur"):
         TiledRasterizer(RenderingConstants(blur=0.0))
     with pytest.raises(CompleteSplatError, match="near_plane"):
