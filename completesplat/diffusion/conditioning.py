@@ -22,7 +22,7 @@ class LearnedConditioning(nn.Module):
     def __init__(
         self,
         out_channels: int = 16,
-        channels: Sequence[int] = (16, 32, 64, 64),
+        channels: Sequence[int] = (8, 16, 32, 64),
         layers_per_block: int = 1,
         norm_groups: int = 8,
     ) -> None:

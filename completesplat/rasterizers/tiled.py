@@ -100,7 +100,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         images = ctx.saved_tensors[5:]
         given = [
-            torch.zeros_like(image) if gradient is None else gradient.contiguous()
+            # Zeros by NumPy: torch would wake its own threads, which then spin for a while on the kernels' cores.
+            torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
         gradients = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, given))

@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.table import Table
 
@@ -77,11 +78,14 @@ def _machine() -> dict[str, Any]:
 def _milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:
     """Of the forward pass, and of both passes."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    shape = cameras.intrinsics.shape[:2]
+    # By NumPy: torch would wake its own threads, which then spin for a while on the cores that are to be timed.
+    ones = [np.ones((*shape, channels, *cameras.image_size), np.float32) for channels in (3, 1, 1)]
     start = time.perf_counter()
     rendering = rasterizer(gaussians, cameras)
     middle = time.perf_counter()
     images = [rendering.color, rendering.depth, rendering.alpha]
-    torch.autograd.backward(images, [torch.ones_like(image) for image in images])
+    torch.autograd.backward(images, [torch.from_numpy(array) for array in ones])
     return (middle - start) * 1e3, (time.perf_counter() - start) * 1e3
 
 
