@@ -90,13 +90,15 @@ def run_job(verb: str, config: Any) -> None:
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
     (out / "run.json").write_text(json.dumps(record, indent=2) + "\n")
-    quieten()
     import_module(f"completesplat.commands.{verb}").run(config, out)
     print(out)
 
 
 def quieten() -> None:
-    """Keep Lightning's hints about its products and settings out of the output; its errors and progress stay."""
+    """Keep Lightning's hints about its products and settings out of the output; its errors and progress stay.
+
+    To be called after Lightning is imported, which sets these levels itself.
+    """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in (".*does not have many workers.*", ".*LeafSpec.*", "Experiment logs directory .* exists.*"):

@@ -10,6 +10,9 @@ def run(config: Any, out: Path) -> None:
     from hydra.utils import instantiate
     from lightning import seed_everything
 
+    from completesplat.commands import quieten
+
+    quieten()
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     module = instantiate(config.model, _convert_="all")

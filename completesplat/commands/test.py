@@ -12,10 +12,12 @@ def run(config: Any, out: Path) -> None:
     from hydra.utils import instantiate
     from lightning import seed_everything
 
+    from completesplat.commands import quieten
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.training.checkpoints import load_part
 
     run_config = config_of_run(Path(config.ckpt), list(config.overrides))
+    quieten()
     seed_everything(config.seed, verbose=False)
     data = instantiate(run_config.data, _convert_="all")
     # The weights come from this checkpoint, whatever the run started from.

@@ -11,16 +11,16 @@ COLUMNS = [
     for view in ("novel", "reference")
     for metric in ("psnr", "ssim")
 ]
-LABELS = {"full": "all pixels", "object": "object pixels", "psnr": "PSNR", "ssim": "SSIM"}
+LABELS = {"full": "all\npixels", "object": "object\npixels", "psnr": "PSNR", "ssim": "SSIM"}
 
 
 def evaluation_table(results: dict[str, Any]) -> Table:
     """One row for each predictor of `Evaluation.results`, PSNR in dB."""
     first = next(iter(results.values()))
     table = Table(title=f"{first['scenes']} scenes, {first['views']} novel views")
-    table.add_column("predictor")
+    table.add_column("predictor", no_wrap=True)
     for region, view, metric in COLUMNS:
-        table.add_column(f"{LABELS[region]}\n{view}\n{LABELS[metric]}", justify="right")
+        table.add_column(f"{LABELS[region]}\n{view}\n{LABELS[metric]}", justify="right", no_wrap=True)
     for predictor, scores in results.items():
         cells = [scores[region][view][metric] for region, view, metric in COLUMNS]
         formats = [".2f" if metric == "psnr" else ".3f" for _, _, metric in COLUMNS]

@@ -23,7 +23,7 @@ def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, s
 
 def test_the_runs_configuration_can_be_changed(command, pipeline, tmp_path):
     checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    change = "overrides=[data.evaluation_targets=1]"
+    change = "overrides=['data.evaluation_targets=1']"
     assert command("test", f"ckpt={checkpoint}", change, f"out={tmp_path / 'one'}").status == 0
     model = strict_json(tmp_path / "one" / "metrics.json")["model"]
     assert model["views"] == model["scenes"]
