@@ -17,6 +17,12 @@ from completesplat.errors import CompleteSplatError
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 TASKS = ("data", "bench")
+UNHELPFUL_WARNINGS = (
+    ".*does not have many workers.*",
+    ".*LeafSpec.*",
+    "Experiment logs directory .* exists.*",
+    ".*logging interval.*",
+)
 
 
 def launch(verb: str, arguments: list[str]) -> None:
@@ -101,7 +107,7 @@ def quieten() -> None:
     """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    for message in (".*does not have many workers.*", ".*LeafSpec.*", "Experiment logs directory .* exists.*"):
+    for message in UNHELPFUL_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
 
 

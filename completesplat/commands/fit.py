@@ -23,9 +23,12 @@ def run(config: Any, out: Path) -> None:
         trainer.fit(module, datamodule=data, ckpt_path=config.resume, weights_only=True)
         if trainer.interrupted:
             raise KeyboardInterrupt
+        metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
+        for logger in loggers:  # a run shorter than the logging interval leaves its figures too
+            logger.log_metrics(metrics, step=trainer.global_step)
+            logger.save()
     finally:
         _finish(loggers)
-    metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
     summary = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
     (out / "metrics.json").write_text(json.dumps(summary, indent=2) + "\n")
 
