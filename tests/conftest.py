@@ -44,3 +44,25 @@ def pipeline(toy_root, tmp_path_factory):
         stage2 = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={stage1}", "sampler.steps=2"]
         assert call(monkeypatch, *fit, *stage2, f"out={runs / 'diffusion'}") == 0
     return Pipeline(toy_root, runs / "var", runs / "diffusion")
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def command(capfd, monkeypatch, tmp_path):
+    """Run `completesplat` in this process, from an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str) -> Finished:
+        capfd.readouterr()
+        status = call(monkeypatch, *arguments)
+        return Finished(status, *capfd.readouterr())
+
+    return run

@@ -119,6 +119,14 @@ def test_images_and_gradients_agree_with_the_float64_reference(seed: int, size: 
     assert_agrees(gaussians, cameras, constants, seed)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(100, 300))
+def test_two_hundred_more_scenes(seed: int) -> None:
+    constants = RenderingConstants() if seed % 2 else OTHER_CONSTANTS
+    gaussians, cameras = scenes(seed, 1, 2, (10 + seed % 17, 8 + seed % 23), constants)
+    assert_agrees(gaussians, cameras, constants, seed)
+
+
 @pytest.mark.parametrize("size", [(20, 300), (5, 517), (1, 1), (130, 3)])
 def test_images_of_any_size(size: tuple[int, int]) -> None:
     constants = RenderingConstants()

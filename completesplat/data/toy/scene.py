@@ -69,7 +69,7 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
         points=points,
         point_colors=point_colors,
         camera_to_world=cameras,
-        fov_degrees=rng.uniform(48, 52),
+        fov_degrees=rng.uniform(36, 40),
         unit=rng.uniform(0.5, 2.0),
         origin=rng.normal(size=3),
     )
