@@ -36,7 +36,9 @@ class TiledRasterizer:
             raise CompleteSplatError("the tiled rasterizer needs near_plane and min_transmittance of at least 0")
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render scenes [batch] from cameras [batch view]."""
+        """Render scenes [batch] from cameras [batch view]; CUDA tensors are copied here and the images back."""
+        if gaussians.means.is_cuda:
+            return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
         parameters = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
         packed = pack_cameras(cameras, self.constants.frustum_margin)

@@ -220,3 +220,16 @@ def test_refusals() -> None:
         TiledRasterizer(RenderingConstants(blur=0.0))
     with pytest.raises(CompleteSplatError, match="near_plane"):
         TiledRasterizer(RenderingConstants(near_plane=-1.0))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_cuda_tensors_are_drawn_on_the_cpu() -> None:
+    gaussians, cameras = scenes(2, 1, 2, (11, 14), RenderingConstants())
+    cotangents = cotangents_for(cameras, 2)
+    expected, expected_gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents)
+    moved = [tensor.cuda() for tensor in cotangents]
+    found, gradients = render_with_gradients(TiledRasterizer(), gaussians.to("cuda"), cameras.to("cuda"), moved)
+    assert found.color.is_cuda
+    assert torch.equal(found.color.cpu(), expected.color)
+    assert all(torch.equal(a.cpu(), b) for a, b in zip(gradients, expected_gradients, strict=True))
