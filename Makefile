@@ -22,7 +22,7 @@ $(READY): pyproject.toml
 demo: $(READY) ## Make toy scenes, train both stages, evaluate, complete two pictures (CPU, under 15 minutes)
 	rm -rf $(DEMO)
 	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) out=$(DEMO)/data
-	$(BIN)/completesplat fit experiment=toy_var data.root=$(DEMO)/data trainer.max_steps=1900 optimizer.lr=2e-3 out=$(DEMO)/var
+	$(BIN)/completesplat fit experiment=toy_var data.root=$(DEMO)/data trainer.max_steps=2200 out=$(DEMO)/var
 	$(BIN)/completesplat fit experiment=toy_diffusion data.root=$(DEMO)/data trainer.max_steps=700 \
 	  model.autoreconstructor_checkpoint=$(DEMO)/var/checkpoints/last.ckpt out=$(DEMO)/diffusion
 	$(BIN)/completesplat test ckpt=$(DEMO)/var/checkpoints/last.ckpt out=$(DEMO)/test_var
