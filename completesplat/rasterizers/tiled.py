@@ -20,12 +20,13 @@ SMALLEST_BLUR = 1e-5  # px^2; it keeps the reference's clamp on the determinant 
 class TiledRasterizer:
     """The same function as `ReferenceRasterizer`, for float32 tensors in main memory, hundreds of times faster.
 
-    Gradients reach the parameters of the Gaussians, not the cameras. Results do not depend on the number of threads
-    (`torch.set_num_threads`). The kernels are compiled on first use, which takes some seconds once per machine.
+    Gradients reach all parameters of the Gaussians and the cameras (of the intrinsics, focal lengths and principal
+    point). Results do not depend on the number of threads (`torch.set_num_threads`). The kernels are compiled on
+    first use, which takes some seconds once per machine.
 
     Raises:
         CompleteSplatError: constants that it cannot honour; on a call, tensors of another dtype, device or number of
-            scenes, or cameras that require a gradient.
+            scenes.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -41,8 +42,8 @@ class TiledRasterizer:
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
         parameters = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-        packed = pack_cameras(cameras, self.constants.frustum_margin)
-        return Rendering(*_Rasterize.apply(*parameters, packed, cameras.image_size, self.constants))
+        matrices = (cameras.world_to_camera, cameras.intrinsics)
+        return Rendering(*_Rasterize.apply(*parameters, *matrices, cameras.image_size, self.constants))
 
 
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
@@ -58,10 +59,6 @@ def _check(gaussians: Gaussians, cameras: Cameras) -> None:
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
             found = f"{name} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
             raise CompleteSplatError(f"the tiled rasterizer takes float32 tensors on the CPU, but {found}")
-    if torch.is_grad_enabled() and (cameras.world_to_camera.requires_grad or cameras.intrinsics.requires_grad):
-        raise CompleteSplatError(
-            "the tiled rasterizer has no gradient with respect to cameras: use the reference rasterizer for this"
-        )
 
 
 def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
@@ -82,32 +79,48 @@ def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
     return packed
 
 
+def unpack_camera_gradients(packed: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Gradients [batch view 16] from the kernels as those of `world_to_camera` and `intrinsics`."""
+    shape = packed.shape[:2]
+    world_to_camera, intrinsics = np.zeros((*shape, 4, 4), np.float32), np.zeros((*shape, 3, 3), np.float32)
+    rotation = packed[..., layout.ROTATION : layout.ROTATION + 9]
+    world_to_camera[..., :3, :3] = rotation.reshape(*shape, 3, 3)
+    world_to_camera[..., :3, 3] = packed[..., layout.TRANSLATION : layout.TRANSLATION + 3]
+    for axis in range(2):
+        intrinsics[..., axis, axis] = packed[..., layout.FOCAL_X + axis]
+        intrinsics[..., axis, 2] = packed[..., layout.PRINCIPAL_X + axis]
+    return torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics)
+
+
 class _Rasterize(torch.autograd.Function):
-    """(means, quaternions, scales, opacities, colors, packed cameras, image size, constants) to three images."""
+    """(means, quaternions, scales, opacities, colors, world_to_camera, intrinsics, image size, constants) to images."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
         tensors = [tensor.detach().contiguous() for tensor in arguments[:5]]
-        cameras, image_size, constants = arguments[5:]
+        image_size, constants = arguments[7:]
+        cameras = pack_cameras(Cameras(arguments[5], arguments[6], image_size), constants.frustum_margin)
         keep = any(ctx.needs_input_grad)
         drawing = Drawing(_arrays(Parameters, tensors), cameras, image_size, constants, keep)
         images = tuple(torch.from_numpy(image) for image in drawing.draw())
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*arguments[:5], *images)
+        ctx.save_for_backward(*arguments[:7], *images)
         ctx.drawing = drawing
         return images
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        images = ctx.saved_tensors[5:]
+        images = ctx.saved_tensors[7:]
         given = [
             # Zeros by NumPy: torch would wake its own threads, which then spin for a while on the kernels' cores.
             torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
-        gradients = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, given))
-        return *(torch.from_numpy(gradient) for gradient in gradients), None, None, None
+        to_cameras = any(ctx.needs_input_grad[5:7])
+        gradients, of_cameras = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, given), to_cameras)
+        matrices = (None, None) if of_cameras is None else unpack_camera_gradients(of_cameras)
+        return *(torch.from_numpy(gradient) for gradient in gradients), *matrices, None, None
 
 
 def _arrays(kind: Any, tensors: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import WORD_BITS
 from completesplat.rasterizers.kernels.buffers import Buffers
+from completesplat.rasterizers.kernels.camera_backward import camera_backward
 from completesplat.rasterizers.kernels.composite import STATE_VECTORS, composite
 from completesplat.rasterizers.kernels.composite_backward import STATE_VECTORS as BACKWARD_STATE_VECTORS
 from completesplat.rasterizers.kernels.composite_backward import composite_backward
@@ -103,8 +104,11 @@ class Drawing:
             parallel(partial(self._composite, images, start), number * len(self.bands))
         return images
 
-    def backward(self, images: Images, gradients: Images) -> Parameters:
-        """Gradients with respect to the parameters, given those with respect to the images that `draw` returned."""
+    def backward(self, images: Images, gradients: Images, to_cameras: bool) -> tuple[Parameters, np.ndarray | None]:
+        """Gradients of the parameters and, if asked for, the cameras, given those of the images that `draw` returned.
+
+        The latter are [batch view 16]: of the first 16 columns of `cameras`.
+        """
         buffers = Buffers()
         bands, views = len(self.bands), self.scenes * self.views
         sums = buffers.empty((self.scenes, self.views, bands, self.count, layout.GRADIENT_WIDTH))
@@ -112,7 +116,11 @@ class Drawing:
         result = Parameters(*(np.empty_like(x) for x in self.parameters))
         chunks = -(-self.count // CHUNK)
         parallel(partial(self._project_backward, result, sums), self.scenes * chunks)
-        return result
+        if not to_cameras:
+            return result, None
+        grad_cameras = np.empty((self.scenes, self.views, layout.GRAD_CAMERA_WIDTH))
+        parallel(partial(self._camera_backward, grad_cameras, sums), views)
+        return result, grad_cameras
 
     def _prepare(self, scene: int) -> None:
         prepare(*(x[scene] for x in self.parameters), self.log2_min_alpha, self.prepared[scene])
@@ -173,4 +181,16 @@ class Drawing:
             chunk * CHUNK,
             min((chunk + 1) * CHUNK, self.count),
             *(x[scene] for x in result),
+        )
+
+    def _camera_backward(self, grad_cameras: np.ndarray, sums: np.ndarray, task: int) -> None:
+        scene, view = divmod(task, self.views)
+        camera_backward(
+            self.parameters.means[scene],
+            self.prepared[scene],
+            self.cameras[scene, view],
+            float(self.constants.blur),
+            self.visible[task],
+            sums[scene, view : view + 1],
+            grad_cameras[scene, view],
         )

@@ -40,6 +40,7 @@ TRANSLATION = 9
 FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y = 12, 13, 14, 15
 MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # between which x/z and y/z enter the Jacobian
 CAMERA_WIDTH = 20
+GRAD_CAMERA_WIDTH = 16  # the same columns up to PRINCIPAL_Y
 
 # images are worked on in blocks of 4 x 4 pixels, one SIMD lane each, row-major
 BLOCK = 4

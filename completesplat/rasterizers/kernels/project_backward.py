@@ -115,18 +115,37 @@ def outer(a, b):
 
 @helper
 def view_gradients(means, prepared, camera, blur, i, sums):
-    """Gradients with respect to the mean and to the root of the covariance, from one view.
+    """Gradients with respect to the mean and to the root of the covariance, from one view."""
+    rotation = nine(camera, layout.ROTATION)
+    slope_x, slope_y, inverse_z = camera_slopes(means, camera, rotation, i)
+    row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
+    root = nine(prepared[i], layout.ROOT)
+    grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
+    grad_root = add9(outer(row_x, grad_a), outer(row_y, grad_b))
+    grad_row_x, grad_row_y = matrix_times_column(root, grad_a), matrix_times_column(root, grad_b)
+    grad_point = point_gradient(
+        camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y
+    )
+    grad_point = grad_point[0], grad_point[1], grad_point[2] + sums[layout.SUM_DEPTH]
+    return row_times_matrix(grad_point, rotation), grad_root
+
+
+@helper
+def camera_slopes(means, camera, rotation, i):
+    """(x / z, y / z, 1 / z) of mean i in camera coordinates."""
+    x, y, z = camera_point(camera, rotation, means, i)
+    inverse_z = ONE / z
+    return x * inverse_z, y * inverse_z, inverse_z
+
+
+@helper
+def splat_gradients(row_x, row_y, root, blur, sums):
+    """Gradients with respect to the centre (two numbers) and to the rows a, b of J W times the root.
 
     With T = [[U, -U SHEAR], [0, V]], so that (u, v) = T d, the inverse covariance is 2 ln(2) T^T T. Hence
     dL/dcentre = 2 ln(2) T^T (sum s u, sum s v), and dL/dcovariance = 1/2 (2 ln 2)^2 T^T S T with the symmetric
     matrix S of the sums of s u u, s u v, s v v (gsplat's backward, `Utils.cuh`, in whitened coordinates).
     """
-    rotation = nine(camera, layout.ROTATION)
-    x, y, z = camera_point(camera, rotation, means, i)
-    inverse_z = ONE / z
-    slope_x, slope_y = x * inverse_z, y * inverse_z
-    row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
-    root = nine(prepared[i], layout.ROOT)
     a, b = row_times_matrix(row_x, root), row_times_matrix(row_y, root)
     _, xy, yy, determinant = covariance_2d(a, b, blur)
     inverse_yy = ONE / yy
@@ -143,14 +162,7 @@ def view_gradients(means, prepared, camera, blur, i, sums):
     inner_b = combine(sums[layout.SUM_SUV], white_a, sums[layout.SUM_SVV], white_b)
     grad_a = combine(factor * factor * u, inner_a, 0.0, inner_a)
     grad_b = combine(-shear, grad_a, factor * factor * v, inner_b)
-
-    grad_root = add9(outer(row_x, grad_a), outer(row_y, grad_b))
-    grad_row_x, grad_row_y = matrix_times_column(root, grad_a), matrix_times_column(root, grad_b)
-    grad_point = point_gradient(
-        camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y
-    )
-    grad_point = grad_point[0], grad_point[1], grad_point[2] + sums[layout.SUM_DEPTH]
-    return row_times_matrix(grad_point, rotation), grad_root
+    return grad_center_x, grad_center_y, grad_a, grad_b
 
 
 @helper

@@ -1,0 +1,98 @@
+"""Random scenes on which rasterizers are compared, and what it takes to compare them."""
+
+import torch
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, look_at
+from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
+from completesplat.rasterizers.reference import project_gaussians, visible_in_depth_order
+
+# A scene keeps this far from the steps of the function, relative to where they are: alpha from its threshold and its
+# clamp; the transmittance from the stop (it is a product of many factors); depths from each other and the near plane.
+BAND, STOP_BAND, DEPTH_BAND = 1e-5, 1e-4, 1e-6
+OTHER_CONSTANTS = RenderingConstants(
+    blur=0.1, near_plane=1.6, max_alpha=0.9, min_alpha=0.02, min_transmittance=0.05, frustum_margin=0.05
+)
+
+
+def draw_scene(generator: torch.Generator, batch: int, views: int, size: tuple[int, int], count: int) -> tuple:
+    """Thin and round Gaussians of all opacities about the origin, seen from cameras on a sphere."""
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    gaussians = Gaussians(
+        means=uniform(-0.9, 0.9, batch, count, 3),
+        quaternions=torch.randn(batch, count, 4, generator=generator),
+        scales=uniform(-4.5, -0.7, batch, count, 3).exp(),
+        opacities=uniform(0.02, 1.0, batch, count),
+        colors=uniform(0.0, 1.0, batch, count, 3),
+    )
+    eyes = torch.nn.functional.normalize(torch.randn(batch, views, 3, generator=generator), dim=-1) * 2.2
+    matrices = look_at(eyes, uniform(-0.2, 0.2, batch, views, 3), torch.tensor([0.1, -1.0, 0.2]))
+    height, width = size
+    intrinsics = torch.eye(3).repeat(batch, views, 1, 1)
+    intrinsics[..., 0, 0] = uniform(0.8, 1.4, batch, views) * width
+    intrinsics[..., 1, 1] = uniform(0.8, 1.4, batch, views) * height
+    intrinsics[..., 0, 2] = uniform(0.4, 0.6, batch, views) * width
+    intrinsics[..., 1, 2] = uniform(0.4, 0.6, batch, views) * height
+    return gaussians, Cameras(matrices, intrinsics, size)
+
+
+def keeps_clear_of_the_steps(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> bool:
+    """Whether no decision (thresholds, stop, order, culling) is so close that float32 could decide otherwise."""
+    for b in range(gaussians.means.shape[0]):
+        for v in range(cameras.intrinsics.shape[1]):
+            scene, camera = gaussians[b].to(torch.float64), cameras[b, v].to(torch.float64)
+            visible, order = visible_in_depth_order(scene, camera, constants)
+            scene = scene[visible][order]
+            centers, depths, covariances = project_gaussians(scene, camera, constants)
+            height, width = camera.image_size
+            x, y = torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy")
+            offsets = torch.stack([x, y], -1).double().flatten(0, 1) - centers[:, None]
+            sigma = 0.5 * (offsets @ torch.linalg.inv(covariances) * offsets).sum(-1)
+            alpha = scene.opacities[:, None] * torch.exp(-sigma)
+            drawn = torch.where(alpha >= constants.min_alpha, alpha.clamp(max=constants.max_alpha), 0)
+            behind = torch.cumprod(1 - drawn, dim=0)
+            steps = [
+                (alpha / constants.min_alpha, BAND),
+                (alpha / constants.max_alpha, BAND),
+                (behind / constants.min_transmittance, STOP_BAND),
+                (depths[1:] / depths[:-1], DEPTH_BAND),
+                (depths / constants.near_plane, DEPTH_BAND),
+            ]
+            if any(bool(((ratio - 1).abs() < band).any()) for ratio, band in steps):
+                return False
+    return True
+
+
+def scenes(
+    seed: int, batch: int, views: int, size: tuple[int, int], constants: RenderingConstants, count: int = 60
+) -> tuple[Gaussians, Cameras]:
+    """The first draw of this seed that keeps clear of the steps."""
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(50):
+        gaussians, cameras = draw_scene(generator, batch, views, size, count)
+        if keeps_clear_of_the_steps(gaussians, cameras, constants):
+            return gaussians, cameras
+    raise AssertionError("no draw keeps clear of the steps")
+
+
+def render_with_gradients(
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, cotangents: list[Tensor]
+) -> tuple[Rendering, dict[str, Tensor]]:
+    """The images, and the gradients of all inputs under these cotangents of colour, depth and alpha."""
+    gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    cameras = cameras.map(lambda tensor: tensor.detach().requires_grad_())
+    inputs = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+    rendering = rasterizer(gaussians, cameras)
+    images = [rendering.color, rendering.depth, rendering.alpha]
+    gradients = torch.autograd.grad(images, list(inputs.values()), cotangents)
+    return rendering.detach(), dict(zip(inputs, gradients, strict=True))
+
+
+def cotangents_for(cameras: Cameras, seed: int) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shape = cameras.intrinsics.shape[:2]
+    return [torch.randn(*shape, channels, *cameras.image_size, generator=generator) for channels in (3, 1, 1)]
