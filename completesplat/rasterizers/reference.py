@@ -3,6 +3,7 @@
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_centers, transform_points
@@ -11,10 +12,11 @@ from completesplat.tensors import stack
 
 # In px and px^2. Products of two such numbers are still finite in float32.
 LARGEST_PROJECTION = 1e15
+PAIRS_AT_ONCE = 2**20  # of a Gaussian and a pixel; a few MB for each intermediate result, which stays in the cache
 
 
 class ReferenceRasterizer:
-    """Every Gaussian against every pixel. Memory and time grow with their product: for tests and small scenes.
+    """Every Gaussian against every pixel. Time grows with their product: for tests and small scenes.
 
     Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled, not finite, or so
     large or far aside that their projection overflows take no part at all: they are left out before anything is
@@ -32,17 +34,29 @@ class ReferenceRasterizer:
 
     def _render(self, gaussians: Gaussians, camera: Cameras) -> Rendering:
         height, width = camera.image_size
+        pixels = pixel_centers(height, width, gaussians.means.device, gaussians.means.dtype).flatten(0, 1)
+        image = self.at_pixels(gaussians, camera, pixels).mT.unflatten(-1, (height, width))
+        return Rendering(image[:3], image[3:4], image[4:])
+
+    def at_pixels(
+        self, gaussians: Gaussians, camera: Cameras, pixels: Float[Tensor, "pixel 2"]
+    ) -> Float[Tensor, "pixel 5"]:
+        """Red, green, blue, depth and alpha of one scene seen by one camera, at these pixel coordinates.
+
+        Intermediate results are computed again in the backward pass rather than kept: memory does not grow with the
+        number of pixels, and what fits into the cache is computed twice sooner than read from memory once.
+        """
         visible, depth_order = visible_in_depth_order(gaussians, camera, self.constants)
         chosen = gaussians[visible][depth_order]
         centers, depths, covariances = project_gaussians(chosen, camera, self.constants)
-        pixels = pixel_centers(height, width, centers.device, centers.dtype).flatten(0, 1)
-        alphas = alphas_at(pixels, centers, covariances, chosen.opacities, self.constants)
-        weights = composite(alphas, self.constants)
+        values = torch.cat([chosen.colors, depths[:, None], torch.ones_like(depths)[:, None]], dim=-1)
+        chunks = pixels.split(max(1, PAIRS_AT_ONCE // max(1, chosen.count)))
+        inputs = (centers, covariances, chosen.opacities, values)
+        return torch.cat([checkpoint(self._chunk, chunk, *inputs, use_reentrant=False) for chunk in chunks])
 
-        def image(values: Float[Tensor, "gaussian channel"]) -> Tensor:
-            return (weights.mT @ values).mT.unflatten(-1, (height, width))
-
-        return Rendering(image(chosen.colors), image(depths[:, None]), image(torch.ones_like(depths)[:, None]))
+    def _chunk(self, pixels: Tensor, centers: Tensor, covariances: Tensor, opacities: Tensor, values: Tensor) -> Tensor:
+        alphas = alphas_at(pixels, centers, covariances, opacities, self.constants)
+        return composite(alphas, self.constants).mT @ values
 
 
 def visible_in_depth_order(
