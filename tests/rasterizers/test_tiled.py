@@ -83,6 +83,19 @@ def test_cameras_alone_can_be_differentiated() -> None:
         assert gradient.any()
 
 
+def test_neighbours_in_depth_that_are_one_in_float32_keep_their_order() -> None:
+    """As in any large scene. The one behind comes first, so that equal keys would leave it in front."""
+    gaussians, _ = scenes(6, 1, 1, (9, 9), RenderingConstants(), count=2)
+    gaussians.means[0] = torch.tensor([[1.5e-8, 0.0, 2.5], [0.0, 0.0, 2.5]])
+    pose = torch.tensor([[0.8, 0, -0.6, 1.5], [0, 1, 0, 0], [0.6, 0, 0.8, 0], [0, 0, 0, 1]])
+    intrinsics = torch.tensor([[20.0, 0, 4.5], [0, 20.0, 4.5], [0, 0, 1]])
+    cameras = Cameras(pose[None, None], intrinsics[None, None], (9, 9))
+    depths = (gaussians.means[0].double() @ pose[2, :3].double()).tolist()
+    assert depths[0] > depths[1]
+    assert torch.tensor(depths)[0] == torch.tensor(depths)[1]
+    assert_agrees(gaussians, cameras, RenderingConstants(), 6)
+
+
 def test_the_number_of_threads_changes_no_bit() -> None:
     gaussians, cameras = scenes(5, 1, 1, (50, 70), RenderingConstants())
     cotangents = cotangents_for(cameras, 5)

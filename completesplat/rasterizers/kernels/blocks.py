@@ -19,6 +19,7 @@ from completesplat.rasterizers.kernels.simd import (
     splat,
     square_root,
     store,
+    store_shifted,
 )
 
 BLOCK, BLOCK_SHIFT = layout.BLOCK, layout.BLOCK_SHIFT
@@ -31,10 +32,16 @@ BIT, TWO_BITS = np.uint64(1), np.uint64(2)
 # Blocks are chosen a little generously, in px, against rounding. What counts is the test at the pixel itself.
 MARGIN = np.float32(0.01)
 
-# Pixel centres relative to the block's corner; top pixel row of 16 block rows relative to the first.
+ROWS_AT_ONCE = LANES // 2  # in `row_spans`
+
+# Pixel centres relative to the block's corner.
 lane_x = lane_constant([lane % BLOCK + 0.5 for lane in range(LANES)])
 lane_y = lane_constant([lane // BLOCK + 0.5 for lane in range(LANES)])
-row_tops = lane_constant([lane * BLOCK + 0.5 for lane in range(LANES)])
+# For the left ends of block rows, then for the right ends: top pixel row, direction, and limits of the pixel column.
+row_tops = lane_constant([lane % ROWS_AT_ONCE * BLOCK + 0.5 for lane in range(LANES)])
+side = lane_constant([-1] * ROWS_AT_ONCE + [1] * ROWS_AT_ONCE)
+is_left = lane_constant([1] * ROWS_AT_ONCE + [0] * ROWS_AT_ONCE)
+lowest_pixel = lane_constant([0] * ROWS_AT_ONCE + [-BLOCK] * ROWS_AT_ONCE)
 
 
 @helper
@@ -61,33 +68,34 @@ def close_block(open_words, row, column):
 
 @helper
 def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
-    """Pixel columns that the ellipse of record j touches in the block rows top..bottom, to spans[:, row - top].
+    """First and last block column that the ellipse of record j touches in each of the block rows top..bottom.
 
-    In a row at d_y it reaches from SHEAR d_y - h to SHEAR d_y + h with h^2 = (reach - (V d_y)^2) / U^2. Over the
-    rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest near minus it.
+    They go to spans[offset] and spans[offset + ROWS_AT_ONCE], where offset is `span_offset(row - top)`.
+
+    In a row at d_y the ellipse reaches from SHEAR d_y - h to SHEAR d_y + h with h^2 = (reach - (V d_y)^2) / U^2. Over
+    the rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest near minus
+    it. The left ends are in the first half of a vector's lanes, the right ends in the second.
     """
-    center_x, center_y = records[j, layout.CENTER_X], records[j, layout.CENTER_Y]
-    shear, v, inverse_u = records[j, layout.SHEAR], records[j, layout.V], records[j, layout.INVERSE_U]
-    rightmost, extent = records[j, layout.RIGHTMOST_Y], records[j, layout.EXTENT_Y]
+    center_y, extent = records[j, layout.CENTER_Y], records[j, layout.EXTENT_Y]
     reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha + SLACK
-    limit = np.float32(width)
-    for row in range(top, bottom + 1, LANES):
+    # Truncation of the left end, which has one pixel too much, rounds up. The limits keep the integers small.
+    start = records[j, layout.CENTER_X] - side() * (np.float32(0.5) - MARGIN)
+    extreme_y, stretch = side() * records[j, layout.RIGHTMOST_Y], side() * records[j, layout.INVERSE_U]
+    lowest, highest = lowest_pixel(), is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
+    for row in range(top, bottom + 1, ROWS_AT_ONCE):
         low = row_tops() + (np.float32(row * BLOCK) - center_y)
         high = minimum(low + np.float32(BLOCK - 1), extent)
-        low = maximum(low, -extent)
-        right_y = minimum(maximum(splat(rightmost), low), high)
-        left_y = minimum(maximum(splat(-rightmost), low), high)
-        right = right_y * shear + half_width(right_y, v, reach) * inverse_u + (center_x - np.float32(0.5) + MARGIN)
-        left = left_y * shear - half_width(left_y, v, reach) * inverse_u + (center_x + np.float32(0.5) - MARGIN)
-        # Truncation of the left end, which has one pixel too much, rounds up. The clamps keep the integers small.
-        store(spans, row - top, minimum(maximum(left, ZERO), limit + np.float32(BLOCK)))
-        store(spans, spans.shape[0] // 2 + row - top, maximum(minimum(right, limit - ONE), np.float32(-BLOCK)))
+        y = minimum(maximum(extreme_y, maximum(low, -extent)), high)
+        scaled = y * records[j, layout.V]
+        half_width = square_root(maximum(reach - scaled * scaled, ZERO))
+        end = y * records[j, layout.SHEAR] + half_width * stretch + start
+        store_shifted(spans, span_offset(row - top), minimum(maximum(end, lowest), highest), BLOCK_SHIFT)
 
 
 @helper
-def half_width(y, v, reach):
-    scaled = y * v
-    return square_root(maximum(reach - scaled * scaled, ZERO))
+def span_offset(row):
+    """Where the first block column of a row stands in `spans`, counted from the top row."""
+    return row + (row & ~(ROWS_AT_ONCE - 1))
 
 
 @helper

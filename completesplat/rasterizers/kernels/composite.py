@@ -10,7 +10,7 @@ from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import (
     BIT,
     BLOCK,
-    BLOCK_SHIFT,
+    ROWS_AT_ONCE,
     WORD_SHIFT,
     ZERO,
     alpha_at,
@@ -21,6 +21,7 @@ from completesplat.rasterizers.kernels.blocks import (
     open_pixels,
     row_spans,
     row_terms,
+    span_offset,
     state_vector,
     word_mask,
 )
@@ -45,12 +46,11 @@ def composite(
         records: [gaussian 16], of which the first `count` are used.
         state: scratch [block * 6 * 16], all blocks of the band.
         open_words: scratch [row word] uint64.
-        spans: scratch [2 * (row + 16)].
+        spans: scratch [2 * row + 32] int32.
         color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written.
     """
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
-    second = spans.shape[0] // 2
     integers = records.view(np.int32)
     begin(first_row, end_row, columns, height, width, state)
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
@@ -63,7 +63,8 @@ def composite(
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
         z = records[j, layout.DEPTH]
         for row in range(top, bottom + 1):
-            first, last = int(spans[row - top]) >> BLOCK_SHIFT, int(spans[second + row - top]) >> BLOCK_SHIFT
+            span = span_offset(row - top)
+            first, last = spans[span], spans[span + ROWS_AT_ONCE]
             if last < first:
                 continue
             for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):

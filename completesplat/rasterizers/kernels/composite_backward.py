@@ -1,8 +1,9 @@
 """Backward pass of `composite`: the same walk again, front to back, which recomputes the alphas.
 
-With g = dL/dimage . (colour, z, 1) at a pixel, dL/dalpha_i = T_i g_i - (sum of w_j g_j behind i) / (1 - alpha_i)
+With g = dL/dimage . (colour, z) at a pixel, dL/dalpha_i = T_i g_i - (sum of w_j g_j behind i) / (1 - alpha_i)
 (Kerbl et al. 2023, Appendix C). The sum behind is the image's total, known from the forward pass, minus what has been
-passed. A Gaussian's sums over all pixels stay in registers until it is done.
+passed. The image of alphas, 1 - T with the final T, adds dL/dalpha T / (1 - alpha_i): it enters as one more term of the
+sum, -dL/dalpha T. A Gaussian's sums over all pixels stay in registers until it is done.
 """
 
 import numpy as np
@@ -11,8 +12,8 @@ from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import (
     BIT,
     BLOCK,
-    BLOCK_SHIFT,
     ONE,
+    ROWS_AT_ONCE,
     WORD_SHIFT,
     ZERO,
     alpha_at,
@@ -23,6 +24,7 @@ from completesplat.rasterizers.kernels.blocks import (
     open_pixels,
     row_spans,
     row_terms,
+    span_offset,
     state_vector,
     word_mask,
 )
@@ -40,7 +42,7 @@ from completesplat.rasterizers.kernels.simd import (
 
 Array = np.ndarray
 
-STATE_VECTORS = 7  # transmittance, sum behind, gradients of red, green, blue, depth, alpha
+STATE_VECTORS = 6  # transmittance, sum behind, gradients of red, green, blue, depth
 reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
 
 
@@ -55,13 +57,12 @@ def composite_backward(
     """Add up, for every visible Gaussian, its gradients over the block rows first_row..end_row - 1 of one view.
 
     Args:
-        state: scratch [block * 7 * 16]; otherwise as for `composite`, with the images that it drew.
+        state: scratch [block * 6 * 16]; otherwise as for `composite`, with the images that it drew.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images.
         gradients: [gaussian 16], see `layout`; rows of Gaussians that are not visible are not written.
     """
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
-    second = spans.shape[0] // 2
     integers = records.view(np.int32)
     flat_gradients = gradients.reshape(-1)
     begin(first_row, end_row, columns, height, width, state)
@@ -82,7 +83,8 @@ def composite_backward(
         sum_red, sum_green, sum_blue, sum_z = zero, zero, zero, zero
         sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv = zero, zero, zero, zero, zero, zero
         for row in range(top, bottom + 1):
-            first, last = int(spans[row - top]) >> BLOCK_SHIFT, int(spans[second + row - top]) >> BLOCK_SHIFT
+            span = span_offset(row - top)
+            first, last = spans[span], spans[span + ROWS_AT_ONCE]
             if last < first:
                 continue
             for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):
@@ -104,7 +106,6 @@ def composite_backward(
                     grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
                     grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
                     own = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
-                    own = own + state_vector(state, offset, 6)
                     sum_behind = state_vector(state, offset, 1) - weight * own
                     store(state, offset + LANES, sum_behind)
                     grad_opacity = transmittance * own - sum_behind / (ONE - opacity)
@@ -141,7 +142,7 @@ def begin(first_row, end_row, columns, height, width, state):
 
 @helper
 def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha):
-    """Put the gradients of the images, and the total sum of w_j g_j, into the state."""
+    """Put the gradients of the images, and the total sum, into the state."""
     height, width = alpha.shape
     for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
         for x in range(width):
@@ -149,6 +150,6 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
             pixel = block * (STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
             red, green, blue = grad_color[0, y, x], grad_color[1, y, x], grad_color[2, y, x]
             state[pixel + 2 * LANES], state[pixel + 3 * LANES], state[pixel + 4 * LANES] = red, green, blue
-            state[pixel + 5 * LANES], state[pixel + 6 * LANES] = grad_depth[y, x], grad_alpha[y, x]
+            state[pixel + 5 * LANES] = grad_depth[y, x]
             total = red * color[0, y, x] + green * color[1, y, x] + blue * color[2, y, x]
-            state[pixel + LANES] = total + grad_depth[y, x] * depth[y, x] + grad_alpha[y, x] * alpha[y, x]
+            state[pixel + LANES] = total + grad_depth[y, x] * depth[y, x] - grad_alpha[y, x] * (ONE - alpha[y, x])

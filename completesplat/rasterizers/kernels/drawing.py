@@ -138,7 +138,7 @@ class Drawing:
             float(self.constants.blur),
             float(self.constants.near_plane),
             buffers.empty((self.count, layout.RECORD_WIDTH)),
-            buffers.empty((2, self.count), np.uint32),
+            buffers.empty((2, self.count), np.int64),
             buffers.empty((2, self.count), np.int32),
             self.records[slot],
             self.visible[slot],
@@ -160,7 +160,7 @@ class Drawing:
         columns = -(-self.width // layout.BLOCK)
         state = buffers.empty(((end - first) * columns * state_vectors * LANES,))
         open_words = buffers.empty((end - first, -(-columns // WORD_BITS)), np.uint64)
-        spans = buffers.empty((2 * (end - first + LANES),))
+        spans = buffers.empty((2 * (end - first + LANES),), np.int32)
         count = self.visible_counts[slot]
         kernel(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 

@@ -143,7 +143,21 @@ def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     return builder.bitcast(builder.gep(array.data, [offset], inbounds=True), VECTOR_IR.as_pointer())
 
 
+def _store_shifted(typing_context: Any, array: Any, offset: Any, vector: Any, shift: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        whole = builder.fptosi(values[2], INTEGERS_IR)
+        places = ir.Constant(INTEGERS_IR, [shift.literal_value] * LANES)
+        address = _address(context, builder, signature, values)
+        builder.store(builder.ashr(whole, places), builder.bitcast(address, INTEGERS_IR.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, offset, VECTOR, shift), emit
+
+
 # load(array, offset): 16 floats of a flat float32 array, from element `offset` on.
-# store(array, offset, vector): the reverse. Neither checks bounds.
+# store(array, offset, vector): the reverse.
+# store_shifted(array, offset, vector, shift): the lanes, truncated to integers and shifted down, to a flat int32 array.
+# None of them checks bounds.
 load: Any = intrinsic(_load)
 store: Any = intrinsic(_store)
+store_shifted: Any = intrinsic(prefer_literal=True)(_store_shifted)
