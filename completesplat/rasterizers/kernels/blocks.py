@@ -14,8 +14,6 @@ from completesplat.rasterizers.kernels.simd import (
     keep,
     lane_constant,
     load,
-    maximum,
-    minimum,
     splat,
     square_root,
     store,
@@ -84,12 +82,12 @@ def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
     lowest, highest = lowest_pixel(), is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
     for row in range(top, bottom + 1, ROWS_AT_ONCE):
         low = row_tops() + (np.float32(row * BLOCK) - center_y)
-        high = minimum(low + np.float32(BLOCK - 1), extent)
-        y = minimum(maximum(extreme_y, maximum(low, -extent)), high)
+        high = min(low + np.float32(BLOCK - 1), extent)
+        y = min(max(extreme_y, max(low, -extent)), high)
         scaled = y * records[j, layout.V]
-        half_width = square_root(maximum(reach - scaled * scaled, ZERO))
+        half_width = square_root(max(reach - scaled * scaled, ZERO))
         end = y * records[j, layout.SHEAR] + half_width * stretch + start
-        store_shifted(spans, span_offset(row - top), minimum(maximum(end, lowest), highest), BLOCK_SHIFT)
+        store_shifted(spans, span_offset(row - top), min(max(end, lowest), highest), BLOCK_SHIFT)
 
 
 @helper
@@ -117,7 +115,7 @@ def column_offset(records, j, column):
 def alpha_at(exponent, log2_min_alpha, max_alpha):
     """(2^exponent, alpha): the same clamped from above, and zero below the threshold."""
     value = exp2(exponent)
-    return value, keep(exponent >= log2_min_alpha, minimum(value, max_alpha))
+    return value, keep(exponent >= log2_min_alpha, min(value, max_alpha))
 
 
 @helper

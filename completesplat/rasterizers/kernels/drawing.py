@@ -83,7 +83,7 @@ class Drawing:
         self.prepared = self.buffers.empty((self.scenes, self.count, layout.PREPARED_WIDTH))
         self.held = self.scenes * self.views if keep else min(self.scenes * self.views, VIEWS_AT_ONCE)
         self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
-        self.visible = self.buffers.empty((self.held, self.count), np.uint8)
+        self.visible = self.buffers.empty((self.held, self.count))
         self.visible_counts = np.zeros(self.held, np.int64)
         self.bands = self._bands()
 
@@ -191,6 +191,6 @@ class Drawing:
             self.cameras[scene, view],
             float(self.constants.blur),
             self.visible[task],
-            sums[scene, view : view + 1],
+            sums[scene, view],
             grad_cameras[scene, view],
         )

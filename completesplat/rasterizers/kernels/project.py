@@ -73,7 +73,7 @@ def project(
         unsorted: scratch like `records`.
         keys, order: scratch [2 gaussian], int64 and int32.
         records: receives the visible Gaussians, front to back.
-        visible: [gaussian] uint8, receives 1 for these.
+        visible: [gaussian] float32, receives 1 for these, 0 for the others.
 
     Returns:
         How many are visible.
@@ -86,7 +86,8 @@ def project(
         reach = np.float64(prepared[i, layout.REACH])
         if not reach > 0:
             continue
-        x, y, z = camera_point(camera, rotation, means, i)
+        mean = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        x, y, z = camera_point(camera, rotation, mean)
         if not (z > near_plane and z <= LARGEST_FLOAT32):
             continue
         inverse_z = ONE / z
@@ -118,7 +119,7 @@ def project(
         unsorted[count, layout.EXTENT_Y] = extent_y
         integers[count, layout.ROWS] = (int(top) >> layout.BLOCK_SHIFT) | (int(bottom) >> layout.BLOCK_SHIFT << 16)
         integers[count, layout.INDEX] = i
-        keys[0, count] = max(np.float64(z).view(np.int64) - SMALLEST_DEPTH_BITS, 0) >> DROPPED_BITS
+        keys[0, count] = depth_key(z)
         visible[i] = 1
         count += 1
     radix_sort(keys, order, count)
@@ -127,6 +128,12 @@ def project(
         source = np.int64(order[PASSES % 2, j]) * layout.RECORD_WIDTH
         store(records_flat, j * layout.RECORD_WIDTH, load(unsorted_flat, source))
     return count
+
+
+@helper
+def depth_key(z):
+    bits = np.float64(z).view(np.int64) - SMALLEST_DEPTH_BITS
+    return bits >> DROPPED_BITS if bits > 0 else 0
 
 
 @helper

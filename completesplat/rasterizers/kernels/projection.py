@@ -66,9 +66,8 @@ def nine(array, start):
 
 
 @helper
-def camera_point(camera, rotation, means, i):
-    """Mean i in camera coordinates."""
-    mean = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+def camera_point(camera, rotation, mean):
+    """A mean in camera coordinates."""
     x, y, z = matrix_times_column(rotation, mean)
     t = layout.TRANSLATION
     return x + camera[t], y + camera[t + 1], z + camera[t + 2]

@@ -9,6 +9,7 @@ from numba.extending import intrinsic
 
 from completesplat.rasterizers.kernels.vectors import (
     FLAGS,
+    I32,
     INTEGERS_IR,
     LANES,
     VECTOR,
@@ -34,18 +35,6 @@ def lane_constant(values: Any) -> Any:
 def splat(builder: Any, scalar: Any) -> Any:
     """The scalar in every lane."""
     return scalar
-
-
-@vector_function(VECTOR)
-def minimum(builder: Any, a: Any, b: Any) -> Any:
-    """The smaller of two, lane by lane; `b` where one is NaN, as in the processors' own instructions."""
-    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
-
-
-@vector_function(VECTOR)
-def maximum(builder: Any, a: Any, b: Any) -> Any:
-    """The larger of two, lane by lane; `b` where one is NaN."""
-    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
 @vector_function(VECTOR)
@@ -154,10 +143,49 @@ def _store_shifted(typing_context: Any, array: Any, offset: Any, vector: Any, sh
     return types.void(array, offset, VECTOR, shift), emit
 
 
+def _gather(typing_context: Any, array: Any, stride: Any, column: Any, start: Any, last: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, values[0]).data
+        integers = [
+            context.cast(builder, v, t, types.intp) for v, t in zip(values[1:], signature.args[1:], strict=True)
+        ]
+        width, first_column, begin, end = integers
+        final = builder.sub(end, ir.Constant(end.type, 1))
+        vector = ir.Constant(VECTOR_IR, ir.Undefined)
+        for lane in range(LANES):
+            i = builder.add(begin, ir.Constant(begin.type, lane))
+            i = builder.select(builder.icmp_signed("<", i, final), i, final)
+            address = builder.gep(data, [builder.add(builder.mul(i, width), first_column)], inbounds=True)
+            vector = builder.insert_element(vector, builder.load(address), ir.Constant(I32, lane))
+        return vector
+
+    return VECTOR(array, stride, column, start, last), emit
+
+
+def _transpose(typing_context: Any, rows: Any) -> Any:
+    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        matrix = cgutils.unpack_tuple(builder, values[0])
+        for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
+            for i in (i for i in range(LANES) if not i & step):
+                a, b = matrix[i], matrix[i + step]
+                upper = [LANES + lane - step if lane & step else lane for lane in range(LANES)]
+                lower = [LANES + lane if lane & step else lane + step for lane in range(LANES)]
+                matrix[i] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, upper))
+                matrix[i + step] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, lower))
+        return context.make_tuple(builder, signature.return_type, matrix)
+
+    return types.UniTuple(VECTOR, LANES)(rows), emit
+
+
 # load(array, offset): 16 floats of a flat float32 array, from element `offset` on.
 # store(array, offset, vector): the reverse.
 # store_shifted(array, offset, vector, shift): the lanes, truncated to integers and shifted down, to a flat int32 array.
+# gather(array, stride, column, start, last): array[i * stride + column] of a flat array for i = start, ..., start + 15;
+# for i = last - 1 in the lanes beyond that.
 # None of them checks bounds.
+# transpose(rows): from a tuple of 16 vectors, the tuple whose vector i has lane i of each.
 load: Any = intrinsic(_load)
 store: Any = intrinsic(_store)
 store_shifted: Any = intrinsic(prefer_literal=True)(_store_shifted)
+gather: Any = intrinsic(_gather)
+transpose: Any = intrinsic(_transpose)

@@ -2,7 +2,7 @@
 
 Vectors are lowered to LLVM's `<16 x float>`, which LLVM maps to whatever the processor has (AVX-512, AVX2, SSE2,
 NEON). So speed does not depend on the auto-vectoriser, and users need no C compiler. Arithmetic between vectors, or
-a vector and a scalar, is written with the usual operators; comparisons give a mask. `simd` has the functions.
+a vector and a scalar, is written with the usual operators, min and max; comparisons give a mask. `simd` has the rest.
 """
 
 import inspect
@@ -115,6 +115,19 @@ _define_operator(operator.truediv, VECTOR, lambda builder, a, b: builder.fdiv(a,
 _define_operator(operator.gt, MASK, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
 _define_operator(operator.ge, MASK, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 _define_operator(operator.le, MASK, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+# Of two numbers of which one is NaN, these give the second, as the processors' own instructions do.
+_define_operator(max, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+_define_operator(min, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+
+
+@type_callable(operator.neg)
+def _type_neg(context: Any) -> Any:
+    return lambda a: VECTOR if a == VECTOR else None
+
+
+@lower_builtin(operator.neg, VectorType)
+def _lower_neg(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    return builder.fneg(values[0])
 
 
 @type_callable(operator.and_)

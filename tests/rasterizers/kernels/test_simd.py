@@ -10,7 +10,8 @@ from completesplat.rasterizers.kernels.compilation import kernel
 from completesplat.rasterizers.kernels.vectors import LANES
 
 exp2, keep, lane_sums, load, store = simd.exp2, simd.keep, simd.lane_sums, simd.load, simd.store
-maximum, minimum, any_lane, lowest_bit = simd.maximum, simd.minimum, simd.any_lane, simd.lowest_bit
+any_lane, lowest_bit, gather, transpose = simd.any_lane, simd.lowest_bit, simd.gather, simd.transpose
+store_shifted = simd.store_shifted
 word_mask = blocks.word_mask
 LIMIT = np.float32(0.25)
 
@@ -30,10 +31,33 @@ def run_lane_sums(values: np.ndarray, out: np.ndarray) -> None:
 @kernel
 def run_selects(values: np.ndarray, out: np.ndarray) -> bool:
     a = load(values, 0)
-    store(out, 0, minimum(a, LIMIT))
-    store(out, LANES, maximum(a, LIMIT))
+    store(out, 0, min(a, LIMIT))
+    store(out, LANES, max(a, LIMIT))
     store(out, 2 * LANES, keep((a > LIMIT) & (a <= np.float32(2)), a))
     return any_lane(a > np.float32(100))
+
+
+@kernel
+def run_negative(values: np.ndarray, out: np.ndarray) -> None:
+    store(out, 0, -load(values, 0))
+
+
+@kernel
+def run_gather(values: np.ndarray, start: int, last: int, out: np.ndarray) -> None:
+    store(out, 0, gather(values, 3, 2, start, last))
+
+
+@kernel
+def run_store_shifted(values: np.ndarray, out: np.ndarray) -> None:
+    store_shifted(out, 1, load(values, 0), 2)
+
+
+@kernel
+def run_transpose(values: np.ndarray, out: np.ndarray) -> None:
+    a, b, c = load(values, 0), load(values, LANES), load(values, 2 * LANES)
+    columns = transpose((a, b, c, a, b, c, a, b, c, a, b, c, a, b, c, a))
+    for i in range(LANES):
+        store(out, i * LANES, columns[i])
 
 
 @kernel
@@ -85,3 +109,27 @@ def test_word_masks_hold_the_bits_of_their_columns(first: int, last: int) -> Non
         columns = [64 * word + bit for bit in range(64) if mask >> bit & 1]
         assert columns == [column for column in range(first, last + 1) if column // 64 == word]
         assert lowest == columns[0] - 64 * word
+
+
+def test_negative(values: np.ndarray) -> None:
+    assert np.array_equal(apply(run_negative, values, LANES), -values[:LANES])
+
+
+@pytest.mark.parametrize(("start", "last"), [(0, 16), (2, 16), (3, 4), (0, 30)])
+def test_gathered_columns_repeat_the_last_row(start: int, last: int) -> None:
+    table = np.arange(90, dtype=np.float32)
+    out = np.empty(LANES, np.float32)
+    run_gather(table, start, last, out)
+    assert out.tolist() == [3 * min(start + lane, last - 1) + 2 for lane in range(LANES)]
+
+
+def test_shifted_lanes_are_whole_numbers() -> None:
+    values = np.linspace(-9.7, 40.2, LANES).astype(np.float32)
+    out = np.full(LANES + 2, 77, np.int32)
+    run_store_shifted(values, out)
+    assert out.tolist() == [77, *(int(value) >> 2 for value in values), 77]
+
+
+def test_transpose(values: np.ndarray) -> None:
+    rows = values.reshape(3, LANES)[[i % 3 for i in range(LANES)]]
+    assert np.array_equal(apply(run_transpose, values, LANES * LANES).reshape(LANES, LANES), rows.T)
