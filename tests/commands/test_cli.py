@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 import time
@@ -22,6 +23,20 @@ def test_help_needs_no_heavy_import():
     output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
     assert time.perf_counter() - start < 10  # a hang, not a benchmark
+
+
+@pytest.mark.parametrize("given", [None, "7"])
+def test_torch_is_loaded_with_short_waits_of_its_threads(given):
+    """In a process of its own: what counts is the setting at the moment at which torch is loaded."""
+    program = "import os, sys; sys.argv = ['completesplat', 'data', '--help']; from completesplat.cli import main\n"
+    program += "class Watch:\n    def find_spec(self, name, *_):\n"
+    program += "        if name == 'torch': print('torch with', os.environ.get('GOMP_SPINCOUNT'))\n"
+    program += "sys.meta_path.insert(0, Watch())\ntry:\n    main()\nexcept SystemExit:\n    pass\nimport torch"
+    environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+    environment |= {} if given is None else {"GOMP_SPINCOUNT": given}
+    command = [sys.executable, "-c", program]
+    output = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    assert f"torch with {given or 3000}" in output.splitlines()
 
 
 def test_version(command):
