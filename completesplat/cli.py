@@ -29,8 +29,8 @@ def main() -> None:
     if arguments[0] not in VERBS:
         sys.exit(_refuse(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}"))
 
-    # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work for milliseconds, at full
-    # speed, which keeps the rasterizer's threads and other processes off the cores.
+    # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work at full speed, for
+    # milliseconds, in which they keep the rasterizer's threads and other processes off the cores.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     from completesplat.commands import launch, refusal
 

@@ -54,6 +54,8 @@ PARTS = ["autoreconstructor", "conditioning", "denoiser", "sampler", "rasterizer
 
 @pytest.mark.parametrize(("group", "option"), [(g, o) for g, o in EVERY_OPTION if g in PARTS])
 def test_every_part_instantiates_from_its_config(group, option):
+    if option == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
     config = compose_config("fit", f"{group}={option}", *needed)
     with torch.device("meta" if option == "stable_diffusion" else "cpu"):

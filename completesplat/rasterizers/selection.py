@@ -1,6 +1,7 @@
 """Which backends work on this machine, and the choice among them."""
 
 import logging
+from collections.abc import Callable
 from functools import cache
 
 import torch
@@ -8,6 +9,7 @@ import torch
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers.cuda import CudaRasterizer
 from completesplat.rasterizers.protocol import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -16,41 +18,53 @@ logger = logging.getLogger(__name__)
 TOLERANCE = 1e-4
 
 
-def available() -> dict[str, bool]:
-    """The names of all backends, with whether each renders correctly here."""
-    return {"tiled": _tiled_failure() is None, "reference": True}
+def _tiled(constants: RenderingConstants | None) -> Rasterizer:
+    # Imported here, because the import fails where numba does.
+    from completesplat.rasterizers.tiled import TiledRasterizer
+
+    return TiledRasterizer(constants)
+
+
+FASTER: dict[str, Callable[[RenderingConstants | None], Rasterizer]] = {"cuda": CudaRasterizer, "tiled": _tiled}
+"""Backends that may not work everywhere, the fastest first."""
+
+
+def available(constants: RenderingConstants | None = None) -> dict[str, bool]:
+    """The names of all backends, with whether each renders correctly here and honours the constants."""
+    return {name: failure(name, constants) is None for name in FASTER} | {"reference": True}
 
 
 def auto(constants: RenderingConstants | None = None) -> Rasterizer:
-    """The fastest backend that works here and honours the constants; the choice and its reason are logged."""
-    failure = _tiled_failure()
-    if failure is None:
-        from completesplat.rasterizers.tiled import TiledRasterizer
+    """The fastest backend that works here and honours the constants; the choice and its reasons are logged.
 
-        try:
-            rasterizer = TiledRasterizer(constants)
-        except CompleteSplatError as error:
-            failure = str(error)
-        else:
-            logger.info("rasterizer: tiled (a test rendering agrees with the reference)")
-            return rasterizer
-    logger.warning("rasterizer: reference, which is very slow, because tiled does not work: %s", failure)
+    Every backend takes tensors of any device, so that the choice does not depend on where a model runs: beside a GPU,
+    a model on the CPU is drawn on the GPU as well.
+    """
+    for name, make in FASTER.items():
+        reason = failure(name, constants)
+        if reason is None:
+            logger.info("rasterizer: %s (a test rendering agrees with the reference)", name)
+            return make(constants)
+        expected = name == "cuda" and not torch.cuda.is_available()
+        logger.log(logging.INFO if expected else logging.WARNING, "rasterizer: not %s: %s", name, reason)
+    logger.warning("rasterizer: reference, which is very slow")
     return ReferenceRasterizer(constants)
 
 
 @cache
-def _tiled_failure() -> str | None:
-    """Why the tiled backend cannot be used, or None if a tiny scene comes out as it should, with its gradient.
+def failure(name: str, constants: RenderingConstants | None) -> str | None:
+    """Why a backend cannot be used, or None if a tiny scene comes out as it should, with its gradient.
 
-    Any exception counts: a missing or too old numba, a processor that it does not know, a broken cache.
+    Any exception counts: a missing package, kernels that do not compile (gsplat's are compiled on first use), a
+    processor that numba does not know, a broken cache, refused constants.
     """
     try:
-        from completesplat.rasterizers.tiled import TiledRasterizer
-
-        found, expected = _image_and_gradient(TiledRasterizer()), _image_and_gradient(ReferenceRasterizer())
+        found, expected = map(_image_and_gradient, (FASTER[name](constants), ReferenceRasterizer(constants)))
+    except CompleteSplatError as error:
+        return str(error)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    difference = max((a - b).abs().max().item() for a, b in zip(found, expected, strict=True))
+    difference = torch.cat([(a - b).flatten() for a, b in zip(found, expected, strict=True)]).abs().max().item()
     return None if difference <= TOLERANCE else f"its test rendering is wrong by {difference:.2g}"
 
 

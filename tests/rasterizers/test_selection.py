@@ -1,6 +1,8 @@
-"""The automatic choice of a backend."""
+"""The automatic choice of a backend, on a machine without a GPU unless a test pretends that there is one."""
 
 import logging
+import math
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -8,26 +10,91 @@ import torch
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rendering, RenderingConstants, selection, tiled
+from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection, tiled
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
 
 
 @pytest.fixture(autouse=True)
-def _no_memory() -> Iterator[None]:
-    selection._tiled_failure.cache_clear()
+def _no_gpu_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    selection.failure.cache_clear()
     yield
-    selection._tiled_failure.cache_clear()
+    selection.failure.cache_clear()
 
 
-def test_the_tiled_backend_is_taken_where_it_works(caplog: pytest.LogCaptureFixture) -> None:
+class Works(ReferenceRasterizer):
+    """A backend as it should be."""
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+
+
+def warnings_in(caplog: pytest.LogCaptureFixture) -> str:
+    return "\n".join(record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING)
+
+
+def test_the_tiled_backend_is_taken_where_there_is_no_gpu(caplog: pytest.LogCaptureFixture) -> None:
+    """That there is none is said, but is nothing to warn of."""
     constants = RenderingConstants(max_alpha=0.99)
     with caplog.at_level(logging.INFO):
         chosen = selection.auto(constants)
     assert isinstance(chosen, TiledRasterizer)
     assert chosen.constants == constants
-    assert selection.available() == {"tiled": True, "reference": True}
-    assert "tiled" in caplog.text
+    assert selection.available() == {"cuda": False, "tiled": True, "reference": True}
+    assert "not cuda: the cuda rasterizer needs a CUDA device" in caplog.text
+    assert "rasterizer: tiled" in caplog.text
+    assert warnings_in(caplog) == ""
+
+
+def test_the_cuda_backend_is_taken_where_it_works(
+    gpu: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(selection.FASTER, "cuda", Works)
+    constants = RenderingConstants(blur=0.1)
+    with caplog.at_level(logging.INFO):
+        chosen = selection.auto(constants)
+    assert isinstance(chosen, Works)
+    assert chosen.constants == constants
+    assert selection.available() == {"cuda": True, "tiled": True, "reference": True}
+    assert "rasterizer: cuda" in caplog.text
+    assert warnings_in(caplog) == ""
+
+
+def test_a_gpu_without_gsplat_is_worth_a_warning(
+    gpu: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)  # type: ignore[arg-type]
+    assert isinstance(selection.auto(), TiledRasterizer)
+    assert 'pip install "completesplat[cuda]"' in warnings_in(caplog)
+
+
+def test_gsplat_is_tried_and_not_only_imported(
+    gpu: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It imports where its kernels are not compiled; then its first call fails like this."""
+    gsplat = pytest.importorskip("gsplat")
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+
+    def fail(**arguments: object) -> None:
+        raise AttributeError("'NoneType' object has no attribute 'CameraModelType'")
+
+    monkeypatch.setattr(gsplat, "rasterization", fail)
+    constants = RenderingConstants(**cuda.compiled_constants())
+    assert isinstance(selection.auto(constants), TiledRasterizer)
+    assert not selection.available(constants)["cuda"]
+    assert "not cuda: AttributeError: 'NoneType'" in warnings_in(caplog)
+
+
+def test_constants_that_gsplat_refuses_go_to_the_next_backend(gpu: None, caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("gsplat")
+    constants = RenderingConstants(**cuda.compiled_constants() | {"max_alpha": 0.9})
+    chosen = selection.auto(constants)
+    assert isinstance(chosen, TiledRasterizer)
+    assert chosen.constants == constants
+    assert "set rasterizer.constants.max_alpha" in warnings_in(caplog)
 
 
 def test_a_backend_that_raises_is_not_taken(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
@@ -37,24 +104,25 @@ def test_a_backend_that_raises_is_not_taken(monkeypatch: pytest.MonkeyPatch, cap
     monkeypatch.setattr(tiled.TiledRasterizer, "__call__", fail)
     assert isinstance(selection.auto(), ReferenceRasterizer)
     assert not selection.available()["tiled"]
-    assert "OSError: no such instruction" in caplog.text
+    assert "not tiled: OSError: no such instruction" in warnings_in(caplog)
+    assert "reference, which is very slow" in warnings_in(caplog)
 
 
-@pytest.mark.parametrize("wrong", ["image", "gradient"])
+@pytest.mark.parametrize("wrong", ["image", "gradient", "nan"])
 def test_a_backend_that_renders_wrongly_is_not_taken(
     wrong: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    right = TiledRasterizer.__call__
+    class Wrong(ReferenceRasterizer):
+        def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+            rendering = super().__call__(gaussians, cameras)
+            color = rendering.color * (1.01 if wrong == "image" else 1)
+            color.register_hook(lambda gradient: gradient * {"image": 1, "gradient": 1.01, "nan": math.nan}[wrong])
+            return Rendering(color, rendering.depth, rendering.alpha)
 
-    def render(self: TiledRasterizer, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        rendering = right(self, gaussians, cameras)
-        color = rendering.color
-        color = color * 1.01 if wrong == "image" else color + 0.01 * (color - color.detach())
-        return Rendering(color, rendering.depth, rendering.alpha)
-
-    monkeypatch.setattr(tiled.TiledRasterizer, "__call__", render)
-    assert isinstance(selection.auto(), ReferenceRasterizer)
-    assert "wrong by" in caplog.text
+    monkeypatch.setattr(selection, "FASTER", {"first": Wrong, "second": Works})
+    assert isinstance(selection.auto(), Works)
+    assert selection.available() == {"first": False, "second": True, "reference": True}
+    assert "not first: its test rendering is wrong by" in warnings_in(caplog)
 
 
 def test_constants_that_the_tiled_backend_refuses_go_to_the_reference(caplog: pytest.LogCaptureFixture) -> None:
@@ -67,3 +135,10 @@ def test_constants_that_the_tiled_backend_refuses_go_to_the_reference(caplog: py
 def test_the_choice_works_where_gradients_are_off() -> None:
     with torch.no_grad():
         assert isinstance(selection.auto(), TiledRasterizer)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_gpu_with_gsplat_is_used(gpu: None) -> None:
+    pytest.importorskip("gsplat")
+    assert isinstance(selection.auto(RenderingConstants(**cuda.compiled_constants())), cuda.CudaRasterizer)

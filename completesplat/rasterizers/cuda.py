@@ -1,0 +1,172 @@
+"""The GPU backend: an adapter onto gsplat, version 1.5.3 or newer, imported only when a rasterizer is made."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, transform_points
+from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.rasterizers.reference import LARGEST_PROJECTION
+
+DEVICE = "cuda"
+WARP = 32
+# Further away the reciprocal of the cubed depth, a factor of gsplat's gradients, is below float32; further still, at
+# 1e17, gradients become NaN where the depth image has one, because coordinates are multiplied before they are divided.
+FARTHEST = 1e12
+SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
+
+
+class CudaRasterizer:
+    """The same function as `ReferenceRasterizer`, by gsplat's kernels, for float32 tensors.
+
+    Gradients reach all parameters of the Gaussians and the poses of the cameras, not the intrinsics. Their last bits
+    change from run to run (sums in no fixed order). Four things differ from the reference:
+
+    - gsplat takes one opacity for all views of a scene. A Gaussian whose projection may overflow in a view before
+      whose near plane it lies is therefore left out of all views of that scene.
+    - Gaussians further away than 1e12 are not drawn.
+    - An opacity above 1 is cut off at 3.33 standard deviations.
+    - gsplat takes the determinant of the projected covariance as a difference in float32. It is lost to rounding for
+      thin Gaussians with a standard deviation over 1000 px, which can then be missing, too thin or too wide.
+
+    Raises:
+        CompleteSplatError: no gsplat, no CUDA device, or constants other than those compiled into gsplat; on a call,
+            tensors of another dtype or on several devices, intrinsics that require a gradient.
+    """
+
+    def __init__(self, constants: RenderingConstants | None = None) -> None:
+        self.constants = constants or RenderingConstants()
+        if not torch.cuda.is_available():
+            raise CompleteSplatError("the cuda rasterizer needs a CUDA device, and torch finds none")
+        try:
+            import gsplat
+        except ImportError as error:
+            message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
+            raise CompleteSplatError(message) from error
+        for name, value in compiled_constants().items():
+            if not math.isclose(getattr(self.constants, name), value, rel_tol=1e-6):
+                raise CompleteSplatError(
+                    f"gsplat {gsplat.__version__} is compiled with {name} = {value:g}, not "
+                    f"{getattr(self.constants, name):g}: set rasterizer.constants.{name}={value}"
+                )
+        if not (self.constants.blur >= SMALLEST_BLUR and self.constants.near_plane >= SMALLEST_NEAR_PLANE):
+            least = f"a blur of at least {SMALLEST_BLUR} px^2 and a near_plane of at least {SMALLEST_NEAR_PLANE}"
+            raise CompleteSplatError(f"the cuda rasterizer needs {least}")
+        # gsplat culls what is nearer than its near plane, the reference what is not further.
+        self._near_plane = float(np.nextafter(np.float32(self.constants.near_plane), np.float32(np.inf)))
+        self._rasterization = gsplat.rasterization
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Render scenes [batch] from cameras [batch view]; CPU tensors are copied to the GPU and the images back."""
+        home = gaussians.means.device
+        if home.type != DEVICE:
+            return self(gaussians.to(DEVICE), cameras.to(DEVICE)).to(home)
+        _check(gaussians, cameras)
+        height, width = cameras.image_size
+        prepared = prepare(gaussians, drawable(gaussians, cameras, self.constants))
+        images, alphas, _ = self._rasterization(
+            means=prepared.means,
+            quats=prepared.quaternions,
+            scales=prepared.scales,
+            opacities=prepared.opacities,
+            colors=prepared.colors,
+            viewmats=cameras.world_to_camera,
+            Ks=cameras.intrinsics,
+            width=width,
+            height=height,
+            near_plane=self._near_plane,
+            far_plane=FARTHEST,
+            eps2d=self.constants.blur,
+            # Nearly every Gaussian is seen in every view, so that there is little to gain; and the packed kernels can
+            # add the gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
+            packed=False,
+            render_mode="RGB+D",
+            rasterize_mode="classic",
+        )
+        images = images.movedim(-1, -3)
+        return Rendering(images[:, :, :3], images[:, :, 3:], alphas.movedim(-1, -3))
+
+
+def compiled_constants() -> dict[str, float]:
+    """Those of the installed gsplat's kernels, which no argument changes.
+
+    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`, 1.5.3 only in its kernels
+    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`). The margin of the frustum stands in `Utils.cuh` in both.
+    """
+    constants = {"max_alpha": 0.999, "min_alpha": 1 / 255, "min_transmittance": 1e-4, "frustum_margin": 0.3}
+    try:
+        from gsplat.cuda import _constants as stated
+    except ImportError:
+        return constants
+    return constants | {
+        "max_alpha": stated.MAX_ALPHA,
+        "min_alpha": stated.ALPHA_THRESHOLD,
+        "min_transmittance": stated.TRANSMITTANCE_THRESHOLD,
+    }
+
+
+def _check(gaussians: Gaussians, cameras: Cameras) -> None:
+    tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+    home = gaussians.means.device
+    for name, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device != home:
+            found = f"{name} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
+            raise CompleteSplatError(f"the cuda rasterizer takes float32 tensors on one device ({home}), but {found}")
+    if torch.is_grad_enabled() and cameras.intrinsics.requires_grad:
+        message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=tiled"
+        raise CompleteSplatError(message)
+
+
+@torch.no_grad()
+def drawable(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> Bool[Tensor, "batch gaussian"]:
+    """Which Gaussians gsplat may see: finite ones whose extent overflows in no view that can show them.
+
+    It culls by itself what is too transparent, or so far aside that only its centre overflows. Up to
+    LARGEST_PROJECTION, radii fit its int32, and products of two variances have a reciprocal in fast arithmetic.
+    """
+    depths = transform_points(cameras.world_to_camera, gaussians.means[:, None])[..., 2]
+    deviations = gaussians.scales.abs().amax(-1)[:, None] * _magnification(cameras, constants)[..., None] / depths
+    # Comparisons with NaN are false.
+    bounded = (depths <= constants.near_plane) | (deviations.square() <= LARGEST_PROJECTION)
+    return gaussians.finite() & bounded.all(1)
+
+
+def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Tensor, "batch view"]:
+    """Upper bound of the standard deviation (px) of a Gaussian of unit scale at unit depth, in x and y.
+
+    A row of the Jacobian is (f, -f * slope) / depth, and the slope is limited to the frustum with its margin.
+    """
+    height, width = cameras.image_size
+    focal = torch.diagonal(cameras.intrinsics, dim1=-2, dim2=-1)[..., :2]
+    principal = cameras.intrinsics[..., :2, 2]
+    extent = torch.tensor([width, height], dtype=focal.dtype, device=focal.device)
+    slope = (torch.maximum(principal, extent - principal) + constants.frustum_margin * 0.5 * extent) / focal
+    return (focal * (1 + slope.square()).sqrt()).amax(-1)
+
+
+def prepare(gaussians: Gaussians, kept: Bool[Tensor, "batch gaussian"]) -> Gaussians:
+    """Gaussians with which gsplat can do no harm: unit quaternions, and zeros for those that are not kept.
+
+    Zero opacity keeps a Gaussian out of the image; zeros instead of its values keep NaN out of the gradients.
+    Their number is filled up to a multiple of 32, and at least to that, because gsplat fails (a division by zero in
+    `ProjectionEWA3DGSFused.cu`) when there is none, and because the backward pass there sums over the lanes of a warp
+    that agree in the index of the Gaussian or the view, whatever their scene: no warp may reach into a second scene.
+    """
+    missing = max(WARP - gaussians.count, -gaussians.count % WARP)
+
+    def clean(tensor: Tensor) -> Tensor:
+        values = torch.where(kept.reshape(*kept.shape, *[1] * (tensor.ndim - kept.ndim)), tensor, 0.0)
+        return pad(values, (*[0, 0] * (tensor.ndim - kept.ndim), 0, missing))
+
+    cleaned = gaussians.map(clean)
+    # Brought to at most unit size first: the square of a long quaternion overflows.
+    size = cleaned.quaternions.detach().abs().amax(-1, keepdim=True).clamp(min=1)
+    return replace(cleaned, quaternions=normalize_quaternion(cleaned.quaternions / size))

@@ -1,0 +1,422 @@
+"""The adapter onto gsplat.
+
+Most tests here run without a GPU. gsplat's own Python front end (`gsplat.rasterization`) is called, and its four CUDA
+operations are replaced by the stand-ins below: gsplat's projection in torch, and a compositor written from the
+definition in `RasterizeToPixels3DGSFwd.cu`, both in float64. So they prove the adapter's conventions (units, axes,
+order and shapes of arguments, batches, what is culled, what is kept from gsplat), not gsplat's CUDA kernels, their
+float32 arithmetic or their gradients. The tests marked `gpu` compare those with the reference.
+"""
+
+import math
+import runpy
+import sys
+from dataclasses import replace
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from degenerate_gaussians import DRAWN, FLAT, NEVER_DRAWN, SIZE, camera, changed, healthy
+from rasterizer_scenes import cotangents_for, scenes
+from torch import Tensor
+
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers import Rasterizer, RenderingConstants, cuda
+from completesplat.rasterizers.cuda import FARTHEST, CudaRasterizer
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.tensors import stack
+
+BEYOND_FARTHEST = {"very far"}
+
+
+def standin_projection(means, covars, quats, scales, viewmats, Ks, width, height, **options) -> tuple:
+    """`fully_fused_projection`: what CUDA leaves uninitialised for a culled Gaussian is NaN here."""
+    from gsplat.cuda import _torch_impl
+
+    assert covars is None
+    assert (options["packed"], options["calc_compensations"], options["camera_model"]) == (False, False, "pinhole")
+    (batch, count), views = means.shape[:2], viewmats.shape[1]
+    covariances, _ = _torch_impl._quat_scale_to_covar_preci(quats.double(), scales.double(), compute_preci=False)
+    results: list[list[Tensor]] = [[], [], [], []]
+    for b, v in np.ndindex(batch, views):
+        depths = means[b].double() @ viewmats[b, v, 2, :3].double() + viewmats[b, v, 2, 3].double()
+        seen = (depths >= options["near_plane"]) & (depths <= options["far_plane"])
+        seen &= options["opacities"][b] >= 1 / 255
+        radii, *projected, _ = _torch_impl._fully_fused_projection(
+            means[b, seen].double(),
+            covariances[b, seen],
+            viewmats[b, v : v + 1].double(),
+            Ks[b, v : v + 1].double(),
+            width,
+            height,
+            options["eps2d"],
+            -math.inf,
+            math.inf,
+        )
+        results[0].append(torch.zeros(count, 2, dtype=torch.int32).index_put((seen,), radii[0]))
+        for result, values in zip(results[1:], projected, strict=True):
+            unknown = torch.full((count, *values.shape[2:]), math.nan, dtype=torch.float64)
+            result.append(unknown.index_put((seen,), values[0]))
+    return *(torch.stack(result).unflatten(0, (batch, views)) for result in results), None
+
+
+def standin_tiles(means2d, radii, depths, tile_size, tile_width, tile_height, **options) -> tuple:
+    """`isect_tiles`: the drawn Gaussians of each image once (not once for each tile), from front to back."""
+    assert not options["packed"]
+    drawn, count = (radii > 0).all(-1).flatten(0, 1), radii.shape[-2]
+    orders = [torch.argsort(row, stable=True) for row in depths.flatten(0, 1)]
+    indices = torch.cat([i * count + order[drawn[i][order]] for i, order in enumerate(orders)])
+    return drawn.int(), indices, indices.int()
+
+
+def standin_offsets(isect_ids, n_images, tile_width, tile_height) -> Tensor:
+    return torch.zeros(n_images, tile_height, tile_width, dtype=torch.int32)
+
+
+def standin_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, indices, **options) -> tuple:
+    """`rasterize_to_pixels` for every pixel and all Gaussians of an image."""
+    assert options["backgrounds"] is None
+    images, count = means2d.shape[:2], means2d.shape[2]
+    x, y = torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy")
+    pixels = torch.stack([x, y], dim=-1).double()
+    results = []
+    for i in range(images.numel()):
+        chosen = indices[indices // count == i].long()
+        tensors = [t.flatten(0, 2)[chosen] for t in (means2d, conics, colors, opacities.double())]
+        results.append(composite(pixels, *tensors))
+    return tuple(torch.stack(result).unflatten(0, images).float() for result in zip(*results, strict=True))
+
+
+def composite(pixels: Tensor, means: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor) -> tuple:
+    left, done = torch.ones_like(pixels[..., :1]), torch.zeros_like(pixels[..., :1], dtype=torch.bool)
+    # An image of nothing is connected with what could have been in it, as gsplat's is.
+    nothing = sum(tensor[:0].sum() for tensor in (means, conics, colors, opacities))
+    image = nothing + torch.zeros(*pixels.shape[:-1], colors.shape[-1], dtype=pixels.dtype)
+    for mean, conic, color, opacity in zip(means, conics, colors, opacities, strict=True):
+        dx, dy = (mean - pixels).split(1, dim=-1)
+        sigma = 0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) + conic[1] * dx * dy
+        alpha = (opacity * torch.exp(-sigma)).clamp(max=0.999)
+        drawn = (sigma >= 0) & (alpha >= 1 / 255)
+        done = done | (drawn & (left * (1 - alpha) <= 1e-4))
+        alpha = torch.where(drawn & ~done, alpha, 0.0)
+        image = image + left * alpha * color
+        left = left * (1 - alpha)
+    return image, 1 - left
+
+
+@pytest.fixture
+def front_end(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """gsplat with stand-ins for its CUDA operations, on the CPU; a list of the arguments of all calls."""
+    gsplat = pytest.importorskip("gsplat")
+    if gsplat.__version__ != "1.5.3":
+        pytest.skip("from gsplat 1.6 on its front end is one CUDA operation")
+    monkeypatch.setattr(gsplat.rendering, "fully_fused_projection", standin_projection)
+    monkeypatch.setattr(gsplat.rendering, "isect_tiles", standin_tiles)
+    monkeypatch.setattr(gsplat.rendering, "isect_offset_encode", standin_offsets)
+    monkeypatch.setattr(gsplat.rendering, "rasterize_to_pixels", standin_pixels)
+    calls: list[dict[str, Any]] = []
+
+    def rasterization(**arguments):
+        calls.append(arguments)
+        return gsplat.rendering.rasterization(**arguments)
+
+    monkeypatch.setattr(gsplat, "rasterization", rasterization)
+    pretend_a_device(monkeypatch)
+    return calls
+
+
+def pretend_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+
+
+def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, **constants: float) -> None:
+    """An empty gsplat that states these constants, or none."""
+    package, kernels, stated = ModuleType("gsplat"), ModuleType("gsplat.cuda"), ModuleType("gsplat.cuda._constants")
+    package.__dict__.update(__version__="9", rasterization=None)
+    stated.__dict__.update(constants)
+    for module in (package, kernels, stated):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    if not constants:
+        monkeypatch.delitem(sys.modules, stated.__name__)
+
+
+def draw(
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """All images in one tensor; gradients of the Gaussians and the poses under random cotangents."""
+    cameras = camera().to(gaussians.means) if cameras is None else cameras
+    gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    cameras = replace(cameras, world_to_camera=cameras.world_to_camera.detach().requires_grad_())
+    rendering = rasterizer(gaussians, cameras)
+    images = torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=2)
+    cotangents = torch.cat(cotangents_for(cameras, 0), dim=2).to(images)
+    inputs = vars(gaussians) | {"world_to_camera": cameras.world_to_camera}
+    gradients = torch.autograd.grad(images, list(inputs.values()), cotangents)
+    return images.detach(), dict(zip(inputs, gradients, strict=True))
+
+
+def assert_agrees(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    constants: RenderingConstants,
+    of_images: float,
+    of_gradients: float,
+    exceptions: float = 0.0,
+) -> None:
+    """Exceptions are the share of values where another rounding may have decided otherwise at a threshold of alpha."""
+    found, gradients = draw(CudaRasterizer(constants), gaussians, cameras)
+    gaussians, cameras = (x.to("cpu", torch.float64) for x in (gaussians, cameras))
+    exact, expected = draw(ReferenceRasterizer(constants), gaussians, cameras)
+    assert found.dtype == torch.float32
+    assert exact.any()
+    assert ((found.cpu() - exact).abs() > of_images).double().mean() <= exceptions
+    for name, gradient in expected.items():
+        assert (gradients[name].cpu() - gradient).norm() <= of_gradients * gradient.norm(), name
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_images_and_gradients_agree_with_the_float64_reference(seed: int, front_end: list) -> None:
+    size = [(13, 17), (16, 16), (9, 33)][seed % 3]
+    constants = RenderingConstants() if seed % 2 else RenderingConstants(blur=0.1, near_plane=1.6)
+    gaussians, cameras = scenes(seed, 2, 3, size, constants, count=[40, 64][seed % 4 == 0])
+    assert_agrees(gaussians, cameras, constants, 2e-6, 1e-5)
+    assert len(front_end) == 1  # for all scenes and views
+
+
+def test_what_gsplat_is_given(front_end: list) -> None:
+    gaussians, cameras = scenes(1, 2, 3, (13, 17), RenderingConstants(), count=40)
+    CudaRasterizer()(gaussians, cameras)
+    (given,) = front_end
+    shapes = {name: list(given[name].shape) for name in ("means", "quats", "scales", "opacities", "colors")}
+    # 40 Gaussians are filled up to whole warps, so that none reaches from one scene into the next.
+    assert shapes == {
+        "means": [2, 64, 3],
+        "quats": [2, 64, 4],
+        "scales": [2, 64, 3],
+        "opacities": [2, 64],
+        "colors": [2, 64, 3],
+    }
+    assert (given["width"], given["height"]) == (17, 13)
+    assert given["near_plane"] == np.nextafter(np.float32(0.01), np.float32(1))
+    assert not given["opacities"][:, 40:].any()
+    assert torch.allclose(given["quats"].norm(dim=-1), torch.ones(2, 64))
+
+
+@pytest.mark.parametrize(("count", "given"), [(0, 32), (1, 32), (32, 32), (33, 64)])
+def test_gaussians_are_filled_up_to_whole_warps(count: int, given: int, front_end: list) -> None:
+    gaussians = healthy(40).map(lambda tensor: tensor[:, :count])
+    images, gradients = draw(CudaRasterizer(), gaussians)
+    assert front_end[0]["means"].shape[1] == given
+    assert images.any() == (count > 0)
+    assert all(gradients[name].shape == tensor.shape for name, tensor in vars(gaussians).items())
+
+
+@pytest.mark.parametrize("kind", NEVER_DRAWN)
+def test_a_gaussian_that_cannot_be_drawn_is_as_good_as_absent(kind: str, front_end: list) -> None:
+    assert_as_good_as_absent(CudaRasterizer(), changed(NEVER_DRAWN[kind]))
+
+
+def test_the_sign_of_a_scale_does_not_hide_its_size(front_end: list) -> None:
+    assert_as_good_as_absent(CudaRasterizer(), changed({"scales": (-3e7, -3e7, 0.2)}))
+
+
+def test_nothing_is_drawn_beyond_what_gsplat_can_differentiate(front_end: list) -> None:
+    """With a gradient to the depth image, gsplat multiplies squares of depths: far away, the result is NaN."""
+    assert_as_good_as_absent(CudaRasterizer(), changed({"means": (0.0, 0.0, 1.01 * FARTHEST)}))
+    images, _ = draw(CudaRasterizer(), changed({"means": (0.0, 0.0, 0.99 * FARTHEST)}))
+    assert images.any()
+
+
+def assert_as_good_as_absent(rasterizer: Rasterizer, one: Gaussians, gradients_agree: float = 0.0) -> None:
+    rest = healthy(12)
+    expected, expected_gradients = draw(rasterizer, rest)
+    images, gradients = draw(rasterizer, concatenate([one, rest]))
+    assert expected.any()
+    assert torch.equal(images, expected)
+    for name, without in expected_gradients.items():
+        gradient = gradients[name]
+        if name != "world_to_camera":
+            assert not gradient[:, 0].any()
+            gradient = gradient[:, 1:]
+        assert (gradient - without).norm() <= gradients_agree * without.norm(), name
+
+
+@pytest.mark.parametrize("kind", sorted(DRAWN.keys() - BEYOND_FARTHEST))
+def test_an_extreme_gaussian_is_drawn_as_by_the_float64_reference(kind: str, front_end: list) -> None:
+    gaussians = concatenate([healthy(12), changed(DRAWN[kind])])
+    images, gradients = draw(CudaRasterizer(), gaussians)
+    expected, expected_gradients = draw(ReferenceRasterizer(), gaussians.to(torch.float64))
+    without, _ = draw(CudaRasterizer(), healthy(12))
+    assert not torch.equal(images, without)
+    assert ((images - expected).abs() <= 1e-5 * expected.abs().clamp(min=1)).all()
+    for name, exact in expected_gradients.items():
+        rest, extreme = (
+            x.split([12, 1], dim=1) if name in vars(gaussians) else (x, x) for x in (gradients[name], exact)
+        )
+        assert (rest[0] - extreme[0]).norm() <= 2e-4 * extreme[0].norm(), name
+        if not (kind in FLAT and name == "quaternions"):
+            assert (rest[1] - extreme[1]).norm() <= 2e-4 * extreme[1].norm(), name
+
+
+def test_what_overflows_in_one_view_is_left_out_of_all_views_of_its_scene_only(front_end: list) -> None:
+    """Unless it lies behind the camera there: then it is drawn in the others, as by the reference."""
+    rest, near, far, behind = healthy(12), *(camera().world_to_camera.clone() for _ in range(3))
+    far[..., 2, 3], behind[..., 2, 3] = 1e8, -4
+    scenes = [concatenate([one, rest]) for one in (changed({"scales": (1e8, 1e8, 1e8)}), changed({}))]
+    both = stack(scenes).map(lambda tensor: tensor.squeeze(1))
+
+    def alphas(rasterizer: Rasterizer, gaussians: Gaussians, *views: Tensor) -> Tensor:
+        batch = len(gaussians.means)
+        intrinsics = camera().intrinsics.expand(batch, len(views), 3, 3)
+        return rasterizer(gaussians, Cameras(torch.cat(views, 1).expand(batch, -1, 4, 4), intrinsics, SIZE)).alpha
+
+    found, expected = (alphas(r, both, near, far) for r in (CudaRasterizer(), ReferenceRasterizer()))
+    assert torch.equal(found[0], alphas(CudaRasterizer(), rest, near, far)[0])
+    assert expected[0, 1].min() > 0.5
+    assert torch.allclose(found[1], expected[1], atol=1e-5)
+    found, expected = (alphas(r, both, behind, far) for r in (CudaRasterizer(), ReferenceRasterizer()))
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_the_near_plane_is_the_reference_s(front_end: list) -> None:
+    """A Gaussian exactly on it is culled; one at the next float32 is not."""
+    on = np.float32(0.01)
+    for depth, seen in ((on, False), (np.nextafter(on, np.float32(1)), True)):
+        one = changed({"means": (0.0, 0.0, float(depth)), "scales": (1e-4, 1e-4, 1e-4)})
+        for rasterizer in (CudaRasterizer(), ReferenceRasterizer()):
+            assert draw(rasterizer, one)[0].any() == seen
+
+
+def test_quaternions_without_direction_and_negative_scales_have_the_reference_s_meaning(front_end: list) -> None:
+    zero, gradients = draw(CudaRasterizer(), changed({"quaternions": (0.0, 0.0, 0.0, 0.0)}))
+    identity, _ = draw(CudaRasterizer(), changed({"quaternions": (1.0, 0.0, 0.0, 0.0)}))
+    assert torch.equal(zero, identity)
+    assert not gradients["quaternions"].any()
+    assert gradients["scales"].any()
+    positive, of_positive = draw(CudaRasterizer(), changed({}))
+    negative, of_negative = draw(CudaRasterizer(), changed({"scales": (-0.2, 0.3, -0.1)}))
+    assert torch.equal(negative, positive)
+    assert torch.equal(of_negative["scales"], of_positive["scales"] * torch.tensor([-1.0, 1.0, -1.0]))
+
+
+def test_calls_that_are_refused(front_end: list) -> None:
+    gaussians, cameras = healthy(3), camera()
+    with pytest.raises(CompleteSplatError, match="means is float64 on cpu"):
+        CudaRasterizer()(gaussians.to(torch.float64), cameras)
+    with pytest.raises(CompleteSplatError, match="world_to_camera is float32 on meta"):
+        CudaRasterizer()(gaussians, cameras.to("meta"))
+    following = replace(cameras, intrinsics=cameras.intrinsics.clone().requires_grad_())
+    with pytest.raises(CompleteSplatError, match="no gradient to the intrinsics"):
+        CudaRasterizer()(gaussians, following)
+    with torch.no_grad():
+        assert CudaRasterizer()(gaussians, following).alpha.any()
+    assert len(front_end) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"max_alpha": 0.99}, r"max_alpha = 0\.999, not 0\.99: set rasterizer\.constants\.max_alpha=0\.999$"),
+        ({"min_alpha": 0.01}, "min_alpha"),
+        ({"min_transmittance": 1e-3}, "min_transmittance"),
+        ({"frustum_margin": 0.15}, "frustum_margin"),
+        ({"blur": 0.0}, "blur of at least"),
+        ({"near_plane": 0.0}, "near_plane of at least"),
+    ],
+)
+def test_constants_that_are_refused(changes: dict, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_a_device(monkeypatch)
+    pretend_gsplat(monkeypatch)
+    CudaRasterizer(RenderingConstants(blur=0.1, near_plane=1.0))
+    with pytest.raises(CompleteSplatError, match=message):
+        CudaRasterizer(RenderingConstants(**changes))
+
+
+def test_newer_releases_state_their_constants(monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_a_device(monkeypatch)
+    pretend_gsplat(monkeypatch, MAX_ALPHA=0.99, ALPHA_THRESHOLD=1.0 / 255.0, TRANSMITTANCE_THRESHOLD=1e-4)
+    CudaRasterizer(RenderingConstants(max_alpha=0.99))
+    with pytest.raises(CompleteSplatError, match=r"set rasterizer\.constants\.max_alpha=0\.99$"):
+        CudaRasterizer()
+
+
+def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And nothing is missed before a rasterizer is made: the module is read without gsplat."""
+    monkeypatch.setitem(sys.modules, "gsplat", None)  # type: ignore[arg-type]
+    runpy.run_path(str(cuda.__file__))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(CompleteSplatError, match="CUDA device"):
+        CudaRasterizer()
+    pretend_a_device(monkeypatch)
+    with pytest.raises(CompleteSplatError, match=r'pip install "completesplat\[cuda\]"'):
+        CudaRasterizer()
+
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+@pytest.fixture
+def kernels() -> None:
+    """gsplat's own."""
+    pytest.importorskip("gsplat")
+
+
+def constants_of_kernels() -> RenderingConstants:
+    return RenderingConstants(**cuda.compiled_constants())
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize(
+    ("seed", "batch", "views", "count"), [(0, 2, 3, 60), (1, 1, 1, 200), (2, 3, 1, 12), (3, 3, 1, 45), (4, 2, 2, 64)]
+)
+def test_gsplat_s_kernels_agree_with_the_reference(
+    seed: int, batch: int, views: int, count: int, kernels: None
+) -> None:
+    """With some of these counts warps would reach into a second scene, were they not filled up."""
+    constants = constants_of_kernels()
+    gaussians, cameras = scenes(seed, batch, views, (33, 50), constants, count=count)
+    assert_agrees(gaussians.to("cuda"), cameras.to("cuda"), constants, 1e-4, 1e-3, exceptions=1e-3)
+
+
+@pytest.mark.gpu
+@needs_gpu
+def test_gsplat_s_kernels_draw_nothing_where_nothing_is(kernels: None) -> None:
+    for gaussians in (healthy(0), changed({"means": (0.0, 0.0, -1.0)})):
+        images, gradients = draw(CudaRasterizer(constants_of_kernels()), gaussians)
+        assert not images.any()
+        assert not any(gradient.any() for gradient in gradients.values())
+
+
+@pytest.mark.gpu
+@needs_gpu
+def test_cpu_tensors_are_drawn_on_the_gpu(kernels: None) -> None:
+    constants = constants_of_kernels()
+    gaussians, cameras = scenes(5, 2, 2, (20, 30), constants)
+    images, gradients = draw(CudaRasterizer(constants), gaussians, cameras)
+    moved, _ = draw(CudaRasterizer(constants), gaussians.to("cuda"), cameras.to("cuda"))
+    assert torch.equal(images, moved.cpu())
+    assert {gradient.device.type for gradient in gradients.values()} == {"cpu"}
+    assert all(gradient.any() for gradient in gradients.values())
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("kind", NEVER_DRAWN)
+def test_gsplat_never_sees_what_cannot_be_drawn(kind: str, kernels: None) -> None:
+    """The image is the same to the bit; gradients are sums in no fixed order."""
+    assert_as_good_as_absent(CudaRasterizer(constants_of_kernels()), changed(NEVER_DRAWN[kind]), 1e-4)
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("kind", DRAWN)
+def test_gsplat_s_kernels_keep_extreme_gaussians_finite(kind: str, kernels: None) -> None:
+    gaussians = concatenate([healthy(12), changed(DRAWN[kind])])
+    images, gradients = draw(CudaRasterizer(constants_of_kernels()), gaussians)
+    assert images.isfinite().all()
+    assert all(gradient.isfinite().all() for gradient in gradients.values())
