@@ -19,6 +19,7 @@ RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 TASKS = ("data", "bench")
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
+    ".*but have no `val_dataloader`.*",
     ".*LeafSpec.*",
     "Experiment logs directory .* exists.*",
     ".*logging interval.*",

@@ -1,0 +1,129 @@
+"""The pure-torch opponent of the benchmark computes the same function: its speed would mean nothing otherwise."""
+
+import math
+
+import pytest
+import torch
+from rasterizer_scenes import OTHER_CONSTANTS, cotangents_for, render_with_gradients, scenes
+
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers import RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.reports.rasterizers import torch_tiled
+from completesplat.reports.rasterizers.torch_tiled import TorchTiledRasterizer
+
+SIZES = [(13, 17), (16, 16), (9, 23), (31, 6), (1, 40)]
+CENTER = (0.05, -0.03, 0.02)
+# What is changed in a healthy Gaussian that all cameras see.
+NEVER_DRAWN = {
+    "far aside": {"means": (1e30, 0.0, 0.0)},
+    "at the end of float32": {"means": (3e38, -3e38, 3e38)},
+    "mean nan": {"means": (0.0, math.nan, 0.0)},
+    "mean inf": {"means": (0.0, 0.0, math.inf)},
+    "quaternion nan": {"quaternions": (math.nan, 0.0, 0.0, 1.0)},
+    "scale inf": {"scales": (0.1, 0.1, math.inf)},
+    "scale enormous": {"scales": (1e30, 1e14, 1e13)},
+    "colour nan": {"colors": (0.1, math.nan, 0.1)},
+    "opacity nan": {"opacities": math.nan},
+    "opacity zero": {"opacities": 0.0},
+    "opacity negative": {"opacities": -1.0},
+}
+DRAWN = {
+    "zero quaternion": {"quaternions": (0.0, 0.0, 0.0, 0.0)},
+    "no extent": {"scales": (0.0, 0.0, 0.0)},
+    "needle": {"scales": (1e3, 1e-3, 1e-3)},
+    "huge": {"scales": (1e4, 1e4, 1e4)},
+    "opacity above one": {"opacities": 1.5},
+}
+
+
+def changed(gaussians: Gaussians, values: dict) -> Gaussians:
+    """One more Gaussian in each scene, with these values."""
+    one = gaussians.map(lambda tensor: tensor[:, :1].clone())
+    healthy = {"means": CENTER, "scales": (0.2, 0.3, 0.1), "opacities": 0.7}
+    for name, value in (healthy | values).items():
+        getattr(one, name)[:] = torch.tensor(value)
+    return concatenate([one, gaussians])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_images_and_gradients_agree_with_the_float64_reference(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # So few tiles at a time and so short rounds that small scenes take many of each.
+    monkeypatch.setattr(torch_tiled, "CHUNK", 5)
+    monkeypatch.setattr(torch_tiled, "ROUND", 6)
+    constants = RenderingConstants() if seed % 2 else OTHER_CONSTANTS
+    gaussians, cameras = scenes(seed, 2, 3, SIZES[seed % len(SIZES)], constants)
+    cotangents = cotangents_for(cameras, seed)
+    found, gradients = render_with_gradients(TorchTiledRasterizer(constants), gaussians, cameras, cotangents)
+    exact, exact_gradients = render_with_gradients(
+        ReferenceRasterizer(constants),
+        gaussians.to(torch.float64),
+        cameras.to(torch.float64),
+        [tensor.double() for tensor in cotangents],
+    )
+    for name in ("color", "depth", "alpha"):
+        assert (getattr(found, name) - getattr(exact, name)).abs().max() <= 2e-5, name
+    for name, expected in exact_gradients.items():
+        assert (gradients[name] - expected).norm() <= 2e-4 * expected.norm(), name
+
+
+def test_a_long_list_is_drawn_until_its_pixels_are_opaque() -> None:
+    """Hundreds of faint Gaussians, a wall, and others behind it that no pixel sees."""
+    generator = torch.Generator().manual_seed(0)
+    faint, walls = 400, 3
+    depths = torch.cat([torch.linspace(1, 3, faint), torch.tensor([4.0, 5.0, 6.0])])
+    count = faint + walls
+    gaussians = Gaussians(
+        means=torch.cat([0.05 * torch.randn(count, 2, generator=generator), depths[:, None]], dim=-1)[None],
+        quaternions=torch.randn(1, count, 4, generator=generator),
+        scales=torch.tensor([0.2] * faint + [50.0] * walls)[None, :, None].repeat(1, 1, 3),
+        opacities=torch.tensor([0.01] * faint + [0.99] * walls)[None],
+        colors=torch.rand(1, count, 3, generator=generator),
+    )
+    intrinsics = torch.tensor([[20.0, 0, 6], [0, 20, 6], [0, 0, 1]])
+    cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (12, 12))
+    found, gradients = render_with_gradients(TorchTiledRasterizer(), gaussians, cameras, cotangents_for(cameras, 0))
+    with torch.no_grad():
+        exact = ReferenceRasterizer()(gaussians.to(torch.float64), cameras.to(torch.float64))
+    assert (found.color - exact.color).abs().max() <= 2e-5
+    assert gradients["colors"][0, : faint + 1].any(-1).all()
+    assert not gradients["colors"][0, -1].any()
+
+
+@pytest.mark.parametrize("kind", NEVER_DRAWN)
+def test_a_gaussian_that_cannot_be_drawn_is_as_good_as_absent(kind: str) -> None:
+    gaussians, cameras = scenes(1, 2, 2, (13, 10), RenderingConstants(), count=12)
+    cotangents = cotangents_for(cameras, 1)
+    expected, expected_gradients = render_with_gradients(TorchTiledRasterizer(), gaussians, cameras, cotangents)
+    worse = changed(gaussians, NEVER_DRAWN[kind])
+    found, gradients = render_with_gradients(TorchTiledRasterizer(), worse, cameras, cotangents)
+    assert torch.equal(found.color, expected.color)
+    for name in vars(gaussians):
+        assert not gradients[name][:, 0].any(), name
+        assert torch.allclose(gradients[name][:, 1:], expected_gradients[name], rtol=1e-4, atol=1e-5), name
+    assert torch.allclose(gradients["world_to_camera"], expected_gradients["world_to_camera"], rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", DRAWN)
+def test_an_extreme_gaussian_is_drawn_as_by_the_float64_reference(kind: str) -> None:
+    gaussians, cameras = scenes(2, 1, 2, (13, 10), RenderingConstants(), count=12)
+    gaussians = changed(gaussians, DRAWN[kind])
+    cotangents = cotangents_for(cameras, 2)
+    found, gradients = render_with_gradients(TorchTiledRasterizer(), gaussians, cameras, cotangents)
+    with torch.no_grad():
+        exact = ReferenceRasterizer()(gaussians.to(torch.float64), cameras.to(torch.float64))
+    assert (found.color - exact.color).abs().max() <= 2e-5
+    assert all(gradient.isfinite().all() for gradient in gradients.values())
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_to_draw(count: int) -> None:
+    gaussians, cameras = scenes(3, 2, 2, (7, 11), RenderingConstants(), count=3)
+    gaussians = gaussians.map(lambda tensor: tensor[:, :count])
+    behind = Gaussians(**vars(gaussians) | {"opacities": torch.zeros_like(gaussians.opacities)})
+    found, gradients = render_with_gradients(TorchTiledRasterizer(), behind, cameras, cotangents_for(cameras, 3))
+    assert found.color.shape == (2, 2, 3, 7, 11)
+    assert not any(image.any() for image in (found.color, found.depth, found.alpha))
+    assert [gradients[name].shape for name in vars(gaussians)] == [tensor.shape for tensor in vars(gaussians).values()]
+    assert not any(gradient.any() for gradient in gradients.values())

@@ -1,0 +1,152 @@
+"""The share of the rasterizer in a training step: what the stop watch counts, and that it changes nothing else."""
+
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from rasterizer_scenes import cotangents_for, render_with_gradients, scenes
+from support import compose_config
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, project
+from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.reports.rasterizers import training_step
+from completesplat.reports.rasterizers.backends import Backend
+from completesplat.reports.rasterizers.training_step import StopWatch, share, synthetic_batch
+from completesplat.reports.rasterizers.workloads import DISTANCE, splatter_scene
+
+NETWORK, RASTERIZER = (100.0, 200.0), (2.0, 3.0)  # seconds that it takes forward and backward
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Stands still, but while something below is at work."""
+    clock = SimpleNamespace(now=0.0)
+    clock.perf_counter = lambda: clock.now
+    monkeypatch.setattr(training_step, "time", clock)
+    return clock
+
+
+class Busy(torch.autograd.Function):
+    """Hands a tensor on, which takes its time."""
+
+    @staticmethod
+    def forward(ctx: Any, tensor: Tensor, clock: SimpleNamespace, seconds: tuple[float, float]) -> Tensor:
+        ctx.clock, ctx.seconds = clock, seconds
+        clock.now += seconds[0]
+        return tensor.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        ctx.clock.now += ctx.seconds[1]
+        return gradient, None, None
+
+
+class Images(torch.autograd.Function):
+    """Hands images on, and notes what gradients come back."""
+
+    @staticmethod
+    def forward(ctx: Any, noted: list, *images: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.noted = noted
+        return tuple(image.clone() for image in images)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor | None) -> Any:
+        ctx.noted += gradients
+        return None, *gradients
+
+
+def busy_rasterizer(clock: SimpleNamespace) -> Rasterizer:
+    def draw(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        value = Busy.apply(sum(tensor.mean() for tensor in vars(gaussians).values()), clock, RASTERIZER)
+        shape = cameras.intrinsics.shape[:2]
+        return Rendering(*(value.expand(*shape, channels, *cameras.image_size) for channels in (3, 1, 1)))
+
+    return draw
+
+
+def test_seconds_are_those_of_both_passes_and_of_nothing_else(clock: SimpleNamespace) -> None:
+    watch = StopWatch(busy_rasterizer(clock))
+    gaussians, cameras = splatter_scene(4, 2, "trained")
+    weight = torch.ones((), requires_grad=True)
+    for step in range(1, 3):
+        beside = Busy.apply(weight, clock, NETWORK)  # a term of the loss that the rasterizer is not part of
+        before = Busy.apply(weight, clock, NETWORK)
+        rendering = watch(gaussians.map(before.mul), cameras)
+        after = Busy.apply(rendering.color.sum() + rendering.alpha.sum(), clock, NETWORK)
+        assert watch.seconds == (step - 1) * sum(RASTERIZER) + RASTERIZER[0]
+        (after + beside + Busy.apply(weight, clock, NETWORK)).backward()
+        assert watch.seconds == step * sum(RASTERIZER)
+    assert clock.now == 2 * (4 * sum(NETWORK) + sum(RASTERIZER))
+
+
+@pytest.mark.parametrize("rasterizer", [TiledRasterizer(), ReferenceRasterizer()], ids=["tiled", "reference"])
+def test_the_watched_rasterizer_draws_what_it_would_draw_alone(rasterizer) -> None:
+    gaussians, cameras = scenes(0, 2, 2, (11, 14), RenderingConstants(), count=20)
+    cotangents = cotangents_for(cameras, 0)
+    alone, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents)
+    watched, found = render_with_gradients(StopWatch(rasterizer), gaussians, cameras, cotangents)
+    for name, image in vars(alone).items():
+        assert torch.equal(image, getattr(watched, name)), name
+    for name, gradient in gradients.items():
+        assert torch.equal(gradient, found[name]), name
+
+
+def test_no_zeros_are_made_where_the_loss_sends_no_gradient() -> None:
+    noted: list[Tensor | None] = []
+    clock = SimpleNamespace(now=0.0)
+
+    def draw(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        images = vars(busy_rasterizer(clock)(gaussians, cameras)).values()
+        return Rendering(*Images.apply(noted, *images))
+
+    gaussians, cameras = splatter_scene(4, 1, "trained")
+    StopWatch(draw)(gaussians.map(lambda tensor: tensor.requires_grad_()), cameras).color.sum().backward()
+    assert [gradient is None for gradient in noted] == [False, True, True]
+
+
+def test_the_synthetic_batch_is_one_of_a_data_module() -> None:
+    scenes = synthetic_batch(16, 3, 2)
+    views = scenes.all_views()
+    assert views.images.shape == (3, 3, 3, 16, 16)
+    assert len(scenes.names) == 3
+    torch.testing.assert_close(scenes.reference.cameras.world_to_camera, torch.eye(4).expand(3, 4, 4))
+    # All cameras look at one point, which lies within the depth range.
+    near, far = scenes.depth_range[0].tolist()
+    axis = torch.linspace(near, far, 99)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    pixels, _ = project(views.cameras, axis)
+    assert (pixels - 8).abs().amax((0, 1, 3)).min() < 0.1
+    assert near < DISTANCE < far
+
+
+@pytest.mark.parametrize(("name", "steps"), [("tiled", 3), ("torch_tiled", 2)])
+def test_the_rasterizer_takes_a_share_of_a_step(
+    name: str, steps: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(training_step, "UNTIMED_STEPS", 1)
+    monkeypatch.setattr(training_step, "TIMED_STEPS", 2)
+    monkeypatch.setattr(training_step, "SLOW", {"torch_tiled": (1, 1)})
+    drawn: list[tuple[int, ...]] = []
+
+    def draw(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        drawn.append((*cameras.intrinsics.shape[:2], *cameras.image_size))
+        return TiledRasterizer()(gaussians, cameras)
+
+    make_module = partial(instantiate, compose_config("bench").model, _convert_="all")
+    row = share(Backend(name, draw), lambda watch: make_module(rasterizer=watch), 32, 2, 1, "32-true")
+    assert drawn == [(2, 2, 32, 32)] * steps
+    assert {key: row[key] for key in ("backend", "size", "batch", "views")} == {
+        "backend": name, "size": 32, "batch": 2, "views": 2
+    }  # fmt: skip
+    assert 0 < row["share"] < 1
+    assert 0 < row["rasterizer_ms"] < row["step_ms"]
+    assert list(tmp_path.iterdir()) == []  # no logs, no checkpoints
