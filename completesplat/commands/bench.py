@@ -45,6 +45,8 @@ def check_settings(config: Any) -> None:
     """
     for name in ("sizes", "views", "repeats"):
         values = [config[name]] if name == "repeats" else config[name]
+        if isinstance(values, int):
+            raise CompleteSplatError(f"{name}={values}: must be a list, {name}=[{values}]")
         if any(value < 1 for value in values):
             raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")
 
@@ -76,11 +78,11 @@ def _scene(
     tick: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
     from completesplat.reports.rasterizers import agreement, speed
+    from completesplat.reports.rasterizers.scene_file import DEFAULTS
 
     if defaults:
-        logger.info(
-            "%s has no %s: defaults are used, see `completesplat bench --help`", config.scene, ", ".join(defaults)
-        )
+        values = ", ".join(f"{name}={DEFAULTS[name]}" for name in defaults)
+        logger.info("%s has no %s: every Gaussian gets %s", config.scene, ", ".join(defaults), values)
     views, (height, width) = cameras.intrinsics.shape[1], cameras.image_size
     tick(f"{gaussians.count} Gaussians in {views} views")
     workload = {"size": max(height, width), "gaussians": gaussians.count, "views": views, "opacity": "file"}

@@ -95,6 +95,7 @@ def test_backends_are_compared_on_a_scene_from_a_file(command, tmp_path, garden)
     (agreement,) = results["agreement"]
     assert (agreement["backend"], agreement["agrees"]) == ("tiled", True)
     assert "has no quats, scales, opacities" in finished.out + finished.err
+    assert "opacities=0.5" in finished.out + finished.err
 
 
 @pytest.mark.parametrize(
@@ -103,6 +104,7 @@ def test_backends_are_compared_on_a_scene_from_a_file(command, tmp_path, garden)
         (["scene=nowhere.npz"], "nowhere.npz: no such file"),
         (["backends=[nonsense]"], "no backend 'nonsense'"),
         (["repeats=0"], "repeats=0: must be at least 1"),
+        (["sizes=64"], "sizes=64: must be a list"),
         (["sizes=[16,0]"], "sizes=[16, 0]: must be at least 1"),
         (["views=[-1]"], "views=[-1]: must be at least 1"),
     ],

@@ -5,8 +5,8 @@ import pytest
 from support import SMALL, call
 
 STEPS = 20
-# With larger steps, or bfloat16, rounding grows: at a learning rate of 3e-3, gradients changed by 1e-7 change the loss of
-# these steps by percents, whatever the backend.
+# With larger steps, or bfloat16, rounding grows: at a learning rate of 3e-3, gradients changed by 1e-7 change the loss
+# of these steps by percents, whatever the backend.
 GENTLE = ["optimizer.lr=5e-5", "trainer.precision=32-true"]
 
 

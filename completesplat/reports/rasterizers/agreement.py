@@ -20,8 +20,9 @@ from completesplat.rasterizers.reference import (
 )
 from completesplat.reports.rasterizers.backends import Backend
 
-TOLERANCE = {"cuda": 1e-4}  # of a backend; of all others:
-USUAL_TOLERANCE = 1e-5
+# `tiled` projects and sorts in float64, like the reference. The others do so in float32: in a large scene some
+# neighbours in depth then change places.
+TOLERANCE, FLOAT32_TOLERANCE = {"tiled": 1e-5}, 1e-4
 PIXELS_PER_VIEW, PIXELS_AT_ONCE = 128, 8
 # Where an alpha is this close to its threshold, or a transmittance to the stop (relatively), float32 may decide
 # otherwise than float64, rightly so. Such pixels are counted, not compared.
@@ -58,7 +59,7 @@ def rows(
         errors = ((draw_at(backend, gaussians, cameras, positions) - expected).abs() / scale)[mask]
         largest = errors.amax(0) if len(errors) else torch.full((5,), torch.nan)
         figures = {"color": largest[:3].max().item(), "depth": largest[3].item(), "alpha": largest[4].item()}
-        agrees = bool((largest <= TOLERANCE.get(backend.name, USUAL_TOLERANCE)).all())
+        agrees = bool((largest <= TOLERANCE.get(backend.name, FLOAT32_TOLERANCE)).all())
         counts = {"pixels": int(mask.sum()), "undecided": int((~mask).sum())}
         finite = {name: error if math.isfinite(error) else None for name, error in figures.items()}
         result.append({"backend": backend.name, **finite, "agrees": agrees, **counts})

@@ -1,6 +1,5 @@
 """The rasterizers that are compared, and which of them work here."""
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -9,8 +8,6 @@ from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.reports.rasterizers.timing import milliseconds
 from completesplat.reports.rasterizers.workloads import splatter_scene
-
-logger = logging.getLogger(__name__)
 
 # `torch_tiled` and `gsplat_torch` are baselines: kept for this comparison, not to be chosen for training.
 CLASSES = {
@@ -57,7 +54,6 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
             milliseconds(backend.rasterizer, gaussians.to(backend.device), cameras.to(backend.device))  # compiles
         except Exception as error:  # a broken installation may raise anything
             absent[name] = " ".join(str(error).split()) or type(error).__name__
-            logger.info("%s: not measured, because %s", name, absent[name])
         else:
             backends.append(backend)
     return backends, absent

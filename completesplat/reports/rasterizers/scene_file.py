@@ -1,6 +1,7 @@
 """A scene in the layout of gsplat's `assets/test_garden.npz`: Gaussians with the cameras that see them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from completesplat.geometry.cameras import Cameras
 NEEDED = ("means3d", "colors", "viewmats", "Ks", "width", "height")
 # What stands in for arrays that the file lacks, as gsplat's file lacks all three: round and half transparent, of
 # about the size that gsplat's own tests give them (0 to 0.02 world units, `gsplat/_helper.py`).
-DEFAULT_QUATERNION, DEFAULT_SCALE, DEFAULT_OPACITY = (1.0, 0.0, 0.0, 0.0), 0.01, 0.5
+DEFAULTS: dict[str, Any] = {"quats": (1.0, 0.0, 0.0, 0.0), "scales": (0.01, 0.01, 0.01), "opacities": 0.5}
 
 
 def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
@@ -31,12 +32,7 @@ def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
         raise DataError(f"{path} lacks {', '.join(missing)}")
 
     count, views = len(np.atleast_1d(arrays["means3d"])), len(np.atleast_1d(arrays["viewmats"]))
-    defaults = {
-        "quats": np.tile(np.array(DEFAULT_QUATERNION), (count, 1)),
-        "scales": np.full((count, 3), DEFAULT_SCALE, np.float32),
-        "opacities": np.full(count, DEFAULT_OPACITY, np.float32),
-    }
-    given = defaults | arrays
+    given = {name: np.broadcast_to(value, (count, *np.shape(value))) for name, value in DEFAULTS.items()} | arrays
 
     def tensor(name: str, *shape: int, unit: int = 1) -> Tensor:
         values = given[name]
@@ -56,7 +52,7 @@ def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
     if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
         raise DataError(f"{path}: an image of {width:g} x {height:g} pixels cannot be drawn")
     cameras = Cameras(tensor("viewmats", views, 4, 4), tensor("Ks", views, 3, 3), (int(height), int(width)))
-    return gaussians, cameras, [name for name in defaults if name not in arrays]
+    return gaussians, cameras, [name for name in DEFAULTS if name not in arrays]
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

@@ -11,9 +11,7 @@ import torch
 
 from completesplat.errors import DataError
 from completesplat.reports.rasterizers.scene_file import (
-    DEFAULT_OPACITY,
-    DEFAULT_QUATERNION,
-    DEFAULT_SCALE,
+    DEFAULTS,
     NEEDED,
     read_scene,
 )
@@ -68,9 +66,9 @@ def test_values_arrive_and_what_is_missing_is_named(path: Path, arrays: Arrays) 
     assert torch.equal(cameras.world_to_camera[0], torch.from_numpy(arrays["viewmats"]))
     assert torch.equal(cameras.intrinsics[0], torch.from_numpy(arrays["Ks"]))
     assert cameras.image_size == (HEIGHT, WIDTH)
-    assert torch.equal(gaussians.quaternions, torch.tensor(DEFAULT_QUATERNION).expand(1, COUNT, 4))
-    assert torch.equal(gaussians.scales, torch.full((1, COUNT, 3), DEFAULT_SCALE))
-    assert torch.equal(gaussians.opacities, torch.full((1, COUNT), DEFAULT_OPACITY))
+    assert torch.equal(gaussians.quaternions, torch.tensor(DEFAULTS["quats"]).expand(1, COUNT, 4))
+    assert torch.equal(gaussians.scales, torch.tensor(DEFAULTS["scales"]).expand(1, COUNT, 3))
+    assert torch.equal(gaussians.opacities, torch.full((1, COUNT), DEFAULTS["opacities"]))
 
 
 def test_defaults_stand_in_for_nothing_that_is_given(path: Path, arrays: Arrays, others: Arrays) -> None:
