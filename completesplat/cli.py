@@ -38,6 +38,9 @@ def main() -> None:
         launch(arguments[0], arguments[1:])
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # whoever read the output (`head`, say) has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except Exception as error:
         message = refusal(error)
         if message is None:

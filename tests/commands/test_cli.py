@@ -25,6 +25,14 @@ def test_help_needs_no_heavy_import():
     assert time.perf_counter() - start < 10  # a hang, not a benchmark
 
 
+def test_a_reader_that_goes_away_is_no_fault_of_the_program():
+    program = "import sys; sys.argv = ['completesplat', 'fit', '--help']; from completesplat.cli import main; main()"
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 1
+
+
 @pytest.mark.parametrize("given", [None, "7"])
 def test_torch_is_loaded_with_short_waits_of_its_threads(given):
     """In a process of its own: what counts is the setting at the moment at which torch is loaded."""
