@@ -35,7 +35,7 @@ def test_nothing_in_the_tree_is_forgotten_here():
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
-    needed += ["data.root=x"] if option.startswith("co3d_") and not needed else []
+    needed += ["data.root=x"] if option.startswith(("co3d_", "realestate10k")) and not needed else []
     needed += NEEDED if option in ("latent_diffusion", "toy_diffusion") else []
     config = compose_config("fit", f"{group}={option}", *needed)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -57,6 +57,7 @@ def test_every_part_instantiates_from_its_config(group, option):
     if option == "cuda" and not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
+    needed += ["data.root=x"] if option == "realestate10k" else []
     config = compose_config("fit", f"{group}={option}", *needed)
     with torch.device("meta" if option == "stable_diffusion" else "cpu"):
         part = instantiate(config[group], _convert_="all")

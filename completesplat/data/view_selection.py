@@ -23,3 +23,27 @@ def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
     if targets is not None and targets < len(others):
         others = others[np.round((np.arange(targets) + 0.5) * len(others) / targets - 0.5).astype(int)]
     return 0, others.tolist()
+
+
+def nearby_views(
+    frames: int, targets: int, min_gap: int, max_gap: int, rng: np.random.Generator
+) -> tuple[int, list[int]]:
+    """A random reference and `targets` random frames that are `min_gap` to `max_gap` frames before or after it.
+
+    Only frames that have such a neighbour become the reference; in a sequence (of at least two frames) that is too
+    short for `min_gap` those are the first and the last. Targets repeat where there are too few neighbours.
+    """
+    nearest = min(min_gap, frames - 1)
+    positions = np.arange(frames)
+    reference = int(rng.choice(positions[np.maximum(positions, frames - 1 - positions) >= nearest]))
+    gap = np.abs(positions - reference)
+    return reference, np.resize(rng.permutation(positions[(gap >= nearest) & (gap <= max_gap)]), targets).tolist()
+
+
+def evaluation_views_within(frames: int, targets: int, gap: int) -> tuple[int, list[int]]:
+    """The first frame as reference; `targets` of the `gap` frames that follow it, evenly spaced.
+
+    Targets repeat in a sequence that has fewer frames.
+    """
+    following = min(gap, frames - 1)
+    return 0, (1 + np.round((np.arange(targets) + 0.5) * following / targets - 0.5).astype(int)).tolist()

@@ -1,0 +1,99 @@
+"""One clip of RealEstate10K (Zhou et al., SIGGRAPH 2018), whichever form it is stored in, and what is refused of it.
+
+A camera is 18 numbers: fx fy cx cy (in units of the picture's width and height), k1 k2 (always 0), and the 3 x 4
+row-major `world_to_camera` in OpenCV axes (stereo-magnification, `stereomag/datasets.py:226-258`).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image, UnidentifiedImageError
+from torch import Tensor
+
+from completesplat.data.transforms import Square
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import Cameras
+
+CAMERA_NUMBERS = 18
+RIGID_TOLERANCE = 1e-3
+MOST_PIXELS = 50_000_000
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The frames of a clip, in order.
+
+    Attributes:
+        source: the file that holds the cameras.
+        timestamps: microseconds of the video.
+        cameras: [view], float64, in pixels of the stored pictures and in the clip's own units of length.
+        read: (frame, square, size) -> the square part of that frame's picture, resized to `size`.
+    """
+
+    key: str
+    source: Path
+    timestamps: tuple[int, ...]
+    cameras: Cameras
+    read: Callable[[int, Square, int], UInt8[Tensor, "3 size size"]]
+
+
+def clip_cameras(
+    rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int], where: str
+) -> Cameras:
+    """Cameras [view] (float64) for pictures of (height, width), from rows as they are stored.
+
+    Args:
+        where: file and clip, for the refusals.
+
+    Raises:
+        DataError: fewer than two frames, timestamps that repeat, numbers that are not finite, no positive focal length,
+            lens distortion, or a pose that is no rotation and translation.
+    """
+    if len(rows) < 2:
+        raise DataError(f"{where}: {len(rows)} frames, at least two are needed")
+    count = Counter(timestamps)
+    _refuse([f for f, time in enumerate(timestamps) if count[time] > 1], where, "another frame has its timestamp")
+    rows = rows.double()
+    rotation = rows[:, 6:].unflatten(1, (3, 4))[:, :, :3]
+    deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
+    rigid = (deviation <= RIGID_TOLERANCE) & (torch.linalg.det(rotation) > 0)
+    _refuse(_frames(~rows.isfinite().all(dim=1)), where, "camera with numbers that are not finite")
+    _refuse(_frames((rows[:, :2] <= 0).any(dim=1)), where, "focal length is not positive")
+    _refuse(_frames((rows[:, 4:6] != 0).any(dim=1)), where, "lens distortion is not supported")
+    _refuse(_frames(~rigid), where, "pose is not a rotation and translation")
+    height, width = image_size
+    intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1] = rows[:, 0] * width, rows[:, 1] * height
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = rows[:, 2] * width, rows[:, 3] * height
+    pose[:, :3] = rows[:, 6:].unflatten(1, (3, 4))
+    return Cameras(pose, intrinsics, image_size)
+
+
+def _frames(bad: Tensor) -> list[int]:
+    return bad.nonzero().flatten().tolist()
+
+
+def _refuse(frames: list[int], where: str, reason: str) -> None:
+    if frames:
+        raise DataError(f"{where}, frame {frames[0]}: {reason}")
+
+
+def picture_size(file: Path | BytesIO, where: str) -> tuple[int, int]:
+    """(height, width) of an image file, from its header.
+
+    Raises:
+        DataError: no JPEG or PNG image, or one of more than 50 million pixels.
+    """
+    try:
+        with Image.open(file, formats=("JPEG", "PNG")) as image:
+            width, height = image.size
+    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DataError(f"{where}: not a readable image ({type(error).__name__})") from None
+    if width * height > MOST_PIXELS:
+        raise DataError(f"{where}: a picture of {width} x {height} pixels is too large")
+    return height, width

@@ -1,0 +1,92 @@
+"""RealEstate10K as it is published: `<split>/<key>.txt` beside the frames `<split>/<key>/<timestamp>.jpg` (or .png).
+
+Line 0 of a text is the video's address; every other line is a timestamp in microseconds and a camera's 18 numbers.
+"""
+
+import os
+from functools import partial
+from pathlib import Path
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from completesplat.data.checks import require_file
+from completesplat.data.realestate10k_clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
+from completesplat.data.transforms import Square, read_square
+from completesplat.errors import DataError
+
+PICTURES = (".png", ".jpg")
+
+
+class TextClips:
+    """The clips of one folder whose frames are there.
+
+    Attributes:
+        keys: names of the clips, sorted.
+        missing: how many clips have no folder of frames.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        with os.scandir(folder) as entries:
+            folders = {entry.name: entry.is_dir() for entry in entries}
+        texts = sorted(name.removesuffix(".txt") for name in folders if name.endswith(".txt"))
+        self.keys = [key for key in texts if folders.get(key)]
+        self.missing = len(texts) - len(self.keys)
+
+    def chunks(self, keys: list[str]) -> list[list[int]]:
+        """Numbers of the clips that are best read together: clips are files of their own, so any will do."""
+        return [list(range(len(keys)))]
+
+    def clip(self, key: str) -> Clip:
+        """Read a clip's text and list its frames.
+
+        Raises:
+            DataError: it is malformed, or a frame is missing.
+        """
+        path = self.folder / f"{key}.txt"
+        where = f"{path}, clip {key}"
+        timestamps, rows = _read_text(path, where)
+        pictures = _pictures(self.folder / key)
+        for frame, time in enumerate(timestamps):
+            if time not in pictures:
+                raise DataError(f"{where}, frame {frame}: no picture {self.folder / key / f'{time}.jpg'}")
+        paths = [pictures[time] for time in timestamps]
+        size = picture_size(paths[0], f"{where}, frame 0 ({paths[0].name})") if paths else (1, 1)
+        cameras = clip_cameras(
+            torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS), timestamps, size, where
+        )
+        return Clip(key, path, timestamps, cameras, partial(_read, paths, size))
+
+
+def _read_text(path: Path, where: str) -> tuple[tuple[int, ...], list[list[float]]]:
+    """Timestamps and camera rows."""
+    timestamps, rows = [], []
+    try:
+        lines = require_file(path).read_text(encoding="utf-8").splitlines()[1:]
+    except UnicodeDecodeError:
+        raise DataError(f"{where}: not a text file") from None
+    for frame, columns in enumerate(line.split() for line in lines if line.strip()):
+        if len(columns) != 1 + CAMERA_NUMBERS:
+            raise DataError(f"{where}, frame {frame}: {len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
+        try:
+            timestamps.append(int(columns[0]))
+            rows.append([float(column) for column in columns[1:]])
+        except ValueError as error:
+            raise DataError(f"{where}, frame {frame}: {error}") from None
+    return tuple(timestamps), rows
+
+
+def _pictures(folder: Path) -> dict[int, Path]:
+    """Files by timestamp, JPEG before PNG."""
+    with os.scandir(folder) as entries:
+        paths = [Path(entry.path) for entry in entries]
+    ordered = sorted((path for path in paths if path.suffix in PICTURES), key=lambda path: PICTURES.index(path.suffix))
+    return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
+
+
+def _read(
+    paths: list[Path], image_size: tuple[int, int], frame: int, square: Square, size: int
+) -> UInt8[Tensor, "3 size size"]:
+    return read_square(paths[frame], image_size, square, size, "RGB")

@@ -1,0 +1,272 @@
+"""The data module: both forms, geometry, protocols, repeatability, and a step of training."""
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hydra.utils import instantiate
+from lightning import Trainer
+from realestate10k_trees import FORMS, HEIGHT, WIDTH, StoredClip, encode, make_clip
+from support import SMALL, compose_config
+
+from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k_scenes import split_by_hash
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import project
+from completesplat.scene import SceneBatch
+
+TRAIN = [make_clip(f"train{i}", frames=5 + i % 3) for i in range(7)]
+TEST = [make_clip(f"test{i}", frames=8) for i in range(5)]
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def root(request, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp(request.param)
+    FORMS[request.param](folder / "train", TRAIN)
+    FORMS[request.param](folder / "test", TEST)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory) -> list[Path]:
+    folders = [tmp_path_factory.mktemp(form) for form in FORMS]
+    for folder, write in zip(folders, FORMS.values(), strict=True):
+        write(folder / "train", TRAIN)
+        write(folder / "test", TEST)
+    return folders
+
+
+def module(root: Path, **settings) -> RE10KDataModule:
+    return RE10KDataModule(str(root), **{"image_size": 16, "batch_size": 2, "targets": 2, "max_gap": 2, **settings})
+
+
+def tree(tmp_path: Path, form: str, train: list[StoredClip], test: list[StoredClip] = TEST) -> Path:
+    FORMS[form](tmp_path / "train", train)
+    FORMS[form](tmp_path / "test", test)
+    return tmp_path
+
+
+def epoch(loader, number: int) -> list[SceneBatch]:
+    loader.sampler.set_epoch(number)
+    return list(loader)
+
+
+def same(a: SceneBatch, b: SceneBatch) -> bool:
+    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
+        views = batch.all_views()
+        return [views.images, views.masks, views.cameras.world_to_camera, views.cameras.intrinsics, batch.depth_range]
+
+    return a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
+
+
+def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
+    return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_both_forms_give_the_same_batches(both):
+    text, chunks = (module(folder, scale=2.0) for folder in both)
+    assert equal(list(text.test_dataloader()), list(chunks.test_dataloader()))
+    assert equal(list(text.val_dataloader()), list(chunks.val_dataloader()))
+    key = {name: split.store("train").keys for name, split in (("text", text), ("chunks", chunks))}
+    assert sorted(key["text"]) == sorted(key["chunks"])
+    for name in key["text"]:
+        scenes = [data.store("train").scene(data.store("train").clips.clip(name), 1, [0, 3]) for data in (text, chunks)]
+        assert same(*scenes)
+    torch.testing.assert_close(text.mean_image(), chunks.mean_image())
+    assert text.typical_camera() == chunks.typical_camera()
+
+
+def test_training_batches_have_the_stated_shapes(root):
+    batches = epoch(module(root, scale=3.0).train_dataloader(), 0)
+    assert [len(batch.names) for batch in batches] == [2, 2, 2]
+    batch = batches[0]
+    assert batch.reference.images.shape == (2, 3, 16, 16)
+    assert batch.targets.images.shape == (2, 2, 3, 16, 16)
+    assert batch.reference.images.dtype == batch.targets.cameras.world_to_camera.dtype == torch.float32
+    assert batch.reference.cameras.image_size == (16, 16)
+    torch.testing.assert_close(batch.depth_range, torch.tensor([[2.1, 30.0]] * 2))
+    torch.testing.assert_close(batch.reference.cameras.world_to_camera, torch.eye(4).expand(2, 4, 4))
+    assert (batch.all_views().masks == 1).all()
+
+
+@pytest.mark.parametrize("crop", ["center", "principal"])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_point_reprojects_onto_its_pixel(tmp_path, form, crop):
+    """Every frame shows one bright disc where the stored camera, by the format's definition, sees a fixed point."""
+    height, width, world = 90, 160, np.array([0.2, 0.1, 4.0])
+    clip = make_clip("a", frames=4, size=(height, width))
+    clip.rows[:, 2:4] = [0.46, 0.53]
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    for frame, row in enumerate(clip.rows):
+        x, y, z = row[6:].reshape(3, 4) @ [*world, 1]
+        u, v = width * (row[0] * x / z + row[2]), height * (row[1] * y / z + row[3])
+        disc = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18)
+        clip.pictures[frame] = encode(disc[..., None].repeat(3, axis=2).astype(np.uint8))
+    root = tree(tmp_path, form, [clip, make_clip("b")])
+    store = module(root, image_size=64, crop=crop, scale=2.0, val_fraction=0.0).store("train")
+    scene = store.scene(store.clips.clip("a"), 1, [0, 2, 3])
+    pose = clip.rows[1, 6:].reshape(3, 4)
+    point = torch.tensor(2.0 * (pose[:, :3] @ world + pose[:, 3]), dtype=torch.float32)
+    views = scene.all_views()
+    for view in range(4):
+        weight = views.images[view].mean(dim=0).clamp(min=0.1) - 0.1
+        j, i = torch.meshgrid(torch.arange(64) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+        seen = torch.stack([(i * weight).sum(), (j * weight).sum()]) / weight.sum()
+        expected = project(views.cameras[view], point[None])[0][0]
+        assert (seen - expected).abs().max() < 0.15
+    # The central square of 160 x 90 begins 35 pixels from the left.
+    central = ((0.46 * width - 35) * 64 / 90, 0.53 * height * 64 / 90)
+    expected = torch.tensor(central if crop == "center" else (32.0, 32.0)).expand(4, 2)
+    torch.testing.assert_close(views.cameras.intrinsics[:, :2, 2], expected)
+
+
+def test_targets_stay_near_the_reference(root):
+    data = module(root, min_gap=1, max_gap=2)
+    store = data.store("train")
+    items = data.train_dataloader().dataset
+    for number in range(10):
+        for index in range(len(items)):
+            scene = items[number, index]
+            clip = store.clips.clip(scene.names)
+            frames = [(store.image(clip, f).float() / 255) for f in range(len(clip.timestamps))]
+
+            def found(image, frames=frames):
+                return next(f for f, picture in enumerate(frames) if torch.equal(image, picture))
+
+            gaps = {abs(found(image) - found(scene.reference.images)) for image in scene.targets.images}
+            assert gaps <= {1, 2}
+
+
+def test_epochs_and_seeds_differ_and_can_be_repeated(root):
+    first = epoch(module(root).train_dataloader(), 0)
+    assert not equal(first, epoch(module(root).train_dataloader(), 1))
+    assert equal(first, epoch(module(root).train_dataloader(), 0))
+    assert not equal(first, epoch(module(root, seed=1).train_dataloader(), 0))
+
+
+def test_every_item_comes_once_an_epoch(root):
+    names = [n for b in epoch(module(root, references_per_clip=3).train_dataloader(), 0) for n in b.names]
+    assert sorted(names) == sorted(module(root).store("train").keys * 3)
+
+
+def test_workers_do_not_change_the_batches(root):
+    expected = [epoch(module(root, references_per_clip=2).train_dataloader(), number) for number in (0, 1)]
+    for workers in (1, 2):
+        loader = module(root, references_per_clip=2, workers=workers).train_dataloader()
+        for number in (0, 1):
+            assert equal(epoch(loader, number), expected[number])
+
+
+def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
+    data = module(root, evaluation_targets=2, evaluation_gap=4, evaluation_batch_size=5)
+    (batch,) = list(data.test_dataloader())
+    store = data.store("test")
+    for number, key in enumerate(store.keys):
+        assert same(batch[number], store.scene(store.clips.clip(key), 0, [1, 3]))
+    assert sorted(batch.names) == sorted(clip.key for clip in TEST)
+
+
+def test_the_evaluation_index_decides(root, tmp_path, caplog):
+    views = {"test0": {"context": [2, 7], "target": [3, 5]}, "test1": None, "gone": {"context": [0, 1], "target": [0]}}
+    views |= {key: {"context": [0, 5], "target": [1, 2]} for key in ("test2", "test3")}
+    (tmp_path / "index.json").write_text(json.dumps(views))
+    (tmp_path / "scenes.txt").write_text("test0\ntest3\nelsewhere\n")
+    files = {"evaluation_index": str(tmp_path / "index.json"), "scene_list": str(tmp_path / "scenes.txt")}
+    data = module(root, **files)
+    with caplog.at_level(logging.INFO, logger="completesplat"):
+        (batch,) = list(data.test_dataloader())
+    assert batch.names == ("test0", "test3")
+    store = data.store("test")
+    assert same(batch[0], store.scene(store.clips.clip("test0"), 2, [3, 5]))
+    (line,) = caplog.messages
+    assert "2 clips to test" in line
+    for count in ("0 missing", "1 null in the index", "1 in the index, not in the data", "1 not in the index"):
+        assert count in line
+    for count in ("1 in the list, not in the data", "1 not in the list"):
+        assert count in line
+
+
+def test_indexed_scenes_of_unequal_length_come_one_by_one(root, tmp_path):
+    views = {"test0": {"context": [0, 7], "target": [3]}, "test1": {"context": [0, 7], "target": [3, 4]}}
+    (tmp_path / "index.json").write_text(json.dumps(views))
+    batches = list(module(root, evaluation_index=str(tmp_path / "index.json")).test_dataloader())
+    assert [batch.targets.images.shape[:2] for batch in batches] == [(1, 1), (1, 2)]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [{"context": [0, 7], "target": [8]}, {"context": [], "target": [1]}, {"target": [1]}, [1], {"context": [-1]}],
+)
+def test_a_bad_evaluation_index_is_refused_by_name(root, tmp_path, entry):
+    (tmp_path / "index.json").write_text(json.dumps({"test0": entry}))
+    with pytest.raises(DataError, match="test0"):
+        list(module(root, evaluation_index=str(tmp_path / "index.json")).test_dataloader())
+
+
+def test_missing_clips_are_counted_and_left_out(root, tmp_path, caplog):
+    if (root / "train/index.json").exists():
+        index = json.loads((root / "train/index.json").read_text())
+        tree(tmp_path, "chunks", TRAIN)
+        (tmp_path / "train/index.json").write_text(json.dumps(index | {"x": "000099.torch", "y": "000099.torch"}))
+    else:
+        tree(tmp_path, "text", TRAIN)
+        (tmp_path / "train/x.txt").write_text("address\n")
+        (tmp_path / "train/y.txt").write_text("address\n")
+    with caplog.at_level(logging.INFO, logger="completesplat"):
+        data = module(tmp_path)
+        data.setup("fit")
+    assert sorted(data.store("train").keys + data.store("val").keys) == sorted(clip.key for clip in TRAIN)
+    assert len(caplog.messages) == 1
+    assert "left out: 2 missing" in caplog.messages[0]
+
+
+def test_a_clip_stays_on_its_side_when_others_come():
+    keys = [f"clip{i}" for i in range(2000)]
+    train, val = split_by_hash(keys, 0.1, 0)
+    assert sorted(train + val) == sorted(keys)
+    # 200 expected; six standard deviations of the binomial distribution are 80.
+    assert 120 < len(val) < 280
+    assert set(split_by_hash(keys[:500], 0.1, 0)[1]) == set(val) & set(keys[:500])
+    assert set(split_by_hash(keys, 0.1, 1)[1]) != set(val)
+    assert len(split_by_hash(keys, 0.0, 0)[1]) == 1
+
+
+def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
+    with pytest.raises(DataError, match="train"):
+        module(tmp_path).setup("fit")
+    with pytest.raises(DataError, match="no train clips"):
+        module(tree(tmp_path, "text", TRAIN[:1])).setup("fit")
+    for settings in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"crop": "left"}, {"scale": -1.0}):
+        with pytest.raises(CompleteSplatError, match="data"):
+            module(tmp_path, **settings)
+
+
+def test_means_of_the_training_frames(root):
+    data = module(root, crop="center", image_size=HEIGHT)
+    store = data.store("train")
+    clips = [store.clips.clip(key) for key in store.keys]
+    images = [store.image(clip, f).double() / 255 for clip in clips for f in range(len(clip.timestamps))]
+    torch.testing.assert_close(data.mean_image(), torch.stack(images).mean(dim=0).float())
+    camera = data.typical_camera()
+    # Half of the square over the focal length (half of the picture's width) is the tangent of half of the angle.
+    assert camera.fov_degrees == pytest.approx(2 * np.degrees(np.arctan(HEIGHT / WIDTH)), rel=1e-6)
+    assert camera.depth_range == pytest.approx((0.7, 10.0))
+    assert camera.up == pytest.approx((0, -1, 0), abs=1e-6)
+
+
+def test_a_model_trains_on_it(root, tmp_path):
+    short = ["data.workers=0", "data.evaluation_batch_size=1"]
+    config = compose_config("fit", "data=realestate10k", f"data.root={root}", *SMALL, *short)
+    data = instantiate(config.data, _convert_="all")
+    model = instantiate(config.model, _convert_="all")
+    before = [parameter.detach().clone() for parameter in model.parameters()]
+    trainer = Trainer(
+        max_steps=2, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, limit_val_batches=1,
+    )  # fmt: skip
+    trainer.fit(model, datamodule=data)
+    trainer.test(model, datamodule=data, verbose=False)
+    assert any(not torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
