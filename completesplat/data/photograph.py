@@ -1,8 +1,6 @@
 """Any photograph as the square image that a model takes, with the field of view of its camera."""
 
 import io
-import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,16 +11,22 @@ from jaxtyping import Float
 from PIL import Image, ImageCms
 from torch import Tensor
 
-from completesplat.data.exif import ORIENTATION, TRANSPOSITIONS, crop_fov, read_exif
+from completesplat.data.exif import ORIENTATION, crop_fov, read_exif
+from completesplat.data.images import (
+    EIGHT_BIT_MODES,
+    MOST_PIXELS,
+    SIXTEEN_BIT_MODES,
+    check_pixels,
+    damage_refused,
+    deep_grey,
+    upright,
+)
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.tensors import TensorDataclass
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
-MOST_PIXELS = 50_000_000
 SMALLEST_SIDE = 8
-EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
-DEEP_GREY_MODES = ("I;16", "I;16B", "I;16L", "I", "F")
-TIFF_BITS, TIFF_PHOTOMETRIC, TIFF_SAMPLE_FORMAT = 258, 262, 339
+DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ def read_photograph(
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
         picture, exif = _decode(path)
-        square = _central_square(_upright(picture, exif.get(ORIENTATION)))
+        square = _central_square(upright(picture, exif.get(ORIENTATION)))
         image = _to_tensor(square, picture, size)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from error.__cause__
@@ -77,37 +81,17 @@ def _decode(path: str | Path) -> tuple[Image.Image, dict[int, Any]]:
         raise ImageError("no such file")
     if Path(path).stat().st_size == 0:
         raise ImageError("the file is empty")
-    # Pillow only warns of images between 89 and 179 million pixels; the limit here is lower and an error.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            with Image.open(path, formats=FORMATS) as picture:
-                _check_size(picture)
-                picture.load()
-                return picture, read_exif(picture)
-        except ImageError:
-            raise
-        except Image.UnidentifiedImageError:
-            raise ImageError(f"not an image in one of the formats {', '.join(FORMATS)}") from None
-        except Image.DecompressionBombError:
-            raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
-        # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise ImageError(f"cannot be decoded: {reason}") from error
+    with damage_refused(FORMATS, MOST_PIXELS), Image.open(path, formats=FORMATS) as picture:
+        _check_size(picture)
+        picture.load()
+        return picture, read_exif(picture)
 
 
 def _check_size(picture: Image.Image) -> None:
+    check_pixels(picture, MOST_PIXELS)
     width, height = picture.size
-    if width * height > MOST_PIXELS:
-        raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels")
     if min(width, height) < SMALLEST_SIDE:
         raise ImageError(f"{width} x {height} pixels; at least {SMALLEST_SIDE} on a side are needed")
-
-
-def _upright(picture: Image.Image, orientation: object) -> Image.Image:
-    transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
-    return picture if transposition is None else picture.transpose(transposition)
 
 
 def _central_square(picture: Image.Image) -> Image.Image:
@@ -119,30 +103,13 @@ def _central_square(picture: Image.Image) -> Image.Image:
 def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Tensor, "3 size size"]:
     """Pixels as sRGB in [0, 1]; `source` is the opened file, which alone knows its TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
-        grey = Image.fromarray(_deep_grey(square, getattr(source, "tag_v2", {})))
+        grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
         return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
     if square.mode not in EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
     small = _to_srgb(square).resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
-
-
-def _deep_grey(square: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
-    """Grey values of more than 8 bits as float32 in [0, 1]. Pillow's own conversion would clip them at 255."""
-    bits = tiff_tags.get(TIFF_BITS, (16,))
-    values = np.asarray(square).astype(np.float64)
-    if square.mode != "F":
-        # Pillow gives 12-bit TIFF values as they are; everything else of these modes uses 16 bits.
-        values = values / (4095 if bits == (12,) else 65535)
-    # False for NaN too.
-    if not ((values >= 0) & (values <= 1)).all():
-        raise ImageError(f"grey values of mode {square.mode} outside the range from black to white, or not finite")
-    if tiff_tags.get(TIFF_PHOTOMETRIC) == 0:
-        values = 1 - values  # "white is zero", which Pillow undoes for 8 bits only
-    if isinstance(square.info.get("transparency"), int):
-        values[np.asarray(square) == square.info["transparency"]] = 1
-    return values.astype(np.float32)
 
 
 def _to_srgb(square: Image.Image) -> Image.Image:

@@ -1,15 +1,15 @@
-"""Pictures on their way from files to square tensors: decoding, the principal-point crop, resizing."""
+"""Pictures on their way from files to square tensors: the principal-point crop, resizing."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from completesplat.data.checks import require_file
+from completesplat.data.images import decode
 from completesplat.errors import DataError
 
 
@@ -37,24 +37,18 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
 
 
 def read_square(
-    path: Path, image_size: tuple[int, int], square: Square, size: int, mode: str
+    path: Path, image_size: tuple[int, int], square: Square, size: int, mode: Literal["RGB", "L"]
 ) -> UInt8[Tensor, "channel size size"]:
     """A square part of an image file, resized to `size`.
 
     Args:
-        image_size: (height, width) that the file must have.
+        image_size: (height, width) that the upright picture must have.
         mode: "RGB" (resized with Lanczos' filter) or "L" (bilinearly, for masks).
 
     Raises:
-        DataError: a file that is missing, no image, or of another size.
+        DataError: a file that `decode` refuses, as missing, damaged or of another size, for instance.
     """
-    try:
-        with Image.open(require_file(path)) as file:
-            image = file.convert(mode)
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise DataError(f"not a readable image: {path} ({error})") from None
-    if image.size != image_size[::-1]:
-        raise DataError(f"{path} has {image.height} x {image.width} pixels, its annotation says {image_size}")
+    image = decode(path, str(path), mode, image_size)
     box = (square.left, square.top, square.left + square.side, square.top + square.side)
     resampling = Image.Resampling.LANCZOS if mode == "RGB" else Image.Resampling.BILINEAR
     # Rounding may put a full-size box a hair outside, which Pillow refuses.

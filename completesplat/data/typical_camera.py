@@ -24,7 +24,7 @@ class TypicalCamera(NamedTuple):
     up: tuple[float, float, float]
 
 
-def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Tensor, "view 2"]]) -> TypicalCamera:
+def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Tensor, "_ 2"]]) -> TypicalCamera:
     """Average over all cameras of all sequences, each [view]."""
     focal = torch.cat([cameras.intrinsics[:, 0, 0] for cameras in sequences])
     width = sequences[0].image_size[1]
