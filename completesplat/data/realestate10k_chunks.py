@@ -10,15 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from completesplat.data.checks import inside, read_json, require_file
+from completesplat.data.images import decode
 from completesplat.data.realestate10k_clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
-from completesplat.data.transforms import Square
+from completesplat.data.transforms import Square, cut_square
 from completesplat.errors import DataError
 
 CHUNKS_IN_MEMORY = 2
@@ -125,27 +124,5 @@ def _is_bytes(image: Any) -> bool:
 def _read(
     images: list[Tensor], image_size: tuple[int, int], where: str, frame: int, square: Square, size: int
 ) -> UInt8[Tensor, "3 size size"]:
-    return decode_square(images[frame], image_size, square, size, f"{where}, frame {frame}")
-
-
-def decode_square(
-    data: UInt8[Tensor, " byte"], image_size: tuple[int, int], square: Square, size: int, where: str
-) -> UInt8[Tensor, "3 size size"]:
-    """A square part of an encoded JPEG or PNG, resized with Lanczos' filter: `transforms.read_square` for bytes.
-
-    Raises:
-        DataError: no image, or one that has not this (height, width).
-    """
-    found = picture_size(io.BytesIO(data.numpy().tobytes()), where)
-    if found != image_size:
-        raise DataError(f"{where}: {found[0]} x {found[1]} pixels, the clip's first frame has {image_size}")
-    box = (square.left, square.top, square.left + square.side, square.top + square.side)
-    # Rounding may put a full-size box a hair outside, which Pillow refuses.
-    box = tuple(np.clip(box, 0, [image_size[1], image_size[0]] * 2).tolist())
-    try:
-        with Image.open(io.BytesIO(data.numpy().tobytes()), formats=("JPEG", "PNG")) as file:
-            image = file.convert("RGB")
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise DataError(f"{where}: not a readable image ({error})") from None
-    pixels = np.asarray(image.resize((size, size), Image.Resampling.LANCZOS, box=box))
-    return torch.from_numpy(pixels.transpose(2, 0, 1).copy())
+    image = decode(images[frame].numpy().tobytes(), f"{where}, frame {frame}", "RGB", image_size)
+    return cut_square(image, square, size)

@@ -48,9 +48,13 @@ def read_square(
     Raises:
         DataError: a file that `decode` refuses, as missing, damaged or of another size, for instance.
     """
-    image = decode(path, str(path), mode, image_size)
+    return cut_square(decode(path, str(path), mode, image_size), square, size)
+
+
+def cut_square(image: Image.Image, square: Square, size: int) -> UInt8[Tensor, "channel size size"]:
+    """A square part of a picture, resized to `size`: colours with Lanczos' filter, greys (masks) bilinearly."""
     box = (square.left, square.top, square.left + square.side, square.top + square.side)
-    resampling = Image.Resampling.LANCZOS if mode == "RGB" else Image.Resampling.BILINEAR
+    resampling = Image.Resampling.LANCZOS if image.mode == "RGB" else Image.Resampling.BILINEAR
     # Rounding may put a full-size box a hair outside, which Pillow refuses.
     box = tuple(np.clip(box, 0, [image.width, image.height] * 2).tolist())
     pixels = np.asarray(image.resize((size, size), resampling, box=box))

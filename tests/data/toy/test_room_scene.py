@@ -1,0 +1,208 @@
+"""Toy rooms and the camera in them: what a point looks like, where the camera goes, what the files' numbers mean."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from completesplat.data.toy import write_rooms
+from completesplat.data.toy.room_camera import HIGHEST, LOWEST, MARGIN, image_width
+from completesplat.data.toy.room_furniture import furnish
+from completesplat.data.toy.room_ingredients import BALL
+from completesplat.data.toy.room_scene import draw_room_scene, render_room_frame
+
+Pinhole = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+def scene(index: int, frames: int = 60):
+    return draw_room_scene(np.random.default_rng([7, index]), frames)
+
+
+def pinhole(row: np.ndarray, height: int, width: int) -> Pinhole:
+    """World points to (column, row) and depth by the 18 numbers of a line of RealEstate10K's texts."""
+    matrix = row[6:].reshape(3, 4)
+
+    def see(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y, z = matrix[:, :3] @ points.T + matrix[:, 3:]
+        return np.stack([(row[0] * x / z + row[2]) * width, (row[1] * y / z + row[3]) * height], axis=1), z
+
+    return see
+
+
+def at(image: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Bilinear samples; pixel centres lie at halves."""
+    column, row = (places - 0.5).T
+    i, j = np.floor(row).astype(int), np.floor(column).astype(int)
+    a, b = (row - i)[:, None], (column - j)[:, None]
+    image = image.reshape(*image.shape[:2], -1)
+    upper = (1 - b) * image[i, j] + b * image[i, j + 1]
+    return (1 - a) * upper + a * ((1 - b) * image[i + 1, j] + b * image[i + 1, j + 1])
+
+
+def face_points(size: np.ndarray, count: int = 1500) -> np.ndarray:
+    """Points on the walls, floor and ceiling, room axes."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.5, 0, -0.5], [0.5, 1, 0.5], (count, 3))
+    axis, side = rng.integers(3, size=count), rng.integers(2, size=count)
+    points[np.arange(count), axis] = side - np.where(axis == 1, 0.0, 0.5)
+    return points * size
+
+
+def hidden(room_scene, eye: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether furniture lies between the eye and the points: by walking along the lines of sight."""
+    blocked = np.zeros(len(points), dtype=bool)
+    for share in np.linspace(0, 0.995, 120):
+        along = eye + share * (points - eye)
+        for solid in room_scene.furniture:
+            blocked |= solid.distances(along) < 0.03
+    return blocked
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    """Rooms of the seed that `scene` draws from."""
+    root = tmp_path_factory.mktemp("rooms")
+    return write_rooms(root, scenes=3, frames=24, size=72, seed=7, workers=1, progress=False)
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_a_wall_point_has_the_same_color_in_two_frames_by_the_numbers_in_the_text(written, index):
+    """Far from this with another frame's pose, so the agreement is the poses' doing."""
+    height, frames, last = 72, 24, 23
+    text = next(written.glob(f"text/*/room{index:05d}.txt"))
+    lines = [line.split() for line in text.read_text().splitlines()[1:]]
+    rows = np.array(lines, dtype=np.float64)[:, 1:]
+    width = image_width(height)
+    room = scene(index, frames)
+    move = room.move
+    points = face_points(room.room.size)
+    world = move.unit * points @ move.rotation.T + move.origin
+    seen = np.ones(len(points), dtype=bool)
+    for frame in (0, last):
+        places, depth = pinhole(rows[frame], height, width)(world)
+        seen &= (depth > 0) & (places > 1).all(axis=1) & (places < [width - 1, height - 1]).all(axis=1)
+        seen &= ~hidden(room, move.camera_to_room[frame, :3, 3], points)
+    assert seen.sum() > 60
+
+    def colors(frame: int, pose: int) -> np.ndarray:
+        picture = np.asarray(Image.open(text.with_suffix("") / f"{lines[frame][0]}.jpg")) / 255
+        places, _ = pinhole(rows[pose], height, width)(world[seen])
+        return at(picture, np.clip(places, 1, [width - 1, height - 1]))
+
+    right = np.abs(colors(0, 0) - colors(last, last)).mean(axis=1)
+    wrong = np.abs(colors(0, 0) - colors(last, 0)).mean(axis=1)
+    assert np.median(right) < 0.02
+    assert np.mean(right) < 0.4 * np.mean(wrong)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_depth_ends_on_the_faces_of_the_room_or_on_furniture(index):
+    """Every pixel's depth, carried back along its ray, gives a point on the room's box or on a solid's surface."""
+    room = scene(index)
+    size, move, frame = room.room.size, room.move, 20
+    _, depth = render_room_frame(room, frame, 32, 58)
+    fx, fy, cx, cy = move.intrinsics(32, 58)
+    u, v = np.meshgrid((np.arange(58) + 0.5) / 58, (np.arange(32) + 0.5) / 32)
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) * depth[..., None]
+    pose = move.camera_to_room[frame]
+    points = (rays @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3)
+    middle = points - [0, size[1] / 2, 0]
+    outside = (np.abs(middle) - size / 2).max(axis=1)
+    assert outside.max() < 1e-9
+    on_solid = np.zeros(len(points), dtype=bool)
+    for solid in room.furniture:
+        local = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ solid.to_local().T
+        radius = np.linalg.norm(local, axis=1) if solid.kind == BALL else np.abs(local).max(axis=1)
+        assert radius.min() > 1 - 1e-9
+        on_solid |= radius < 1 + 1e-9
+    on_face = outside > -1e-9
+    assert (on_face | on_solid).all()
+    assert on_face.any()
+
+
+@pytest.mark.parametrize("index", range(20))
+def test_furniture_stands_in_the_room_and_pieces_do_not_overlap(index):
+    """Three to six pieces; no point of one lies within 2 cm of another."""
+    rng, size = np.random.default_rng(index), np.array([3.5, 2.4, 4.3])
+    pieces = furnish(rng, size)
+    assert 3 <= len(pieces) <= 6
+    for number, piece in enumerate(pieces):
+        for solid in piece:
+            local = rng.uniform(-1, 1, (3, 100))
+            points = np.linalg.inv(solid.to_local()[:, :3]) @ local + solid.center[:, None]
+            assert (np.abs(points[[0, 2]].T) <= size[[0, 2]] / 2).all()
+            assert points[1].min() >= -1e-9
+            assert points[1].max() <= size[1]
+            others = [other for rest in pieces[:number] for other in rest]
+            assert all(other.distances(points.T).min() > 0.02 for other in others)
+
+
+def test_furniture_is_seen_in_most_rooms():
+    """The depth of most rooms' first pictures is partly shorter than that of the same room without its furniture."""
+    shares = []
+    for index in range(10):
+        full = scene(index)
+        away = np.array([0, 0, 0, 1e6])
+        empty = replace(full, room=full.room._replace(to_local=full.room.to_local + away))
+        depth, behind = (render_room_frame(each, 0, 32, 58)[1] for each in (full, empty))
+        assert (depth <= behind).all()
+        shares.append((depth < behind).mean())
+    assert sum(share > 0.02 for share in shares) >= 6
+
+
+@pytest.mark.parametrize("index", range(30))
+def test_the_camera_walks_smoothly_through_free_space(index):
+    """Away from walls and furniture, at a person's height, upright, in small even steps and small turns."""
+    room = scene(index)
+    poses, half = room.move.camera_to_room, room.room.size / 2
+    centers, forward = poses[:, :3, 3], poses[:, :3, 2]
+    assert (np.abs(centers[:, [0, 2]]) <= half[[0, 2]] - MARGIN).all()
+    assert (centers[:, 1] >= LOWEST).all()
+    assert (centers[:, 1] <= HIGHEST).all()
+    for solid in room.furniture:
+        corner = np.abs(np.concatenate([centers, np.ones((60, 1))], axis=1) @ solid.to_local().T).clip(1) - 1
+        assert np.linalg.norm(corner * solid.half_sizes, axis=1).min() >= MARGIN - 1e-9
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert steps.max() < 0.04
+    assert steps.max() < 1.2 * steps.min()
+    turns = np.degrees(np.arccos((forward[1:] * forward[:-1]).sum(axis=1).clip(-1, 1)))
+    assert turns.max() < 3.5
+    assert (poses[:, 1, 1] < -0.9).all()  # the pictures' down is the room's down
+    assert np.abs(poses[:, 1, 0]).max() < 1e-9  # and their rows are level
+    along = np.diff(centers, axis=0) / steps[:, None]
+    assert ((along * forward[1:]).sum(axis=1) > 0.6).all()
+
+
+def test_neighbouring_pictures_differ_little_and_distant_ones_much():
+    room = scene(0)
+    frames = [render_room_frame(room, frame, 32, 58)[0] for frame in (10, 11, 40)]
+    assert np.abs(frames[0] - frames[1]).mean() < 0.3 * np.abs(frames[0] - frames[2]).mean()
+
+
+def test_rooms_lenses_and_worlds_differ():
+    scenes = [scene(index, frames=2) for index in range(40)]
+    assert len({tuple(room.room.size) for room in scenes}) == 40
+    assert len({room.room.colors.tobytes() for room in scenes}) == 40
+    fields = np.degrees([2 * np.arctan(0.5 / room.move.focal) for room in scenes])
+    assert fields.min() >= 55
+    assert fields.max() <= 75
+    assert np.ptp(fields) > 10
+    off = [bool((room.move.principal_point != 0.5).any()) for room in scenes]
+    assert 0 < sum(off) < 20
+    units = np.array([room.move.unit for room in scenes])
+    assert units.min() >= 0.5
+    assert units.max() <= 2
+    assert units.max() > 2 * units.min()
+
+
+def test_pixels_are_square_and_pictures_about_sixteen_by_nine():
+    for height in (8, 18, 64, 65, 360):
+        width = image_width(height)
+        assert width % 2 == 0
+        assert abs(width - height * 16 / 9) <= 1
+        fx, fy, _, _ = scene(0, frames=2).move.intrinsics(height, width)
+        assert fx * width == pytest.approx(fy * height)
+    assert image_width(360) == 640

@@ -1,0 +1,141 @@
+"""Toy rooms on disk: determinism, layout, and two forms that say the same."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from completesplat.data.toy import write_rooms
+from completesplat.data.toy.realestate10k_files import (
+    CLIPS_PER_CHUNK,
+    clip_files,
+    write_chunks,
+    write_picture,
+    write_text,
+)
+from completesplat.errors import DataError
+
+FRAMES = 4
+SPLITS = {"train": ["room00001", "room00002"], "test": ["room00000"]}
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("rooms")
+    return write_rooms(root, scenes=3, frames=FRAMES, size=18, seed=0, workers=1, progress=False)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def read_text(path: Path) -> tuple[str, list[int], np.ndarray]:
+    url, *lines = path.read_text().splitlines()
+    columns = [line.split() for line in lines]
+    return url, [int(row[0]) for row in columns], np.array([[float(number) for number in row[1:]] for row in columns])
+
+
+def test_bytes_depend_on_the_seed_and_not_on_the_workers(rooms, tmp_path):
+    again, other = tmp_path / "again", tmp_path / "other"
+    write_rooms(again, scenes=3, frames=FRAMES, size=18, seed=0, workers=2, progress=False)
+    assert files_of(again / "toy_rooms") == files_of(rooms)
+    write_rooms(other, scenes=3, frames=FRAMES, size=18, seed=1, workers=1, progress=False)
+    pictures = {content for path, content in files_of(rooms).items() if path.endswith(".jpg")}
+    assert len(pictures) == 3 * FRAMES
+    assert not pictures & set(files_of(other / "toy_rooms").values())
+
+
+def test_a_longer_set_begins_with_the_same_clips(rooms, tmp_path):
+    longer = write_rooms(tmp_path, scenes=11, frames=FRAMES, size=18, seed=0, workers=1, progress=False)
+    texts = {path: content for path, content in files_of(rooms).items() if path.startswith("text")}
+    assert texts.items() <= files_of(longer).items()
+    assert sorted(path.stem for path in longer.glob("text/test/*.txt")) == ["room00000", "room00010"]
+
+
+def test_a_complete_set_is_kept_and_other_content_refused(rooms):
+    settings = {"scenes": 3, "frames": FRAMES, "size": 18, "seed": 0, "workers": 1, "progress": False}
+    before = {path: path.stat().st_mtime_ns for path in rooms.rglob("*")}
+    assert write_rooms(rooms.parent, **settings) == rooms
+    assert {path: path.stat().st_mtime_ns for path in rooms.rglob("*")} == before
+    with pytest.raises(DataError, match="toy_rooms already holds something else"):
+        write_rooms(rooms.parent, **{**settings, "frames": 5})
+    assert {path: path.stat().st_mtime_ns for path in rooms.rglob("*")} == before
+    description = json.loads((rooms / "toy.json").read_text())
+    assert description == {"format": 1, "scenes": 3, "frames": FRAMES, "size": 18, "seed": 0}
+
+
+def test_a_folder_of_something_else_is_refused_and_an_interrupted_run_made_anew(tmp_path):
+    (tmp_path / "toy_rooms").mkdir()
+    (tmp_path / "toy_rooms" / "mine.txt").write_text("mine")
+    with pytest.raises(DataError, match="choose another folder"):
+        write_rooms(tmp_path, scenes=2, frames=2, size=8, seed=0, workers=1, progress=False)
+    assert files_of(tmp_path) == {"toy_rooms/mine.txt": b"mine"}
+    (tmp_path / "new/.toy_rooms.unfinished/text/train/room00001").mkdir(parents=True)
+    folder = write_rooms(tmp_path / "new", scenes=2, frames=2, size=8, seed=0, workers=1, progress=False)
+    assert [path.name for path in folder.parent.iterdir()] == ["toy_rooms"]
+
+
+@pytest.mark.parametrize("small", [{"scenes": 1}, {"frames": 1}, {"size": 7}])
+def test_numbers_that_are_too_small_are_refused(tmp_path, small):
+    with pytest.raises(DataError, match=next(iter(small))):
+        write_rooms(tmp_path, **{"scenes": 2, "frames": 2, "size": 8, "seed": 0, **small}, progress=False)
+
+
+def test_text_form_is_as_published(rooms):
+    """Address, then lines of 19 numbers; 30 frames a second; a picture for each line; rotations are rotations."""
+    for split, keys in SPLITS.items():
+        folder = rooms / "text" / split
+        assert sorted(path.name for path in folder.iterdir()) == sorted([*keys, *(f"{key}.txt" for key in keys)])
+        for key in keys:
+            url, times, cameras = read_text(folder / f"{key}.txt")
+            assert url == f"https://example.com/toy/{key}"
+            assert np.abs(np.diff(times) - 1e6 / 30).max() <= 1
+            assert cameras.shape == (FRAMES, 18)
+            assert not cameras[:, 4:6].any()
+            rotation = cameras[:, 6:].reshape(-1, 3, 4)[:, :, :3]
+            assert np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max() < 1e-6
+            assert np.linalg.det(rotation) == pytest.approx(1, abs=1e-6)
+            assert sorted(int(path.stem) for path in (folder / key).iterdir()) == times
+            assert {Image.open(path).size for path in (folder / key).glob("*.jpg")} == {(32, 18)}
+
+
+def test_chunks_hold_what_the_text_form_holds(rooms):
+    """Same addresses, timestamps, cameras (to the last bit of float32) and bytes of pictures."""
+    for split, keys in SPLITS.items():
+        index = json.loads((rooms / "chunks" / split / "index.json").read_text())
+        assert index == dict.fromkeys(keys, "000000.torch")
+        clips = torch.load(rooms / "chunks" / split / "000000.torch", weights_only=True)
+        assert [clip["key"] for clip in clips] == keys
+        for clip in clips:
+            url, times, cameras = read_text(rooms / "text" / split / f"{clip['key']}.txt")
+            assert clip["url"] == url
+            assert clip["timestamps"].dtype == torch.int64
+            assert clip["timestamps"].tolist() == times
+            assert clip["cameras"].dtype == torch.float32
+            assert np.array_equal(clip["cameras"].numpy(), cameras.astype(np.float32))
+            folder = rooms / "text" / split / clip["key"]
+            stored = [image.numpy().tobytes() for image in clip["images"]]
+            assert stored == [(folder / f"{time}.jpg").read_bytes() for time in times]
+            assert all(Image.open(io.BytesIO(data)).format == "JPEG" for data in stored)
+
+
+def test_many_clips_fill_several_chunks(tmp_path):
+    poses = np.broadcast_to(np.eye(3, 4), (1, 3, 4))
+    names = [f"clip{number}" for number in range(2 * CLIPS_PER_CHUNK + 1)]
+    clips = [clip_files(tmp_path / "text", name, 0, np.array([0.8, 1.4, 0.5, 0.5]), poses) for name in names]
+    for clip in clips:
+        write_text(clip)
+        write_picture(clip.picture(0), np.zeros((2, 4, 3)))
+    write_chunks(tmp_path / "chunks", clips)
+    index = json.loads((tmp_path / "chunks" / "index.json").read_text())
+    files = sorted(set(index.values()))
+    assert files == ["000000.torch", "000001.torch", "000002.torch"]
+    found = [
+        (clip["key"], name) for name in files for clip in torch.load(tmp_path / "chunks" / name, weights_only=True)
+    ]
+    assert found == list(index.items())
+    assert list(index) == names
