@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.toy.objects import write_objects
+from completesplat.data.toy.rooms import write_rooms
 from completesplat.errors import DataError
 
-KINDS = {"objects": write_objects}
+KINDS = {"objects": write_objects, "rooms": write_rooms}
 
 
 def write(kind: str, out: Path, **settings: Any) -> Path:
@@ -20,4 +21,4 @@ def write(kind: str, out: Path, **settings: Any) -> Path:
     return KINDS[kind](out, **settings)
 
 
-__all__ = ["write", "write_objects"]
+__all__ = ["write", "write_objects", "write_rooms"]

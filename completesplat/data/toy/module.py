@@ -1,10 +1,12 @@
-"""Toy objects as a data module that makes its own data."""
+"""Toy objects and rooms as data modules that make their own data."""
 
 from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.realestate10k import RE10KDataModule
 from completesplat.data.toy.objects import CATEGORY, write_objects
+from completesplat.data.toy.rooms import ROOMS, write_rooms
 
 
 class ToyObjectsDataModule(CO3DDataModule):
@@ -28,3 +30,35 @@ class ToyObjectsDataModule(CO3DDataModule):
         """Write the scenes unless a complete set is there (its description is written last)."""
         if not (Path(self.root) / CATEGORY / "toy.json").is_file():
             write_objects(self.root, self.scenes, self.frames, self.image_size, self.data_seed)
+
+
+class ToyRoomsDataModule(RE10KDataModule):
+    """`RE10KDataModule` on toy rooms, which are written to `root` on first use.
+
+    Clips that are already there are taken as they are, however many they are.
+
+    Args:
+        root: where the rooms are, or will be.
+        form: "text" or "chunks", of RealEstate10K's two forms: both hold the same.
+        scenes, frames, height, data_seed: what to make where there is nothing yet; pictures are wider than high.
+        **reading: settings of `RE10KDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        form: str = "text",
+        scenes: int = 100,
+        frames: int = 60,
+        height: int = 72,
+        data_seed: int = 0,
+        **reading: Any,
+    ) -> None:
+        super().__init__(str(Path(root) / ROOMS / form), **reading)
+        self.home = Path(root)
+        self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
+
+    def prepare_data(self) -> None:
+        """Write the rooms unless a complete set is there (its description is written last)."""
+        if not (self.home / ROOMS / "toy.json").is_file():
+            write_rooms(self.home, **self.making)

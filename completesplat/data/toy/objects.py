@@ -2,21 +2,15 @@
 
 import gzip
 import json
-import os
-import shutil
-from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from completesplat.data.toy.co3d_files import CATEGORY, write_sequence
 from completesplat.data.toy.scene import draw_scene
+from completesplat.data.toy.writing import in_processes, write_once
 from completesplat.errors import DataError
 
 SUBSET = "fewview_train"
@@ -43,31 +37,13 @@ def write_objects(
     if scenes < 1 or frames < 2 or size < 8:
         raise DataError(f"toy objects need scenes >= 1, frames >= 2 and size >= 8, not {scenes}, {frames} and {size}")
     parameters = {"format": FORMAT_VERSION, "scenes": scenes, "frames": frames, "size": size, "seed": seed}
-    category = out / CATEGORY
-    if category.exists():
-        _check_same(category, parameters)
-        if progress:
-            Console().print(f"{category} already holds these scenes")
-        return category
-    # Everything is made beside the final place, so that an interrupted run leaves no half category behind.
-    unfinished = out / f".{CATEGORY}.unfinished"
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    write = partial(_write_scene, unfinished, frames, size, seed)
-    written = list(_map(write, _splits(scenes), workers or os.cpu_count() or 1, progress))
-    _write_lists(unfinished, written)
-    (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
-    unfinished.rename(category)
-    return category
 
+    def fill(category: Path) -> None:
+        write = partial(_write_scene, category, frames, size, seed)
+        written = in_processes(write, _splits(scenes), workers, "Rendering toy objects", progress)
+        _write_lists(category, list(written))
 
-def _check_same(category: Path, parameters: dict[str, int]) -> None:
-    try:
-        found = json.loads((category / "toy.json").read_text())
-    except (OSError, ValueError):
-        found = None
-    if found != parameters:
-        raise DataError(f"{category} already holds something else: remove it or choose another folder")
+    return write_once(out / CATEGORY, parameters, fill, progress)
 
 
 def _splits(scenes: int) -> list[str]:
@@ -75,15 +51,6 @@ def _splits(scenes: int) -> list[str]:
     test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
     val = max(1, round(0.05 * scenes)) if scenes > 2 else 0
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
-
-
-def _map(write: partial[Annotations], splits: list[str], workers: int, progress: bool) -> Iterable[Annotations]:
-    shown = partial(track, description="Rendering toy objects", total=len(splits), disable=not progress)
-    if workers == 1:
-        yield from shown(map(write, range(len(splits)), splits))
-        return
-    with ProcessPoolExecutor(min(workers, len(splits)), mp_context=get_context("spawn")) as pool:
-        yield from shown(pool.map(write, range(len(splits)), splits))
 
 
 def _write_scene(category: Path, frames: int, size: int, seed: int, index: int, split: str) -> Annotations:

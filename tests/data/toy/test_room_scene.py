@@ -98,29 +98,56 @@ def test_a_wall_point_has_the_same_color_in_two_frames_by_the_numbers_in_the_tex
     assert np.mean(right) < 0.4 * np.mean(wrong)
 
 
-@pytest.mark.parametrize("index", range(4))
-def test_depth_ends_on_the_faces_of_the_room_or_on_furniture(index):
-    """Every pixel's depth, carried back along its ray, gives a point on the room's box or on a solid's surface."""
-    room = scene(index)
-    size, move, frame = room.room.size, room.move, 20
-    _, depth = render_room_frame(room, frame, 32, 58)
-    fx, fy, cx, cy = move.intrinsics(32, 58)
-    u, v = np.meshgrid((np.arange(58) + 0.5) / 58, (np.arange(32) + 0.5) / 32)
+def seen_points(room_scene, frame: int, height: int, width: int) -> np.ndarray:
+    """Where the depth says that each pixel's centre ray ends, room axes."""
+    _, depth = render_room_frame(room_scene, frame, height, width)
+    fx, fy, cx, cy = room_scene.move.intrinsics(height, width)
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=-1) * depth[..., None]
-    pose = move.camera_to_room[frame]
-    points = (rays @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3)
-    middle = points - [0, size[1] / 2, 0]
-    outside = (np.abs(middle) - size / 2).max(axis=1)
+    pose = room_scene.move.camera_to_room[frame]
+    return (rays @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3)
+
+
+def radius(solid, points: np.ndarray) -> np.ndarray:
+    """1 on the surface of a solid, less inside."""
+    local = points @ solid.to_local()[:, :3].T + solid.to_local()[:, 3]
+    return np.linalg.norm(local, axis=-1) if solid.kind == BALL else np.abs(local).max(axis=-1)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_rays_end_at_the_first_thing_they_meet(index):
+    """On the room's box or a solid's surface, with no solid on the way."""
+    room, frame = scene(index), 20
+    points, size = seen_points(room, frame, 32, 58), room.room.size
+    outside = (np.abs(points - [0, size[1] / 2, 0]) - size / 2).max(axis=1)
     assert outside.max() < 1e-9
-    on_solid = np.zeros(len(points), dtype=bool)
+    on_face, on_solid = outside > -1e-9, np.zeros(len(points), dtype=bool)
+    eye = room.move.camera_to_room[frame, :3, 3]
+    way = eye + np.linspace(0, 1, 100)[:, None, None] * (points - eye)
     for solid in room.furniture:
-        local = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ solid.to_local().T
-        radius = np.linalg.norm(local, axis=1) if solid.kind == BALL else np.abs(local).max(axis=1)
-        assert radius.min() > 1 - 1e-9
-        on_solid |= radius < 1 + 1e-9
-    on_face = outside > -1e-9
+        assert radius(solid, way).min() > 1 - 1e-9
+        on_solid |= radius(solid, points) < 1 + 1e-9
     assert (on_face | on_solid).all()
     assert on_face.any()
+
+
+def test_furniture_has_the_same_color_from_two_places():
+    """Points on solids found by one frame's depth, seen again at the same depth in another frame."""
+    height, width, agreements = 72, 128, []
+    for index in range(8):
+        room = scene(index)
+        points = seen_points(room, 0, height, width)
+        surface = np.min([radius(solid, points) for solid in room.furniture], axis=0) < 1 + 1e-9
+        inverse = np.linalg.inv(room.move.camera_to_room[12])[:3]
+        row = np.concatenate([room.move.intrinsics(height, width), np.zeros(2), inverse.ravel()])
+        places, along = pinhole(row, height, width)(points)
+        first, (second, depth) = (render_room_frame(room, frame, height, width) for frame in (0, 12))
+        kept = surface & (along > 0) & (places > 1).all(axis=1) & (places < [width - 1, height - 1]).all(axis=1)
+        kept[kept] = np.abs(at(depth, places[kept])[:, 0] - along[kept]) < 0.01
+        agreements += list(np.abs(at(second, places[kept]) - first[0].reshape(-1, 3)[kept]).max(axis=1))
+    assert len(agreements) > 1000
+    assert np.median(agreements) < 0.01
+    assert np.mean(np.array(agreements) < 0.1) > 0.9
 
 
 @pytest.mark.parametrize("index", range(20))

@@ -1,0 +1,193 @@
+"""Ray tracer for toy rooms: a box seen from inside, rectangles on its faces, boxes and ellipsoids in it, a point light.
+
+Shading is Lambertian, so a point looks the same from everywhere. All kernels are in this file, for the reason that
+`raytracing` gives.
+"""
+
+import math
+
+import numpy as np
+
+from completesplat.data.toy.raytracing import inlined, kernel
+from completesplat.data.toy.room_ingredients import BALL, RIPPLES, STRIPES, TILES
+
+SELF_INTERSECTION = 1e-6
+SHADOW = 0.45
+
+
+@inlined
+def _hit_cube(ox, oy, oz, dx, dy, dz):
+    """Nearest hit (distance, axis of the face) of the cube [-1, 1]^3, from outside."""
+    enter, leave, axis = -np.inf, np.inf, 0
+    for i in range(3):
+        o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
+        if abs(d) < 1e-12:
+            if abs(o) > 1:
+                return np.inf, 0
+        else:
+            middle, half = -o / d, abs(1 / d)
+            if middle - half > enter:
+                enter, axis = middle - half, i
+            leave = min(leave, middle + half)
+    return (enter, axis) if SELF_INTERSECTION < enter <= leave else (np.inf, 0)
+
+
+@inlined
+def _hit_ball(ox, oy, oz, dx, dy, dz):
+    """Nearest hit (distance) of the unit ball, from outside."""
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
+    t = (-b - math.sqrt(square)) / a if square > 0 else -1.0
+    return t if t > SELF_INTERSECTION else np.inf
+
+
+@inlined
+def _hit_solid(room, ox, oy, oz, dx, dy, dz):
+    """Nearest solid along a ray: distance, solid (or -1), axis of the face of a box."""
+    nearest, solid, face = np.inf, -1, 0
+    m, balls = room.to_local, room.bounding_balls
+    square = dx * dx + dy * dy + dz * dz
+    for i in range(len(room.solid_kinds)):
+        cx, cy, cz = balls[i, 0] - ox, balls[i, 1] - oy, balls[i, 2] - oz
+        along = cx * dx + cy * dy + cz * dz
+        if (cx * cx + cy * cy + cz * cz - balls[i, 3]) * square > along * along:
+            continue
+        px = m[i, 0, 0] * ox + m[i, 0, 1] * oy + m[i, 0, 2] * oz + m[i, 0, 3]
+        py = m[i, 1, 0] * ox + m[i, 1, 1] * oy + m[i, 1, 2] * oz + m[i, 1, 3]
+        pz = m[i, 2, 0] * ox + m[i, 2, 1] * oy + m[i, 2, 2] * oz + m[i, 2, 3]
+        qx = m[i, 0, 0] * dx + m[i, 0, 1] * dy + m[i, 0, 2] * dz
+        qy = m[i, 1, 0] * dx + m[i, 1, 1] * dy + m[i, 1, 2] * dz
+        qz = m[i, 2, 0] * dx + m[i, 2, 1] * dy + m[i, 2, 2] * dz
+        axis = 0
+        if room.solid_kinds[i] == BALL:
+            t = _hit_ball(px, py, pz, qx, qy, qz)
+        else:
+            t, axis = _hit_cube(px, py, pz, qx, qy, qz)
+        if t < nearest:
+            nearest, solid, face = t, i, axis
+    return nearest, solid, face
+
+
+@inlined
+def _hit_room(room, ox, oy, oz, dx, dy, dz):
+    """Where a ray from inside leaves the room: distance and face."""
+    nearest, face = np.inf, 0
+    for i in range(3):
+        o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
+        if abs(d) > 1e-12:
+            low = 0.0 if i == 1 else -0.5 * room.size[i]
+            t = ((low + room.size[i] if d > 0 else low) - o) / d
+            if t < nearest:
+                nearest, face = t, 2 * i + (1 if d > 0 else 0)
+    return nearest, face
+
+
+@inlined
+def _soft_sign(x):
+    return x / math.sqrt(1 + x * x)
+
+
+@inlined
+def _mixed(colors, first, texture, u, v):
+    """Colours `first` and `first` + 1 mixed by a texture's pattern."""
+    kind, frequency, phase = texture[0], texture[1], texture[2]
+    w = 0.0
+    if kind == STRIPES:
+        w = 0.5 + 0.5 * _soft_sign(5 * math.sin(frequency * u + phase))
+    elif kind == TILES:
+        w = 0.5 + 0.5 * _soft_sign(8 * math.sin(frequency * u + phase) * math.sin(frequency * v + phase))
+    elif kind == RIPPLES:
+        w = 0.5 + 0.25 * (math.sin(frequency * (u + 0.4 * v) + phase) + math.sin(frequency * (v - 0.3 * u) + 2 * phase))
+    a, b = colors[first], colors[first + 1]
+    return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
+
+
+@inlined
+def _face_color(room, face, x, y, z):
+    """Colour of a point on a face of the room; later decals lie on earlier ones."""
+    u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
+    for i in range(len(room.decals) - 1, -1, -1):
+        decal = room.decals[i]
+        if face == decal[0] and decal[1] < u < decal[2] and decal[3] < v < decal[4]:
+            if min(u - decal[1], decal[2] - u, v - decal[3], decal[4] - v) < decal[5]:
+                rim = room.decal_colors[i, 0]
+                return rim[0], rim[1], rim[2]
+            return _mixed(room.decal_colors[i], 1, room.decal_textures[i], u, v)
+    return _mixed(room.colors[face], 0, room.textures[face], u, v)
+
+
+@inlined
+def _solid_look(room, solid, face, x, y, z):
+    """Colour and normal of a point on a solid."""
+    m, half = room.to_local[solid], room.solid_half_sizes[solid]
+    lx = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
+    ly = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
+    lz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    u, v = lx * half[0], ly * half[1]
+    if room.solid_kinds[solid] != BALL:
+        if face == 0:
+            u, lx, ly, lz = lz * half[2], math.copysign(1.0, lx), 0.0, 0.0
+        elif face == 1:
+            v, lx, ly, lz = lz * half[2], 0.0, math.copysign(1.0, ly), 0.0
+        else:
+            lx, ly, lz = 0.0, 0.0, math.copysign(1.0, lz)
+    # Normals transform by the transpose of the map into the local frame.
+    nx = m[0, 0] * lx + m[1, 0] * ly + m[2, 0] * lz
+    ny = m[0, 1] * lx + m[1, 1] * ly + m[2, 1] * lz
+    nz = m[0, 2] * lx + m[1, 2] * ly + m[2, 2] * lz
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    red, green, blue = _mixed(room.solid_colors[solid], 0, room.solid_textures[solid], u, v)
+    return red, green, blue, nx / norm, ny / norm, nz / norm
+
+
+@inlined
+def _shade(room, ox, oy, oz, dx, dy, dz):
+    """Colour and distance (in lengths of the direction) along a ray from inside the room."""
+    t, solid, axis = _hit_solid(room, ox, oy, oz, dx, dy, dz)
+    wall, face = _hit_room(room, ox, oy, oz, dx, dy, dz)
+    if solid < 0:
+        t = wall
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    if solid >= 0:
+        red, green, blue, nx, ny, nz = _solid_look(room, solid, axis, x, y, z)
+    else:
+        red, green, blue = _face_color(room, face, x, y, z)
+        inwards = 1.0 if face % 2 == 0 else -1.0
+        nx, ny, nz = (inwards, 0.0, 0.0) if face < 2 else ((0.0, inwards, 0.0) if face < 4 else (0.0, 0.0, inwards))
+    lx, ly, lz = room.light[0] - x, room.light[1] - y, room.light[2] - z
+    direct = max(0.0, (nx * lx + ny * ly + nz * lz) / math.sqrt(lx * lx + ly * ly + lz * lz))
+    if direct > 0:
+        shift = 1e-4
+        shadow = _hit_solid(room, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
+        direct *= SHADOW if shadow[0] < 1 else 1.0
+    # Light from above keeps the unlit sides from going flat.
+    level = room.ambient * (0.85 + 0.15 * ny) + (1 - room.ambient) * direct
+    return red * level, green * level, blue * level, t
+
+
+@kernel
+def trace_room(room, pose, intrinsics, height, width, samples):
+    """Colours [height width 3] and depth [height width] seen by a camera of pose `camera_to_world`.
+
+    `intrinsics`: fx, fy, cx, cy in pixels. Colours are means over `samples` x `samples` (odd) rays a pixel;
+    the depth is the middle ray's, along the optical axis.
+    """
+    colors, depth = np.zeros((height, width, 3)), np.zeros((height, width))
+    ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
+    for row in range(height):
+        for column in range(width):
+            for sample in range(samples * samples):
+                x = (column + (sample % samples + 0.5) / samples - intrinsics[2]) / intrinsics[0]
+                y = (row + (sample // samples + 0.5) / samples - intrinsics[3]) / intrinsics[1]
+                dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
+                dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
+                dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+                # The direction's component along the optical axis is 1, so its length in t is the depth.
+                red, green, blue, t = _shade(room, ox, oy, oz, dx, dy, dz)
+                colors[row, column, 0] += red / samples**2
+                colors[row, column, 1] += green / samples**2
+                colors[row, column, 2] += blue / samples**2
+                if sample == samples * samples // 2:
+                    depth[row, column] = t
+    return colors, depth

@@ -1,0 +1,63 @@
+"""How toy data get onto the disk: a folder is there as a whole or not at all, and scenes are made in parallel."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+from rich.console import Console
+from rich.progress import track
+
+from completesplat.errors import DataError
+
+Result = TypeVar("Result")
+
+
+def write_once(folder: Path, parameters: dict[str, int], fill: Callable[[Path], None], progress: bool) -> Path:
+    """Make `folder` and let `fill` write into it; `toy.json` in it, written last, holds the parameters.
+
+    A folder that was made with the same parameters is kept as it is.
+
+    Raises:
+        DataError: the folder holds something else.
+    """
+    if folder.exists():
+        _check_same(folder, parameters)
+        if progress:
+            Console().print(f"{folder} already holds these scenes")
+        return folder
+    # Everything is made beside the final place, so that an interrupted run leaves no half folder behind.
+    unfinished = folder.parent / f".{folder.name}.unfinished"
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    fill(unfinished)
+    (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
+    unfinished.rename(folder)
+    return folder
+
+
+def _check_same(folder: Path, parameters: dict[str, int]) -> None:
+    try:
+        found = json.loads((folder / "toy.json").read_text())
+    except (OSError, ValueError):
+        found = None
+    if found != parameters:
+        raise DataError(f"{folder} already holds something else: remove it or choose another folder")
+
+
+def in_processes(
+    write: "partial[Result]", splits: Sequence[str], workers: int | None, description: str, progress: bool
+) -> Iterator[Result]:
+    """`write`(index, split) for every scene, in order, by `workers` processes (by default one a core)."""
+    shown = partial(track, description=description, total=len(splits), disable=not progress)
+    workers = min(workers or os.cpu_count() or 1, len(splits))
+    if workers == 1:
+        yield from shown(map(write, range(len(splits)), splits))
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from shown(pool.map(write, range(len(splits)), splits))
