@@ -1,4 +1,4 @@
-"""Toy rooms and the camera in them: what a point looks like, where the camera goes, what the files' numbers mean."""
+"""Toy rooms and the camera in them: what a point looks like, what the files' numbers mean."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.room_camera import HIGHEST, LOWEST, MARGIN, image_width
+from completesplat.data.toy.room_camera import image_width
 from completesplat.data.toy.room_furniture import furnish
 from completesplat.data.toy.room_ingredients import BALL
 from completesplat.data.toy.room_scene import draw_room_scene, render_room_frame
@@ -131,6 +131,31 @@ def test_rays_end_at_the_first_thing_they_meet(index):
     assert on_face.any()
 
 
+@pytest.mark.parametrize("frame", [0, 59])
+def test_bare_white_walls_follow_lamberts_law(frame):
+    """Ambient light, a little more from above, and the cosine towards the lamp: nothing that knows of the camera."""
+    full = scene(2)
+    room, height, width = full.room, 32, 58
+    bare = room._replace(
+        textures=np.zeros_like(room.textures),
+        colors=np.ones_like(room.colors),
+        decals=np.full_like(room.decals, -1),
+        bounding_balls=np.tile([0.0, -9, 0, 0], (len(room.bounding_balls), 1)),
+    )
+    empty = replace(full, room=bare)
+    points = seen_points(empty, frame, height, width)
+    middle = points - [0, room.size[1] / 2, 0]
+    face = np.abs(np.abs(middle) - room.size / 2).argmin(axis=1)
+    normals = -np.sign(middle) * np.eye(3)[face]
+    lamp = room.light - points
+    cosine = (normals * lamp).sum(axis=1) / np.linalg.norm(lamp, axis=1)
+    expected = room.ambient * (0.85 + 0.15 * normals[:, 1]) + (1 - room.ambient) * cosine
+    picture, _ = render_room_frame(empty, frame, height, width)
+    gap = np.abs(picture.reshape(-1, 3) - expected[:, None]).max(axis=1)
+    assert np.mean(gap < 2e-3) > 0.9  # the others are pixels on the room's edges
+    assert np.ptp(expected) > 0.1
+
+
 def test_furniture_has_the_same_color_from_two_places():
     """Points on solids found by one frame's depth, seen again at the same depth in another frame."""
     height, width, agreements = 72, 128, []
@@ -180,29 +205,6 @@ def test_furniture_is_seen_in_most_rooms():
     assert sum(share > 0.02 for share in shares) >= 6
 
 
-@pytest.mark.parametrize("index", range(30))
-def test_the_camera_walks_smoothly_through_free_space(index):
-    """Away from walls and furniture, at a person's height, upright, in small even steps and small turns."""
-    room = scene(index)
-    poses, half = room.move.camera_to_room, room.room.size / 2
-    centers, forward = poses[:, :3, 3], poses[:, :3, 2]
-    assert (np.abs(centers[:, [0, 2]]) <= half[[0, 2]] - MARGIN).all()
-    assert (centers[:, 1] >= LOWEST).all()
-    assert (centers[:, 1] <= HIGHEST).all()
-    for solid in room.furniture:
-        corner = np.abs(np.concatenate([centers, np.ones((60, 1))], axis=1) @ solid.to_local().T).clip(1) - 1
-        assert np.linalg.norm(corner * solid.half_sizes, axis=1).min() >= MARGIN - 1e-9
-    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    assert steps.max() < 0.04
-    assert steps.max() < 1.2 * steps.min()
-    turns = np.degrees(np.arccos((forward[1:] * forward[:-1]).sum(axis=1).clip(-1, 1)))
-    assert turns.max() < 3.5
-    assert (poses[:, 1, 1] < -0.9).all()  # the pictures' down is the room's down
-    assert np.abs(poses[:, 1, 0]).max() < 1e-9  # and their rows are level
-    along = np.diff(centers, axis=0) / steps[:, None]
-    assert ((along * forward[1:]).sum(axis=1) > 0.6).all()
-
-
 def test_neighbouring_pictures_differ_little_and_distant_ones_much():
     room = scene(0)
     frames = [render_room_frame(room, frame, 32, 58)[0] for frame in (10, 11, 40)]
@@ -223,13 +225,3 @@ def test_rooms_lenses_and_worlds_differ():
     assert units.min() >= 0.5
     assert units.max() <= 2
     assert units.max() > 2 * units.min()
-
-
-def test_pixels_are_square_and_pictures_about_sixteen_by_nine():
-    for height in (8, 18, 64, 65, 360):
-        width = image_width(height)
-        assert width % 2 == 0
-        assert abs(width - height * 16 / 9) <= 1
-        fx, fy, _, _ = scene(0, frames=2).move.intrinsics(height, width)
-        assert fx * width == pytest.approx(fy * height)
-    assert image_width(360) == 640
