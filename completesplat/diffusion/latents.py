@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 @torch.no_grad()
-def measure_scale(draw_latent: Callable[[Tensor], Tensor], images: Iterable[Float[Tensor, "batch 3 _ _"]]) -> float:
+def measure_scale(draw_latent: Callable[[Tensor], Tensor], images: Iterable[Float[Tensor, "_ 3 _ _"]]) -> float:
     """The factor that gives latents unit standard deviation over all elements, as Stable Diffusion's 0.18215 does.
 
     The paper does not say how its latents are scaled; the factor is measured and stored with the weights.
