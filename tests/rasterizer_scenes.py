@@ -6,7 +6,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
-from completesplat.rasterizers.reference import project_gaussians, visible_in_depth_order
+from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians, visible_in_depth_order
 
 # A scene keeps this far from the steps of the function, relative to where they are: alpha from its threshold and its
 # clamp; the transmittance from the stop (it is a product of many factors); depths from each other and the near plane.
@@ -96,3 +96,27 @@ def cotangents_for(cameras: Cameras, seed: int) -> list[Tensor]:
     generator = torch.Generator().manual_seed(seed)
     shape = cameras.intrinsics.shape[:2]
     return [torch.randn(*shape, channels, *cameras.image_size, generator=generator) for channels in (3, 1, 1)]
+
+
+def assert_agrees(
+    rasterizer: Rasterizer, constants: RenderingConstants, gaussians: Gaussians, cameras: Cameras, seed: int,
+    image: float = 1e-5, gradient: float = 1e-4, of: tuple[str, ...] | None = None,
+) -> None:  # fmt: skip
+    """With the float64 reference, under random cotangents.
+
+    Args:
+        image: largest error of the images, absolute, and of each image as a whole, relative in L2.
+        gradient: largest relative L2 error of a gradient.
+        of: the inputs whose gradients are compared; by default all, cameras included.
+    """
+    cotangents = cotangents_for(cameras, seed)
+    found, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents)
+    doubles = [tensor.double() for tensor in cotangents]
+    gaussians, cameras = gaussians.to(torch.float64), cameras.to(torch.float64)
+    exact, exact_gradients = render_with_gradients(ReferenceRasterizer(constants), gaussians, cameras, doubles)
+    for name in ("color", "depth", "alpha"):
+        difference, size = getattr(found, name) - getattr(exact, name), getattr(exact, name).norm()
+        assert difference.abs().max() <= image, name
+        assert difference.norm() <= image * size, name
+    for name in of or exact_gradients:
+        assert (gradients[name] - exact_gradients[name]).norm() <= gradient * exact_gradients[name].norm(), name

@@ -10,10 +10,10 @@ from torch.utils.data import DataLoader
 
 from completesplat.data.co3d_annotations import CO3DSequence, read_category
 from completesplat.data.co3d_scenes import EpochSampler, EvaluationScenes, SceneStore, TrainingScenes
+from completesplat.data.loading import scene_loader
 from completesplat.data.typical_camera import TypicalCamera, typical_camera
 from completesplat.errors import DataError
 from completesplat.scene import SceneBatch
-from completesplat.tensors import stack
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
@@ -121,16 +121,7 @@ class CO3DDataModule(LightningDataModule):
     def _loader(
         self, scenes: TrainingScenes | EvaluationScenes, batch_size: int, sampler: EpochSampler | None
     ) -> DataLoader[SceneBatch]:
-        return DataLoader(
-            scenes,
-            batch_size,
-            sampler=sampler,
-            num_workers=self.workers,
-            # Workers hold the cache, so they live on from one epoch to the next.
-            persistent_workers=self.workers > 0,
-            collate_fn=stack,
-            pin_memory=torch.cuda.is_available(),
-        )
+        return scene_loader(scenes, batch_size, sampler, self.workers)
 
     def typical_camera(self) -> TypicalCamera:
         """The mean camera of the training frames."""

@@ -9,6 +9,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from completesplat.data.loading import scene_loader
 from completesplat.data.realestate10k_evaluation import choose_clips
 from completesplat.data.realestate10k_scenes import (
     CROPS,
@@ -23,7 +24,6 @@ from completesplat.data.realestate10k_scenes import (
 from completesplat.data.typical_camera import TypicalCamera, typical_camera
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
-from completesplat.tensors import stack
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 # A mean over all of 66,033 clips would take hours.
@@ -163,16 +163,7 @@ class RE10KDataModule(LightningDataModule):
     def _loader(
         self, scenes: TrainingScenes | EvaluationScenes, batch_size: int, sampler: ChunkSampler | None
     ) -> DataLoader[SceneBatch]:
-        return DataLoader(
-            scenes,
-            batch_size,
-            sampler=sampler,
-            num_workers=self.workers,
-            # Workers hold chunks, so they live on from one epoch to the next.
-            persistent_workers=self.workers > 0,
-            collate_fn=stack,
-            pin_memory=torch.cuda.is_available(),
-        )
+        return scene_loader(scenes, batch_size, sampler, self.workers)
 
     def typical_camera(self) -> TypicalCamera:
         """The mean camera of some training frames: 8 of each of the first 256 clips."""

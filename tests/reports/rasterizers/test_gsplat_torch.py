@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasterizer_scenes import OTHER_CONSTANTS, cotangents_for, render_with_gradients, scenes
+from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
 
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import RenderingConstants
-from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.reports.rasterizers import gsplat_torch
 from completesplat.reports.rasterizers.gsplat_torch import GsplatTorchRasterizer, intersect_tiles, weights_along_rays
 
@@ -22,18 +21,9 @@ def test_images_and_gradients_agree_with_the_float64_reference(
     pytest.importorskip("gsplat")
     monkeypatch.setattr(gsplat_torch, "BUDGET", 2**14)  # so that a small scene takes several chunks
     gaussians, cameras = scenes(seed, 2, 3, size, constants)
-    cotangents = cotangents_for(cameras, seed)
-    found, gradients = render_with_gradients(GsplatTorchRasterizer(constants), gaussians, cameras, cotangents)
-    exact, exact_gradients = render_with_gradients(
-        ReferenceRasterizer(constants),
-        gaussians.to(torch.float64),
-        cameras.to(torch.float64),
-        [tensor.double() for tensor in cotangents],
+    assert_agrees(
+        GsplatTorchRasterizer(constants), constants, gaussians, cameras, seed, 1e-4, 1e-3, tuple(vars(gaussians))
     )
-    for name in ("color", "depth", "alpha"):
-        assert (getattr(found, name) - getattr(exact, name)).abs().max() <= 1e-4, name
-    for name in vars(gaussians):
-        assert (gradients[name] - exact_gradients[name]).norm() <= 1e-3 * exact_gradients[name].norm(), name
 
 
 def test_nothing_to_draw() -> None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rasterizer_scenes import OTHER_CONSTANTS, cotangents_for, render_with_gradients, scenes
+from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
 
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
@@ -54,18 +54,7 @@ def test_images_and_gradients_agree_with_the_float64_reference(seed: int, monkey
     monkeypatch.setattr(torch_tiled, "ROUND", 6)
     constants = RenderingConstants() if seed % 2 else OTHER_CONSTANTS
     gaussians, cameras = scenes(seed, 2, 3, SIZES[seed % len(SIZES)], constants)
-    cotangents = cotangents_for(cameras, seed)
-    found, gradients = render_with_gradients(TorchTiledRasterizer(constants), gaussians, cameras, cotangents)
-    exact, exact_gradients = render_with_gradients(
-        ReferenceRasterizer(constants),
-        gaussians.to(torch.float64),
-        cameras.to(torch.float64),
-        [tensor.double() for tensor in cotangents],
-    )
-    for name in ("color", "depth", "alpha"):
-        assert (getattr(found, name) - getattr(exact, name)).abs().max() <= 2e-5, name
-    for name, expected in exact_gradients.items():
-        assert (gradients[name] - expected).norm() <= 2e-4 * expected.norm(), name
+    assert_agrees(TorchTiledRasterizer(constants), constants, gaussians, cameras, seed, 2e-5, 2e-4)
 
 
 def test_a_long_list_is_drawn_until_its_pixels_are_opaque() -> None:
