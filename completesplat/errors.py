@@ -6,7 +6,30 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """Files of a data set that are missing, broken or not in the expected layout."""
+    """Something of a data set that is missing, broken or not in the expected layout; see `data/checks.py` for its kinds.
+
+    Args:
+        reason: what is wrong, without the place.
+        file: the file (or folder) it was found in.
+        sequence: the name of the sequence (RealEstate10K: clip).
+        frame: the number of the frame in its data set.
+    """
+
+    kind = "not as expected"
+
+    def __init__(
+        self, reason: str, file: str | None = None, sequence: str | None = None, frame: int | None = None
+    ) -> None:
+        super().__init__(reason, file, sequence, frame)
+        self.reason = reason
+        self.file = file
+        self.sequence = sequence
+        self.frame = frame
+
+    def __str__(self) -> str:
+        frame = None if self.frame is None else f"frame {self.frame}"
+        place = ", ".join(part for part in (self.file, self.sequence, frame) if part)
+        return f"{place}: {self.reason}" if place else self.reason
 
 
 class ImageError(CompleteSplatError):

@@ -25,11 +25,13 @@ class SceneBatch(TensorDataclass):
 
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
+    `visible` is 1 where the conditioning may see the reference picture, 0 within the boxes of masked diffusion.
     """
 
     reference: Views
     targets: Views
     depth_range: Float[Tensor, "*batch 2"]
+    visible: Float[Tensor, "*batch 1 height width"]
     names: str | tuple[str, ...]
 
     def __getitem__(self, index: int | slice) -> "SceneBatch":

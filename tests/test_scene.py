@@ -22,7 +22,7 @@ def make_views(*batch: int, start: float) -> Views:
 
 def make_scene(index: int, targets: int = 3) -> SceneBatch:
     reference, others = make_views(start=10.0 * index), make_views(targets, start=10.0 * index + 1)
-    return SceneBatch(reference, others, torch.tensor([0.5, 4.0]), f"scene{index}")
+    return SceneBatch(reference, others, torch.tensor([0.5, 4.0]), torch.full((1, *SIZE), index / 10), f"scene{index}")
 
 
 def test_a_scene_without_batch_axis_puts_the_reference_first() -> None:
@@ -39,6 +39,7 @@ def test_a_batch_of_scenes_keeps_scenes_and_views_apart() -> None:
     batch = stack([make_scene(0), make_scene(1)])
     assert batch.names == ("scene0", "scene1")
     assert batch.depth_range.shape == (2, 2)
+    assert torch.equal(batch.visible[:, 0, 0, 0], torch.tensor([0.0, 0.1]))
     views = batch.all_views()
     expected = torch.tensor([[0.0, 1, 2, 3], [10, 11, 12, 13]])
     assert views.images.shape == (2, 4, 3, *SIZE)
@@ -58,7 +59,7 @@ def test_all_views_commutes_with_collation() -> None:
 def test_scenes_with_different_image_sizes_do_not_collate() -> None:
     scene = make_scene(0)
     small = Views(torch.zeros(3, 2, 2), Cameras(torch.eye(4), pinhole(60, 2), (2, 2)), masks=torch.zeros(1, 2, 2))
-    other = SceneBatch(small, scene.targets, scene.depth_range, "small")
+    other = SceneBatch(small, scene.targets, scene.depth_range, torch.ones(1, 2, 2), "small")
     with pytest.raises((ValueError, RuntimeError)):
         stack([scene, other])
 

@@ -1,11 +1,101 @@
-"""`completesplat data`: make data sets."""
+"""`completesplat data`: make, check, look at and prepare data sets."""
 
+import json
+import logging
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+
+from completesplat.errors import CompleteSplatError, DataError
+
+logger = logging.getLogger(__name__)
 
 
 def run(config: Any, out: Path) -> None:
     """Do the chosen task (`conf/data_task/`)."""
     from hydra.utils import instantiate
 
-    instantiate(config.task, out=out)
+    instantiate(config.task, out=out, _convert_="all")
+
+
+def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> None:
+    """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
+    from completesplat.data.checking import Findings, show
+    from completesplat.data.checking import check as check_sources
+
+    try:
+        findings = check_sources(_sources(data, splits), workers)
+    except DataError as error:  # the data set as a whole
+        findings = Findings(0, 0, [error], {})
+    findings.write(out / "check.json")
+    show(findings)
+    if not findings.sequences:
+        print(out)
+        sys.exit(1)
+
+
+def stats(data: Any, splits: Sequence[str], out: Path) -> None:
+    """Write `stats.json` and `stats.png`, and print the numbers."""
+    from rich.progress import track
+
+    from completesplat.reports.data_sets.statistics import show_statistics, statistics
+    from completesplat.reports.data_sets.statistics_plot import plot_statistics
+
+    sources = _sources(data, splits)
+    shown = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
+    results = statistics({split: _readable(sources[split], names) for split, names in shown.items()})
+    (out / "stats.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+    plot_statistics(results, out / "stats.png", str(data.root))
+    show_statistics(results)
+
+
+def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
+    """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
+    from completesplat.reports.data_sets.contact_sheet import MOST_SEQUENCES
+    from completesplat.reports.data_sets.contact_sheet import show as draw
+
+    if not 1 <= scenes <= MOST_SEQUENCES or pictures < 1:
+        raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SEQUENCES} and 1 <= pictures")
+    source = _sources(data, [split])[split]
+    names = source.names
+    chosen = [names[i * len(names) // scenes] for i in range(scenes)] if len(names) > scenes else names
+    sequences = list(_readable(source, chosen))
+    if not sequences:
+        raise DataError(f"no {split} sequences that can be used", str(data.root))
+    draw(sequences, out / "show.png", pictures, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
+
+
+def prepare(data: Any, splits: Sequence[str], out: Path, **settings: Any) -> None:
+    """Write the prepared form into `out`; see `completesplat.data.prepared.writing.prepare`."""
+    from completesplat.data.prepared.manifest import is_prepared
+    from completesplat.data.prepared.writing import prepare as prepare_sources
+
+    if is_prepared(data.root):
+        raise CompleteSplatError(f"{data.root} is prepared already")
+    prepare_sources(_sources(data, splits), data.prepared_settings(), out, **settings)
+
+
+def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
+    """The splits that are there; what is broken in them is collected by them, not raised."""
+    data.policy = "skip", 1.0
+    data.prepare_data()
+    sources, missing = {}, []
+    for split in splits:
+        try:
+            sources[split] = data.source(split)
+        except DataError as error:
+            missing.append(error)
+    if not sources:
+        raise missing[0]
+    for error in missing:
+        logger.warning("left out: %s", error)
+    return sources
+
+
+def _readable(source: Any, names: Any) -> Iterator[Any]:
+    for name in names:
+        try:
+            yield source.read(name)
+        except DataError as error:
+            logger.warning("left out: %s", error)

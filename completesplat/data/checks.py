@@ -1,8 +1,10 @@
-"""Refusals of bad input, each a `DataError` of one line that names the path."""
+"""Refusals of bad input: one class of `DataError` for each kind, and what tells good from bad."""
 
 import json
 import os
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from gzip import GzipFile
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any, NoReturn, TypeVar
@@ -19,16 +21,90 @@ CHUNK = 2**20
 ROTATION_TOLERANCE = 1e-3
 
 T = TypeVar("T")
+Refuse = Callable[[DataError], None]
+
+
+class MissingFile(DataError):
+    """A file that an annotation or a layout promises is not there."""
+
+    kind = "missing file"
+
+
+class OutsidePath(DataError):
+    """A path in an annotation that leads out of the data's folder, or nowhere."""
+
+    kind = "path outside of the data"
+
+
+class UnreadableFile(DataError):
+    """A file other than a picture that is damaged, too large, unsafe to read or of another format."""
+
+    kind = "unreadable file"
+
+
+class BadAnnotation(DataError):
+    """An annotation without a key that is needed, or with a value of another type or shape."""
+
+    kind = "malformed annotation"
+
+
+class BadCamera(DataError):
+    """A pose or intrinsics that no camera has."""
+
+    kind = "impossible camera"
+
+
+class BadPicture(DataError):
+    """A picture, mask or depth map that is damaged, too large, of another size or without a plain meaning."""
+
+    kind = "unusable picture"
+
+
+class BadPlacement(DataError):
+    """Nothing tells where a sequence's object is and how large."""
+
+    kind = "object without a place"
+
+
+class TooFewFrames(DataError):
+    """A sequence with too few (usable) frames."""
+
+    kind = "too few frames"
+
+
+class ChangedFile(DataError):
+    """A file that is no longer what its checksum was taken of."""
+
+    kind = "changed file"
+
+
+@contextmanager
+def at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
+    """Tell refusals from within where they happened, as far as they do not know it themselves."""
+    try:
+        yield
+    except DataError as error:
+        place = error.file or (None if file is None else str(file)), error.sequence or sequence
+        raise type(error)(error.reason, *place, frame if error.frame is None else error.frame) from error.__cause__
+
+
+@contextmanager
+def refused_to(refuse: Refuse) -> Iterator[None]:
+    """Hand a refusal from within to `refuse`, which may collect it or raise it."""
+    try:
+        yield
+    except DataError as error:
+        refuse(error)
 
 
 def require_file(path: Path) -> Path:
     """The path itself.
 
     Raises:
-        DataError: no such file.
+        MissingFile: no such file.
     """
     if not path.is_file():
-        raise DataError(f"no such file: {path}")
+        raise MissingFile("no such file", str(path))
     return path
 
 
@@ -36,20 +112,20 @@ def inside(root: Path, relative: str) -> Path:
     """The path below `root` that an annotation names. Links are followed as long as they stay below `root`.
 
     Raises:
-        DataError: no plain relative path (absolute, with `..`, a backslash, a drive, a scheme or a NUL), or one that
+        OutsidePath: no plain relative path (absolute, with `..`, a backslash, a drive, a scheme or a NUL), or one that
             leads out of `root` through a link.
     """
     path, windows = PurePath(relative), PureWindowsPath(relative)
     plain = path.parts and not path.is_absolute() and ".." not in path.parts and not windows.drive
     if not plain or any(text in relative for text in ("\0", "\\", "://")):
-        raise DataError(f"annotation leads outside of {root}, or nowhere: {relative!r}")
+        raise OutsidePath(f"leads outside of {root}, or nowhere: {_shortened(relative)}")
     try:
         # It also takes a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
-        raise DataError(f"annotation names a path with characters that no file name has: {relative!r}") from None
+        raise OutsidePath(f"characters that no file name has: {_shortened(relative)}") from None
     if os.path.commonpath([real_root, real_path]) != real_root:
-        raise DataError(f"a link leads outside of {root}: {relative!r} is {real_path}")
+        raise OutsidePath(f"a link leads outside of {root}: {_shortened(relative)} is {real_path}")
     return root / path
 
 
@@ -61,27 +137,28 @@ def read_json(path: Path, allow_nan: bool = False, most_bytes: int = MOST_BYTES)
         most_bytes: of the JSON text.
 
     Raises:
-        DataError: a file that is missing, is no (gzipped) JSON in UTF-8, or is too large, unpacked or not.
+        MissingFile: no such file.
+        UnreadableFile: no (gzipped) JSON in UTF-8, or too large, unpacked or not.
     """
     try:
         raw = _unpack(path, most_bytes) if path.suffix == ".jgz" else _read(path, most_bytes)
         return json.loads(raw.decode("utf-8"), parse_constant=float if allow_nan else _refuse_constant)
     except (OSError, EOFError, ValueError, zlib.error, RecursionError, MemoryError) as error:
-        raise DataError(f"not a JSON file: {path} ({str(error) or type(error).__name__})") from None
+        raise UnreadableFile(f"not a JSON file ({str(error) or type(error).__name__})", str(path)) from None
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
     """A value of a JSON object.
 
     Raises:
-        DataError: no object, without this key, or with a value of another type than `kind` (true is no `int`).
+        BadAnnotation: no object, without this key, or with a value of another type than `kind` (true is no `int`).
     """
     if type(entry) is not dict or key not in entry:
-        raise DataError(f"no {key} in {_shortened(entry)}")
+        raise BadAnnotation(f"no {key} in {_shortened(entry)}")
     value = entry[key]
     # `isinstance` would take true for an integer.
     if type(value) is not kind:
-        raise DataError(f"{key} must be of type {kind.__name__}, not {_shortened(value)}")
+        raise BadAnnotation(f"{key} must be of type {kind.__name__}, not {_shortened(value)}")
     return value
 
 
@@ -89,7 +166,7 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     """Numbers from JSON as a float64 array.
 
     Raises:
-        DataError: not numbers, another shape, or NaN or infinity among them.
+        BadAnnotation: not numbers, another shape, or NaN or infinity among them.
     """
     try:
         array = np.array(value)
@@ -98,9 +175,9 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     # Strings that look like numbers, truth values and None become arrays of other kinds.
     if array.shape != shape or array.dtype.kind not in "iuf":
         sides = " x ".join(map(str, shape)) or "one"
-        raise DataError(f"{what} must be {sides} numbers, not {_shortened(value)}")
+        raise BadAnnotation(f"{what} must be {sides} numbers, not {_shortened(value)}")
     if not np.isfinite(array).all():
-        raise DataError(f"{what} is not finite: {_shortened(value)}")
+        raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
     return array.astype(np.float64)
 
 
@@ -108,12 +185,12 @@ def require_rotation(matrix: np.ndarray, what: str) -> None:
     """Refuse a 3 x 3 matrix that is no rotation, within 1e-3 for each entry of R R^T.
 
     Raises:
-        DataError: it is not orthonormal, or a reflection.
+        BadCamera: it is not orthonormal, or a reflection.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
-        raise DataError(f"{what} is not orthonormal")
+        raise BadCamera(f"{what} is not orthonormal")
     if np.linalg.det(matrix) < 0:
-        raise DataError(f"{what} is a reflection, not a rotation")
+        raise BadCamera(f"{what} is a reflection, not a rotation")
 
 
 def _shortened(value: object) -> str:
@@ -125,7 +202,7 @@ def _read(path: Path, most_bytes: int) -> bytes:
     with require_file(path).open("rb") as file:
         raw = file.read(most_bytes + 1)
     if len(raw) > most_bytes:
-        raise DataError(f"{path} has more than {most_bytes:,} bytes")
+        raise UnreadableFile(f"more than {most_bytes:,} bytes", str(path))
     return raw
 
 
@@ -136,7 +213,7 @@ def _unpack(path: Path, most_bytes: int) -> bytearray:
         while chunk := file.read(CHUNK):
             raw += chunk
             if len(raw) > limit:
-                raise DataError(f"{path} unpacks to more than {limit:,} bytes from {packed:,}")
+                raise UnreadableFile(f"unpacks to more than {limit:,} bytes from {packed:,}", str(path))
     return raw
 
 

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from PIL import Image, ImageFile
 from torch import Tensor
 
+from completesplat.data.checks import BadPicture, require_file
 from completesplat.data.exif import ORIENTATION, TRANSPOSITIONS, read_exif
-from completesplat.errors import DataError, ImageError
+from completesplat.errors import ImageError
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
 MOST_PIXELS = 50_000_000
@@ -30,7 +31,7 @@ LARGEST_SCALE = 2.0**112  # times the largest float16 it is still a float32
 
 def decode(
     source: Path | bytes,
-    name: str,
+    file: str,
     mode: Literal["RGB", "L"],
     image_size: tuple[int, int] | None = None,
     most_pixels: int = MOST_PIXELS,
@@ -46,15 +47,18 @@ def decode(
 
     Args:
         source: the file, or its content.
-        name: how messages call it.
+        file: what refusals name.
         image_size: (height, width) that the upright picture must have, if that is known.
         most_pixels: checked before anything is decoded.
         most_bytes: checked before a file is read.
 
     Raises:
-        DataError: no such file, too large, damaged, in another format than JPEG, PNG, WebP, TIFF and BMP, of another
-            size than annotated, or with pixels that have no plain meaning in this mode.
+        MissingFile: no such file.
+        BadPicture: too large, damaged, in another format than JPEG, PNG, WebP, TIFF and BMP, of another size than
+            annotated, or with pixels that have no plain meaning in this mode.
     """
+    if isinstance(source, Path):
+        require_file(source)
     try:
         with damage_refused(FORMATS, most_pixels):
             picture, exif = _load(_content(source, most_bytes), FORMATS, most_pixels)
@@ -64,7 +68,7 @@ def decode(
                 _check_annotated_size(image, image_size, orientation)
             return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
     except ImageError as error:
-        raise DataError(f"{name}: {error}") from error.__cause__
+        raise BadPicture(str(error), file) from error.__cause__
 
 
 def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
@@ -73,11 +77,13 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
     0 stands for "unknown", also where the file is not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
 
     Raises:
-        DataError: no readable 16-bit PNG, a factor that is not positive and finite, negative depths, no finite depth
+        MissingFile: no such file.
+        BadPicture: no readable 16-bit PNG, a factor that is not positive and finite, negative depths, no finite depth
             at all, or nothing but subnormal numbers, which is what integer depths below 1024 look like.
     """
     if not 0 < scale_adjustment < LARGEST_SCALE:
-        raise DataError(f"{path}: the depth's scale adjustment must be positive and finite, not {scale_adjustment}")
+        raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
+    require_file(path)
     try:
         with damage_refused(("PNG",), MOST_PIXELS):
             picture, _ = _load(_content(path, MOST_BYTES), ("PNG",), MOST_PIXELS)
@@ -85,16 +91,16 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
                 raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
             bits = np.asarray(picture).astype(np.uint16)
     except ImageError as error:
-        raise DataError(f"{path}: {error}") from error.__cause__
+        raise BadPicture(str(error), str(path)) from error.__cause__
     depth = bits.view(np.float16).astype(np.float32)
     finite = np.isfinite(depth)
     if not finite.any():
-        raise DataError(f"{path}: no finite depth in it")
+        raise BadPicture("no finite depth in it", str(path))
     depth[~finite] = 0
     if depth.min() < 0:
-        raise DataError(f"{path}: negative depths; its bits are no float16")
+        raise BadPicture("negative depths; its bits are no float16", str(path))
     if 0 < depth.max() < SMALLEST_NORMAL:
-        raise DataError(f"{path}: its values are integers, where the bits of float16 are expected")
+        raise BadPicture("its values are integers, where the bits of float16 are expected", str(path))
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 

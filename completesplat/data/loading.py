@@ -1,23 +1,154 @@
-"""How scenes are loaded, whatever data set they come from."""
+"""Batches of scenes: in which order, by how many processes, from where after an interruption, and what was left out."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Sampler
 
+from completesplat.data.scenes import EvaluationScenes, TrainingScenes, collate
+from completesplat.data.view_selection import draws
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
-from completesplat.tensors import stack
+
+ON_BAD = ("skip", "raise")
+
+logger = logging.getLogger(__name__)
 
 
-def scene_loader(
-    scenes: Dataset[SceneBatch], batch_size: int, sampler: Sampler | None, workers: int
-) -> DataLoader[SceneBatch]:
-    """Batches of scenes, loaded by so many processes (0: none)."""
-    return DataLoader(
-        scenes,
-        batch_size,
-        sampler=sampler,
-        num_workers=workers,
-        # Workers hold what is cached, so they live on from one epoch to the next.
-        persistent_workers=workers > 0,
-        collate_fn=stack,
-        pin_memory=torch.cuda.is_available(),
-    )
+class EpochSampler(Sampler[tuple[int, int]]):
+    """All items, group by group: groups and the items of each in an order drawn from (seed, epoch), with the epoch.
+
+    Lightning calls `set_epoch` before every epoch, also after a resume. Where several processes train, each has its
+    own items, equally many (the last few may be left out).
+
+    Args:
+        groups: items that are best loaded one after the other.
+    """
+
+    def __init__(self, groups: Sequence[Sequence[int]], seed: int) -> None:
+        self.groups = groups
+        self.seed = seed
+        self.epoch = 0
+        self.start = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """The epoch of the iterations that start from now on."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return sum(map(len, self.groups)) // _processes()[1]
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        # The index behind the last belongs to no item, so the order is independent of what the items draw.
+        rng = draws(self.seed, self.epoch, sum(map(len, self.groups)))
+        order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
+        rank, processes = _processes()
+        own = order[rank::processes][: len(self)]
+        return iter([(self.epoch, int(index)) for index in own[self.start :]])
+
+
+def _processes() -> tuple[int, int]:
+    """This training process's number, and how many there are."""
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    return 0, 1
+
+
+class SceneLoader:
+    """Iterates over batches of scenes, and keeps account of what could not be read.
+
+    It is a loader of its own for Lightning, which restores `state_dict` in the middle of an epoch.
+
+    Args:
+        sampler: the order; None: as they are.
+        workers: processes that load; 0: none.
+        on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
+        most_bad: skipping more than this share of an epoch's items is an error.
+    """
+
+    def __init__(
+        self,
+        scenes: TrainingScenes | EvaluationScenes,
+        batch_size: int,
+        sampler: EpochSampler | None,
+        workers: int,
+        on_bad: str = "skip",
+        most_bad: float = 0.1,
+    ) -> None:
+        if on_bad not in ON_BAD:
+            raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of {', '.join(ON_BAD)}")
+        self.dataset = scenes
+        self.batch_size = batch_size
+        self.sampler = sampler
+        self.on_bad = on_bad
+        self.most_bad = most_bad
+        self.refused: list[DataError] = []
+        self._batches = 0
+        self._resume: dict[str, int] = {}
+        self._loader = DataLoader(
+            scenes,
+            batch_size,
+            sampler=sampler,
+            num_workers=workers,
+            # Workers hold what is cached, so they live on from one epoch to the next.
+            persistent_workers=workers > 0,
+            collate_fn=collate,
+            pin_memory=torch.cuda.is_available(),
+            # Its own, so that the numbers which training draws do not depend on the number of workers.
+            generator=torch.Generator(),
+        )
+
+    def __len__(self) -> int:
+        return len(self._loader)
+
+    def __iter__(self) -> Iterator[SceneBatch]:
+        """The batches of an epoch, or the rest of it after `load_state_dict`.
+
+        Raises:
+            DataError: something cannot be read and is not to be skipped, or too much cannot be read.
+        """
+        self.refused, resume, self._resume = [], self._resume, {}
+        self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
+        if self.sampler is not None:
+            self.sampler.start = self._batches * self.batch_size
+        for scenes, refused in self._loader:
+            self._batches += 1
+            self._account(refused, scenes is None)
+            if scenes is not None:
+                yield scenes
+        self._report()
+
+    @property
+    def _epoch(self) -> int:
+        return self.sampler.epoch if self.sampler is not None else 0
+
+    def state_dict(self) -> dict[str, int]:
+        """Which epoch it is, and how many batches of it were given out."""
+        return {"epoch": self._epoch, "batches": self._batches}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Start the next iteration after so many batches, if it is still that epoch."""
+        self._resume = dict(state)
+
+    def _account(self, refused: Sequence[DataError], empty: bool) -> None:
+        if refused and self.on_bad == "raise":
+            raise refused[0]
+        self.refused += refused
+        too_many = len(self.refused) > max(1, self.most_bad * len(self.dataset))
+        if too_many or (empty and self.sampler is not None):
+            raise DataError(
+                f"{len(self.refused)} of {len(self.dataset)} items cannot be read, more than data.most_bad="
+                f"{self.most_bad:g} allows; see `completesplat data check`; the last one: {self.refused[-1]}"
+            )
+
+    def _report(self) -> None:
+        if self.refused:
+            kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(e.kind for e in self.refused).most_common())
+            logger.warning(
+                "skipped %d of %d items (%s); the first: %s",
+                *(len(self.refused), len(self.dataset), kinds, self.refused[0]),
+            )

@@ -4,8 +4,10 @@ A chunk is a list of clips as dictionaries: key, url, timestamps int64 [view], c
 of JPEG files as uint8 tensors) (`real_estate_10k_tools`, `src/convert.py`). Chunks are read without running code.
 """
 
-import io
+import hashlib
+import json
 import zipfile
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.data.checks import inside, read_json, require_file
+from completesplat.data.checks import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.data.images import decode
 from completesplat.data.realestate10k_clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
 from completesplat.data.transforms import Square, cut_square
@@ -30,24 +32,31 @@ class ChunkedClips:
 
     Attributes:
         keys: names of the clips, in the order of their files.
-        missing: how many clips lie in a chunk that is not there.
+        missing: the clips of chunks that are not there.
+        refused: entries of the index that lead elsewhere.
 
     Raises:
-        DataError: the index is missing or malformed, or leads elsewhere.
+        DataError: the index is missing or no table.
     """
 
     def __init__(self, folder: Path) -> None:
         path = folder / "index.json"
         index = read_json(path)
         if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
-            raise DataError(f"{path} is not a table of keys and files")
-        there = {name: inside(folder, name).is_file() for name in set(index.values())}
-        self._files = {key: folder / name for key, name in index.items() if there[name]}
+            raise BadAnnotation("not a table of keys and files", str(path))
+        self.refused: list[DataError] = []
+        paths: dict[str, Path] = {}
+        for key, name in index.items():
+            with refused_to(self.refused.append), at(path, key):
+                paths[key] = inside(folder, name)
+        there = {path for path in set(paths.values()) if path.is_file()}
+        self.folder = folder
+        self._files = {key: path for key, path in paths.items() if path in there}
         self.keys = sorted(self._files, key=lambda key: (self._files[key], key))
-        self.missing = len(index) - len(self.keys)
+        self.missing = sorted(paths.keys() - self._files.keys())
         self._loaded: dict[Path, Chunk] = {}
 
-    def chunks(self, keys: list[str]) -> list[list[int]]:
+    def chunks(self, keys: Sequence[str]) -> list[list[int]]:
         """Numbers of the clips that lie in one file, for all files."""
         members: dict[Path, list[int]] = {}
         for number, key in enumerate(keys):
@@ -63,8 +72,15 @@ class ChunkedClips:
         path = self._files[key]
         chunk = self._chunk(path)
         if key not in chunk:
-            raise DataError(f"{path} does not hold clip {key}, which index.json says it does")
-        return _clip_from_entry(path, key, chunk[key])
+            raise BadAnnotation("the chunk does not hold this clip, which index.json says it does", str(path), key)
+        with at(path, key):
+            return _clip_from_entry(path, key, chunk[key])
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the index and of the chunks' sizes."""
+        sizes = sorted((path.name, path.stat().st_size) for path in set(self._files.values()))
+        index = {key: path.name for key, path in sorted(self._files.items())}
+        return hashlib.sha256(json.dumps([index, sizes]).encode()).hexdigest()
 
     def _chunk(self, path: Path) -> Chunk:
         chunk = self._loaded.pop(path, None)
@@ -81,40 +97,40 @@ def read_chunk(path: Path) -> Chunk:
     """The clips of a file by key, as they are stored.
 
     Raises:
-        DataError: no chunk, one that is damaged or would run code, one that is much larger than its file, or clips with
-            the same key.
+        MissingFile: no such file.
+        UnreadableFile: no chunk, one that is damaged or would run code, or one that is much larger than its file.
+        BadAnnotation: not a list of clips, or clips with the same key.
     """
+    require_file(path)
     try:
-        with zipfile.ZipFile(require_file(path)) as archive:
+        with zipfile.ZipFile(path) as archive:
             size = sum(record.file_size for record in archive.infolist())
         # torch.save compresses nothing, so a chunk that says it is larger than its file was made to fill the memory.
         content = torch.load(path, map_location="cpu", weights_only=True) if size <= path.stat().st_size else None
-    except DataError:
-        raise
     except Exception as error:  # the unpickler's refusals have no common class
-        raise DataError(f"{path} is not a chunk that can be read safely ({type(error).__name__})") from None
+        raise UnreadableFile(f"not a chunk that can be read safely ({type(error).__name__})", str(path)) from None
     if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
-        raise DataError(f"{path} is not a list of clips with keys")
+        raise BadAnnotation("not a list of clips with keys", str(path))
     chunk = {entry["key"]: entry for entry in content}
     if len(chunk) < len(content):
-        raise DataError(f"{path} holds several clips with the same key")
+        raise BadAnnotation("several clips with the same key", str(path))
     return chunk
 
 
 def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
-    where = f"{path}, clip {key}"
     images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
     if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
-        raise DataError(f"{where}: images are not a list of JPEG files (uint8)")
+        raise BadAnnotation("images are not a list of JPEG files (uint8)")
     if not isinstance(rows, Tensor) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):
-        raise DataError(f"{where}: cameras are not {CAMERA_NUMBERS} columns of floats")
+        raise BadAnnotation(f"cameras are not {CAMERA_NUMBERS} columns of floats")
     if not isinstance(times, Tensor) or times.dtype != torch.int64 or times.ndim != 1:
-        raise DataError(f"{where}: timestamps are not int64")
+        raise BadAnnotation("timestamps are not int64")
     if not len(images) == len(rows) == len(times):
-        raise DataError(f"{where}: {len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
-    size = picture_size(io.BytesIO(images[0].numpy().tobytes()), f"{where}, frame 0") if images else (1, 1)
+        raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
+    with at(frame=0):
+        size = picture_size(images[0].numpy().tobytes(), str(path)) if images else (1, 1)
     timestamps = tuple(times.tolist())
-    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size, where), partial(_read, images, size, where))
+    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), partial(_read, images, size, str(path)))
 
 
 def _is_bytes(image: Any) -> bool:
@@ -122,7 +138,6 @@ def _is_bytes(image: Any) -> bool:
 
 
 def _read(
-    images: list[Tensor], image_size: tuple[int, int], where: str, frame: int, square: Square, size: int
+    images: list[Tensor], image_size: tuple[int, int], file: str, frame: int, square: Square, size: int
 ) -> UInt8[Tensor, "3 size size"]:
-    image = decode(images[frame].numpy().tobytes(), f"{where}, frame {frame}", "RGB", image_size)
-    return cut_square(image, square, size)
+    return cut_square(decode(images[frame].numpy().tobytes(), file, "RGB", image_size), square, size)

@@ -15,13 +15,12 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
+from completesplat.data.checks import ROTATION_TOLERANCE, BadAnnotation, BadCamera, BadPicture, TooFewFrames
+from completesplat.data.images import MOST_PIXELS
 from completesplat.data.transforms import Square
-from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
 CAMERA_NUMBERS = 18
-RIGID_TOLERANCE = 1e-3
-MOST_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -42,30 +41,27 @@ class Clip:
     read: Callable[[int, Square, int], UInt8[Tensor, "3 size size"]]
 
 
-def clip_cameras(
-    rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int], where: str
-) -> Cameras:
+def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int]) -> Cameras:
     """Cameras [view] (float64) for pictures of (height, width), from rows as they are stored.
 
-    Args:
-        where: file and clip, for the refusals.
-
     Raises:
-        DataError: fewer than two frames, timestamps that repeat, numbers that are not finite, no positive focal length,
-            lens distortion, or a pose that is no rotation and translation.
+        TooFewFrames: fewer than two.
+        BadAnnotation: timestamps that repeat, or numbers that are not finite.
+        BadCamera: no positive focal length, lens distortion, or a pose that is no rotation and translation.
     """
     if len(rows) < 2:
-        raise DataError(f"{where}: {len(rows)} frames, at least two are needed")
+        raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
     count = Counter(timestamps)
-    _refuse([f for f, time in enumerate(timestamps) if count[time] > 1], where, "another frame has its timestamp")
+    repeated = [f for f, time in enumerate(timestamps) if count[time] > 1]
+    _refuse(repeated, BadAnnotation, "another frame has its timestamp")
     rows = rows.double()
     rotation = rows[:, 6:].unflatten(1, (3, 4))[:, :, :3]
     deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
-    rigid = (deviation <= RIGID_TOLERANCE) & (torch.linalg.det(rotation) > 0)
-    _refuse(_frames(~rows.isfinite().all(dim=1)), where, "camera with numbers that are not finite")
-    _refuse(_frames((rows[:, :2] <= 0).any(dim=1)), where, "focal length is not positive")
-    _refuse(_frames((rows[:, 4:6] != 0).any(dim=1)), where, "lens distortion is not supported")
-    _refuse(_frames(~rigid), where, "pose is not a rotation and translation")
+    rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
+    _refuse(_frames(~rows.isfinite().all(dim=1)), BadAnnotation, "camera with numbers that are not finite")
+    _refuse(_frames((rows[:, :2] <= 0).any(dim=1)), BadCamera, "focal length is not positive")
+    _refuse(_frames((rows[:, 4:6] != 0).any(dim=1)), BadCamera, "lens distortion is not supported")
+    _refuse(_frames(~rigid), BadCamera, "pose is not a rotation and translation")
     height, width = image_size
     intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
     intrinsics[:, 0, 0], intrinsics[:, 1, 1] = rows[:, 0] * width, rows[:, 1] * height
@@ -78,22 +74,26 @@ def _frames(bad: Tensor) -> list[int]:
     return bad.nonzero().flatten().tolist()
 
 
-def _refuse(frames: list[int], where: str, reason: str) -> None:
+def _refuse(frames: list[int], kind: type[BadAnnotation | BadCamera], reason: str) -> None:
     if frames:
-        raise DataError(f"{where}, frame {frames[0]}: {reason}")
+        raise kind(reason, frame=frames[0])
 
 
-def picture_size(file: Path | BytesIO, where: str) -> tuple[int, int]:
+def picture_size(source: Path | bytes, file: str) -> tuple[int, int]:
     """(height, width) of an image file, from its header.
 
+    Args:
+        source: the file, or its content.
+        file: what refusals name.
+
     Raises:
-        DataError: no JPEG or PNG image, or one of more than 50 million pixels.
+        BadPicture: no JPEG or PNG image, or one of more than 50 million pixels.
     """
     try:
-        with Image.open(file, formats=("JPEG", "PNG")) as image:
+        with Image.open(BytesIO(source) if isinstance(source, bytes) else source, formats=("JPEG", "PNG")) as image:
             width, height = image.size
     except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"{where}: not a readable image ({type(error).__name__})") from None
+        raise BadPicture(f"not a readable image ({type(error).__name__})", file) from None
     if width * height > MOST_PIXELS:
-        raise DataError(f"{where}: a picture of {width} x {height} pixels is too large")
+        raise BadPicture(f"{width} x {height} are more than {MOST_PIXELS:,} pixels", file)
     return height, width

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from completesplat.data.checks import read_json, require_file
-from completesplat.errors import DataError
+from completesplat.data.checks import BadAnnotation, UnreadableFile, read_json, require_file
 
 
 class ChosenClips(NamedTuple):
@@ -38,7 +37,7 @@ def choose_clips(keys: list[str], evaluation_index: Path | None, scene_list: Pat
     if evaluation_index is not None:
         index = read_json(evaluation_index)
         if not isinstance(index, dict):
-            raise DataError(f"{evaluation_index} is not a table of clips")
+            raise BadAnnotation("not a table of clips", str(evaluation_index))
         views = {key: _views(evaluation_index, key, entry) for key, entry in index.items() if entry is not None}
         left_out["null in the index"] = len(index) - len(views)
         left_out["in the index, not in the data"] = len(views.keys() - there)
@@ -56,7 +55,7 @@ def _views(path: Path, key: str, entry: Any) -> tuple[int, list[int]]:
     views: list[Any] = [entry.get(role) for role in ("context", "target")] if isinstance(entry, dict) else [None]
     for frames in views:
         if not isinstance(frames, list) or not frames or not all(type(f) is int and f >= 0 for f in frames):
-            raise DataError(f"{path}, clip {key}: context and target must be lists of frame numbers")
+            raise BadAnnotation("context and target must be lists of frame numbers", str(path), key)
     context, targets = views
     return context[0], targets
 
@@ -65,4 +64,4 @@ def _lines(path: Path) -> list[str]:
     try:
         return require_file(path).read_text(encoding="utf-8").split()
     except UnicodeDecodeError:
-        raise DataError(f"{path} is not a text file") from None
+        raise UnreadableFile("not a text file", str(path)) from None

@@ -3,7 +3,10 @@
 Line 0 of a text is the video's address; every other line is a timestamp in microseconds and a camera's 18 numbers.
 """
 
+import hashlib
+import json
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.data.checks import require_file
+from completesplat.data.checks import BadAnnotation, MissingFile, UnreadableFile, at, require_file
 from completesplat.data.realestate10k_clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
 from completesplat.data.transforms import Square, read_square
 from completesplat.errors import DataError
@@ -24,7 +27,8 @@ class TextClips:
 
     Attributes:
         keys: names of the clips, sorted.
-        missing: how many clips have no folder of frames.
+        missing: the clips without a folder of frames.
+        refused: nothing, as clips are looked at when they are read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -33,9 +37,10 @@ class TextClips:
             folders = {entry.name: entry.is_dir() for entry in entries}
         texts = sorted(name.removesuffix(".txt") for name in folders if name.endswith(".txt"))
         self.keys = [key for key in texts if folders.get(key)]
-        self.missing = len(texts) - len(self.keys)
+        self.missing = [key for key in texts if not folders.get(key)]
+        self.refused: list[DataError] = []
 
-    def chunks(self, keys: list[str]) -> list[list[int]]:
+    def chunks(self, keys: Sequence[str]) -> list[list[int]]:
         """Numbers of the clips that are best read together: clips are files of their own, so any will do."""
         return [list(range(len(keys)))]
 
@@ -46,35 +51,42 @@ class TextClips:
             DataError: it is malformed, or a frame is missing.
         """
         path = self.folder / f"{key}.txt"
-        where = f"{path}, clip {key}"
-        timestamps, rows = _read_text(path, where)
-        pictures = _pictures(self.folder / key)
-        for frame, time in enumerate(timestamps):
-            if time not in pictures:
-                raise DataError(f"{where}, frame {frame}: no picture {self.folder / key / f'{time}.jpg'}")
-        paths = [pictures[time] for time in timestamps]
-        size = picture_size(paths[0], f"{where}, frame 0 ({paths[0].name})") if paths else (1, 1)
-        cameras = clip_cameras(
-            torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS), timestamps, size, where
-        )
-        return Clip(key, path, timestamps, cameras, partial(_read, paths, size))
+        with at(path, key):
+            timestamps, rows = _read_text(path)
+            pictures = _pictures(self.folder / key)
+            for frame, time in enumerate(timestamps):
+                if time not in pictures:
+                    raise MissingFile(
+                        "no picture with this timestamp", str(self.folder / key / f"{time}.jpg"), key, frame
+                    )
+            paths = [pictures[time] for time in timestamps]
+            with at(frame=0):
+                size = picture_size(paths[0], str(paths[0])) if paths else (1, 1)
+            numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
+            return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the texts' names and sizes (there are tens of thousands)."""
+        sizes = [(key, (self.folder / f"{key}.txt").stat().st_size) for key in self.keys]
+        return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
 
 
-def _read_text(path: Path, where: str) -> tuple[tuple[int, ...], list[list[float]]]:
+def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     """Timestamps and camera rows."""
     timestamps, rows = [], []
     try:
         lines = require_file(path).read_text(encoding="utf-8").splitlines()[1:]
     except UnicodeDecodeError:
-        raise DataError(f"{where}: not a text file") from None
+        raise UnreadableFile("not a text file") from None
     for frame, columns in enumerate(line.split() for line in lines if line.strip()):
-        if len(columns) != 1 + CAMERA_NUMBERS:
-            raise DataError(f"{where}, frame {frame}: {len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
-        try:
-            timestamps.append(int(columns[0]))
-            rows.append([float(column) for column in columns[1:]])
-        except ValueError as error:
-            raise DataError(f"{where}, frame {frame}: {error}") from None
+        with at(frame=frame):
+            if len(columns) != 1 + CAMERA_NUMBERS:
+                raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
+            try:
+                timestamps.append(int(columns[0]))
+                rows.append([float(column) for column in columns[1:]])
+            except ValueError as error:
+                raise BadAnnotation(str(error)) from None
     return tuple(timestamps), rows
 
 

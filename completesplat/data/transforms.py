@@ -9,8 +9,8 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from completesplat.data.checks import BadCamera
 from completesplat.data.images import decode
-from completesplat.errors import DataError
 
 
 class Square(NamedTuple):
@@ -27,12 +27,12 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
     Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`).
 
     Raises:
-        DataError: the principal point is not inside the image.
+        BadCamera: the principal point is not inside the image.
     """
     (x, y), (height, width) = center, image_size
     half = min(x, y, width - x, height - y)
     if not half > 0:
-        raise DataError(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
+        raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
     return Square(x - half, y - half, 2 * half)
 
 
@@ -46,7 +46,8 @@ def read_square(
         mode: "RGB" (resized with Lanczos' filter) or "L" (bilinearly, for masks).
 
     Raises:
-        DataError: a file that `decode` refuses, as missing, damaged or of another size, for instance.
+        MissingFile: no such file.
+        BadPicture: a file that `decode` refuses, as damaged or of another size, for instance.
     """
     return cut_square(decode(path, str(path), mode, image_size), square, size)
 

@@ -117,6 +117,18 @@ def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: in
     return Cameras(cameras.world_to_camera, intrinsics, (size, size))
 
 
+def mirror(cameras: Cameras) -> Cameras:
+    """Cameras of the horizontally mirrored pictures, in the world that is mirrored at its plane x = 0.
+
+    With M = diag(-1, 1, 1, 1), `world_to_camera` becomes M W M, a rotation and translation again: what was seen at
+    (u, v) is seen at (width - u, v), at the same depth.
+    """
+    signs = cameras.world_to_camera.new_tensor([-1, 1, 1, 1])
+    intrinsics = cameras.intrinsics.clone()
+    intrinsics[..., 0, 2] = cameras.image_size[1] - intrinsics[..., 0, 2]
+    return Cameras(cameras.world_to_camera * signs[:, None] * signs, intrinsics, cameras.image_size)
+
+
 def look_at(
     eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:

@@ -68,7 +68,7 @@ class LatentDiffusion(SceneModule):
         parts = self.completesplat
         images = scenes.reference.images
         latent = parts.encode(images).latent
-        conditioning = parts.conditioning(images)
+        conditioning = parts.conditioning(images * scenes.visible)
         kept = torch.rand(len(images), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * kept[:, None, None, None]
         noise = torch.randn_like(latent)

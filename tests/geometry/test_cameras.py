@@ -12,6 +12,7 @@ from completesplat.geometry.cameras import (
     crop_resize,
     invert_rigid,
     look_at,
+    mirror,
     pinhole,
     pixel_centers,
     pixel_rays,
@@ -154,6 +155,27 @@ def test_cropping_moves_and_scales_every_projection(left: float, top: float, sid
     torch.testing.assert_close(after, (before - corner) * size / side, atol=1e-6, rtol=1e-9)
     torch.testing.assert_close(depth_after, depth)
     assert cropped.image_size == (size, size)
+
+
+def test_a_mirrored_camera_sees_the_mirrored_point_mirrored() -> None:
+    cameras, points = random_cameras(2, 3), rand(2, 3, 40, 3, low=-2, high=2)
+    pixels, depth = project(cameras, points)
+    mirrored = mirror(cameras)
+    mirrored_pixels, mirrored_depth = project(mirrored, points * torch.tensor([-1, 1, 1]))
+    expected = torch.stack([64 - pixels[..., 0], pixels[..., 1]], dim=-1)
+    torch.testing.assert_close(mirrored_pixels, expected, atol=1e-6, rtol=1e-9)
+    torch.testing.assert_close(mirrored_depth, depth)
+    assert mirrored.image_size == cameras.image_size
+    rotation = mirrored.world_to_camera[..., :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64).expand(2, 3, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(2, 3, dtype=torch.float64))
+
+
+def test_mirroring_cameras_twice_changes_nothing() -> None:
+    cameras = random_cameras(5)
+    twice = mirror(mirror(cameras))
+    assert torch.equal(twice.world_to_camera, cameras.world_to_camera)
+    torch.testing.assert_close(twice.intrinsics, cameras.intrinsics)
 
 
 @pytest.mark.parametrize(("degrees", "tangent"), [(90.0, 1.0), (60.0, 1 / math.sqrt(3)), (45.0, math.sqrt(2) - 1)])

@@ -16,7 +16,8 @@ def scenes(batch: int, targets: int) -> SceneBatch:
         return Views(torch.full((*axes, 3, 16, 16), 0.5), cameras, mask)
 
     names = tuple(f"scene {i}" for i in range(batch))
-    return SceneBatch(views(batch), views(batch, targets), torch.tensor([[1.0, 2.0]]).expand(batch, 2), names)
+    depth_range, visible = torch.tensor([[1.0, 2.0]]).expand(batch, 2), torch.ones(batch, 1, 16, 16)
+    return SceneBatch(views(batch), views(batch, targets), depth_range, visible, names)
 
 
 def test_views_are_averaged_within_scenes_before_scenes_are():

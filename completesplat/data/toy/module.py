@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.prepared.manifest import is_prepared
 from completesplat.data.realestate10k import RE10KDataModule
 from completesplat.data.toy.objects import CATEGORY, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
@@ -28,7 +29,7 @@ class ToyObjectsDataModule(CO3DDataModule):
 
     def prepare_data(self) -> None:
         """Write the scenes unless a complete set is there (its description is written last)."""
-        if not (Path(self.root) / CATEGORY / "toy.json").is_file():
+        if not is_prepared(self.root) and not (self.root / CATEGORY / "toy.json").is_file():
             write_objects(self.root, self.scenes, self.frames, self.image_size, self.data_seed)
 
 
@@ -54,11 +55,12 @@ class ToyRoomsDataModule(RE10KDataModule):
         data_seed: int = 0,
         **reading: Any,
     ) -> None:
-        super().__init__(str(Path(root) / ROOMS / form), **reading)
-        self.home = Path(root)
+        home = Path(root)
+        super().__init__(str(home if is_prepared(home) else home / ROOMS / form), **reading)
+        self.home = home
         self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
 
     def prepare_data(self) -> None:
         """Write the rooms unless a complete set is there (its description is written last)."""
-        if not (self.home / ROOMS / "toy.json").is_file():
+        if not is_prepared(self.home) and not (self.home / ROOMS / "toy.json").is_file():
             write_rooms(self.home, **self.making)

@@ -134,4 +134,5 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     images = torch.rand(batch, 1 + targets, 3, size, size, generator=generator)
     views = Views(images, cameras, torch.ones_like(images[:, :, :1]))
     depth_range = torch.tensor([0.5 * DISTANCE, 2 * DISTANCE]).expand(batch, 2)
-    return SceneBatch(views[:, 0], views[:, 1:], depth_range, tuple("synthetic" for _ in range(batch)))
+    names = tuple("synthetic" for _ in range(batch))
+    return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], names)

@@ -1,0 +1,125 @@
+"""Captures as a COLMAP model (sparse reconstruction) with its pictures."""
+
+import struct
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from completesplat.data.checks import BadCamera, MissingFile, UnreadableFile, at, finite_array, inside, require_file
+from completesplat.data.importing.capture import Capture, CapturedFrame, Lens, check_lens, in_order, make_cloud
+from completesplat.errors import CompleteSplatError
+
+# Number of parameters by the id that binary models use (colmap, `src/colmap/sensor/models.h`); other ids are refused.
+PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
+
+
+def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture:
+    """Read a model, binary or text, of registered pictures.
+
+    COLMAP's poses are world-to-camera with OpenCV's axes, and the centre of the first pixel is (0.5, 0.5)
+    (colmap.github.io/format.html): both are this package's own conventions. A picture's mask has its name with `.png`
+    behind it, or in place of its suffix; it is the foreground.
+
+    Args:
+        model: folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`.
+        images: folder that the pictures' names are relative to.
+
+    Raises:
+        CompleteSplatError: pycolmap is not installed.
+        DataError: whatever is missing, damaged or impossible, with the file and COLMAP's number of the picture.
+    """
+    pycolmap = _require_pycolmap()
+    for folder in (model, images, masks):
+        if folder is not None and not folder.is_dir():
+            raise MissingFile("no such folder", str(folder))
+    _check_complete(model)
+    try:
+        reconstruction = pycolmap.Reconstruction(str(model))
+    except Exception as error:  # Among them are ValueError, IndexError and RuntimeError.
+        raise UnreadableFile(f"not a COLMAP model ({' '.join(str(error).split())})", str(model)) from None
+    frames = []
+    with at(model):
+        for number in reconstruction.reg_image_ids():
+            with at(frame=number):
+                frames.append(_read_frame(reconstruction, number, images, masks))
+        ordered = in_order(frames)
+    points = list(reconstruction.points3D.values())
+    positions, colors = [point.xyz for point in points], [point.color for point in points]
+    return Capture(images.resolve().parent.name, model, ordered, make_cloud(positions, colors, model))
+
+
+def _require_pycolmap() -> ModuleType:
+    try:
+        import pycolmap
+    except ImportError:
+        raise CompleteSplatError("COLMAP models need pycolmap: pip install completesplat[colmap]") from None
+    return pycolmap
+
+
+def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | None) -> CapturedFrame:
+    image = reconstruction.images[number]
+    path = require_file(inside(images, image.name))
+    mask = None if masks is None else _find_mask(masks, image.name)
+    pose = np.eye(4)
+    pose[:3] = finite_array(image.cam_from_world().matrix(), (3, 4), "the pose")
+    return CapturedFrame(number, path, mask, _lens_of(reconstruction.cameras[image.camera_id]), pose)
+
+
+def _find_mask(masks: Path, name: str) -> Path:
+    candidates = [inside(masks, f"{name}.png"), inside(masks, str(Path(name).with_suffix(".png")))]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise MissingFile(f"no such file, nor {candidates[1].name}", str(candidates[0]))
+
+
+def _lens_of(camera: Any) -> Lens:
+    """Parameters in the order of colmap.github.io/cameras.html."""
+    name, size = camera.model_name, (camera.height, camera.width)
+    values = [float(value) for value in camera.params]
+    match name, values:
+        case "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", [f, cx, cy, *radial]:
+            k1, k2 = [*radial, 0.0, 0.0][:2]
+            return check_lens(Lens((f, f), (cx, cy), size, (k1, k2, 0.0, 0.0, 0.0)))
+        case "PINHOLE", [fx, fy, cx, cy]:
+            return check_lens(Lens((fx, fy), (cx, cy), size))
+        case "OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2]:
+            return check_lens(Lens((fx, fy), (cx, cy), size, (k1, k2, p1, p2, 0.0)))
+    raise BadCamera(f"camera model {name} is not supported; undistort the pictures with COLMAP's image_undistorter")
+
+
+def _check_complete(model: Path) -> None:
+    """Walk through the binary files: of cut ones pycolmap takes what is not there for numbers, or reads forever."""
+    for name, skip in (("cameras", _after_camera), ("images", _after_image), ("points3D", _after_point)):
+        path = model / f"{name}.bin"
+        if not path.is_file():
+            continue
+        content = path.read_bytes()
+        try:
+            (count,), offset = struct.unpack_from("<Q", content), 8
+            for _ in range(count):
+                offset = skip(content, offset)
+        except (struct.error, ValueError):
+            offset = -1
+        if offset != len(content):
+            raise UnreadableFile("cut off, or not COLMAP's", str(path))
+
+
+def _after_camera(content: bytes, offset: int) -> int:
+    _, model, _, _ = struct.unpack_from("<IiQQ", content, offset)
+    if model not in PARAMETERS:
+        raise BadCamera(f"COLMAP's camera model number {model} is not supported; undistort with its image_undistorter")
+    return offset + 24 + 8 * PARAMETERS[model]
+
+
+def _after_image(content: bytes, offset: int) -> int:
+    end_of_name = content.index(b"\0", offset + 64)  # after id, pose and camera
+    (points,) = struct.unpack_from("<Q", content, end_of_name + 1)
+    return end_of_name + 9 + 24 * points
+
+
+def _after_point(content: bytes, offset: int) -> int:
+    (track,) = struct.unpack_from("<Q", content, offset + 43)  # after id, place, colour and error
+    return offset + 51 + 8 * track

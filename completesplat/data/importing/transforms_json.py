@@ -1,0 +1,162 @@
+"""Captures as a `transforms.json` with pictures: the format of NeRF, instant-ngp and nerfstudio."""
+
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from plyfile import PlyData
+
+from completesplat.data.checks import (
+    BadAnnotation,
+    BadCamera,
+    MissingFile,
+    UnreadableFile,
+    at,
+    field,
+    finite_array,
+    inside,
+    read_json,
+    require_file,
+    require_rotation,
+)
+from completesplat.data.importing.capture import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    PointCloud,
+    check_lens,
+    in_order,
+    make_cloud,
+)
+from completesplat.data.importing.pictures import picture_size
+from completesplat.errors import DataError
+
+# Which coefficients a model has, of OpenCV's; `k4` means other things in other programs.
+COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+USED = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": COEFFICIENTS,
+}
+OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
+SCALE_TOLERANCE = 1e-3
+
+
+def read_transforms(path: Path) -> Capture:
+    """Read `transforms.json`; what one frame says goes before what the file says for all.
+
+    `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
+    conventions"). Intrinsics are `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or NeRF's `camera_angle_x`; sizes that are
+    missing are the picture's, a missing principal point is its centre, a missing `fl_y` is `fl_x`. `cx` and `cy` count
+    from the corner of the first pixel, as COLMAP's do, from which they are made (nerfstudio,
+    `process_data/colmap_utils.py`). `mask_path` is the foreground. `ply_file_path` is in the world of the poses
+    (`create_ply_from_colmap`, ibid.). Paths are relative to the file's folder and stay in it.
+
+    Raises:
+        DataError: whatever is missing, malformed or impossible, with the file and the number of the frame in it.
+    """
+    content = read_json(path, allow_nan=True)  # NaN is refused where it stands, by frame.
+    root = path.parent
+    with at(path):
+        entries = field(content, "frames", list)
+        frames = []
+        for number, entry in enumerate(entries):
+            with at(frame=number):
+                frames.append(_read_frame(root, number, content, entry))
+        ordered = in_order(frames)
+        cloud = None if content.get("ply_file_path") is None else field(content, "ply_file_path", str)
+        points = None if cloud is None else _read_cloud(inside(root, cloud))
+    return Capture(path.resolve().parent.name, path, ordered, points)
+
+
+def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any) -> CapturedFrame:
+    image = _find_picture(root, field(entry, "file_path", str))
+    mask = None if entry.get("mask_path") is None else require_file(inside(root, field(entry, "mask_path", str)))
+    lens = _read_lens({**content, **entry}, image)
+    return CapturedFrame(number, image, mask, lens, _read_pose(entry.get("transform_matrix")))
+
+
+def _find_picture(root: Path, name: str) -> Path:
+    for suffix in SUFFIXES:
+        path = inside(root, name + suffix)
+        if path.is_file():
+            return path
+    raise MissingFile("no such file, with or without .png and .jpg", str(inside(root, name)))
+
+
+def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
+    """`world_to_camera` with OpenCV's axes."""
+    pose = finite_array(matrix, (4, 4), "transform_matrix")
+    if not np.allclose(pose[3], [0, 0, 0, 1]):
+        raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")
+    lengths = np.linalg.norm(pose[:3, :3], axis=0)
+    if np.ptp(lengths) < SCALE_TOLERANCE < abs(lengths[0] - 1):
+        raise BadCamera(f"transform_matrix scales by {lengths[0]:g}; a pose is a rotation and a translation")
+    require_rotation(pose[:3, :3], "the rotation of transform_matrix")
+    pose[:3, 1:3] *= -1
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = pose[:3, :3].T
+    world_to_camera[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return world_to_camera
+
+
+def _read_lens(values: dict[str, Any], image: Path) -> Lens:
+    model = values.get("camera_model", "OPENCV")
+    others = [key for key in OTHER_LENSES if values.get(key)]
+    if model not in USED or others:
+        raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
+    number = partial(_number, values)
+    stored = None if {"w", "h"} <= values.keys() else picture_size(image)
+    height, width = stored or (_whole(values, "h"), _whole(values, "w"))
+    if "fl_x" in values:
+        fx = number("fl_x")
+    elif "camera_angle_x" in values:
+        fx = _focal(number("camera_angle_x"), width)
+    else:
+        raise BadAnnotation("neither fl_x nor camera_angle_x, for the frame or for all")
+    fy = number("fl_y", fx)
+    if "fl_x" not in values and "fl_y" not in values and "camera_angle_y" in values:
+        fy = _focal(number("camera_angle_y"), height)
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        if key not in USED[model] and number(key, 0.0) != 0:
+            raise BadCamera(f"{key} = {values[key]} has no meaning for camera model {model}")
+    k1, k2, p1, p2, k3 = (number(key, 0.0) for key in COEFFICIENTS)
+    center = number("cx", width / 2), number("cy", height / 2)
+    return check_lens(Lens((fx, fy), center, (height, width), (k1, k2, p1, p2, k3)))
+
+
+def _number(values: dict[str, Any], key: str, default: float | None = None) -> float:
+    return default if default is not None and key not in values else float(finite_array(values.get(key), (), key))
+
+
+def _whole(values: dict[str, Any], key: str) -> int:
+    value = _number(values, key)  # instant-ngp writes 1920.0.
+    if value != int(value):
+        raise BadAnnotation(f"{key} must be a whole number, not {value}")
+    return int(value)
+
+
+def _focal(angle: float, side: int) -> float:
+    if not 0 < angle < math.pi:
+        raise BadCamera(f"a field of view of {angle:g} radians")
+    return side / 2 / math.tan(angle / 2)
+
+
+def _read_cloud(path: Path) -> PointCloud | None:
+    try:
+        vertices = PlyData.read(str(require_file(path)))["vertex"]
+        points = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
+        names = [name for name in ("red", "green", "blue") if name in vertices.data.dtype.names]
+        colors = [np.asarray(vertices[name]) for name in names]
+    except DataError:
+        raise
+    except Exception as error:  # The parser raises nearly anything on a damaged file.
+        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
+    usable = len(colors) == 3 and all(color.dtype == np.uint8 for color in colors)
+    return make_cloud(points, np.stack(colors, axis=-1) if usable else np.full(points.shape, 128), path)

@@ -1,0 +1,225 @@
+"""What the data modules of all data sets share: loaders, settings, and means over the training pictures."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lightning import LightningDataModule
+from torch import Tensor
+
+from completesplat.data.augmentation import BoxMasks, ColorJitter, augment
+from completesplat.data.loading import EpochSampler, SceneLoader
+from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
+from completesplat.data.prepared.source import PreparedSource
+from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
+from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.typical_camera import TypicalCamera, typical_camera
+from completesplat.errors import CompleteSplatError, DataError
+
+SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
+# A mean over all of RealEstate10K's 66,033 training clips would take hours.
+SEQUENCES_OF_MEANS, FRAMES_OF_MEANS = 256, 8
+
+logger = logging.getLogger(__name__)
+
+
+class SceneDataModule(LightningDataModule):
+    """Scenes from the sequences of a data set, as it was published or prepared with `completesplat data prepare`.
+
+    What training draws depends on the seed, the epoch and the item only.
+
+    Args:
+        root: folder of the data set, or of its prepared form.
+        image_size: side of the square pictures.
+        batch_size: scenes of a training batch.
+        targets: target views of a training scene (not stated by the paper).
+        evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
+        references_per_sequence: training items of a sequence in one epoch.
+        mask_threshold: masks are cut at this probability; None: they stay soft.
+        color_jitter: settings of `ColorJitter`; None: no augmentation of colours.
+        box_masks: settings of `BoxMasks`; None: the reference pictures are seen completely.
+        mirroring: mirror half of the training scenes horizontally.
+        workers: processes that load data; 0: none.
+        cache: keep decoded pictures in memory.
+        on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
+        most_bad: skipping more than this share of an epoch's items is an error.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        image_size: int = 128,
+        batch_size: int = 8,
+        targets: int = 3,
+        evaluation_batch_size: int = 4,
+        references_per_sequence: int = 1,
+        mask_threshold: float | None = None,
+        color_jitter: Mapping[str, float] | None = None,
+        box_masks: Mapping[str, Any] | None = None,
+        mirroring: bool = False,
+        workers: int = 0,
+        cache: bool = False,
+        on_bad: str = "skip",
+        most_bad: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        if mask_threshold is not None and not 0 < mask_threshold <= 1:
+            raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
+        self.root = Path(root)
+        self.image_size = image_size
+        self.batch_size = batch_size
+        self.targets = targets
+        self.evaluation_batch_size = evaluation_batch_size
+        self.references_per_sequence = references_per_sequence
+        self.mask_threshold = mask_threshold
+        self.augment = partial(
+            augment,
+            color_jitter=None if color_jitter is None else ColorJitter(**color_jitter),
+            box_masks=None if box_masks is None else BoxMasks(**box_masks),
+            mirroring=mirroring,
+        )
+        self.workers = workers
+        self.cache = cache
+        self.policy = on_bad, most_bad
+        self.seed = seed
+        self._sources: dict[str, SequenceSource] = {}
+        self._stores: dict[str, SceneStore] = {}
+
+    @abstractmethod
+    def prepared_settings(self) -> dict[str, Any]:
+        """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
+
+    @abstractmethod
+    def open(self, split: str) -> Mapping[str, SequenceSource]:
+        """The data set's own files: the sequences of this split, and of others that come with it.
+
+        Raises:
+            DataError: they are missing or unreadable as a whole.
+        """
+
+    @abstractmethod
+    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
+        """Reference and targets of a training scene."""
+
+    @abstractmethod
+    def evaluation_views(self, sequence: PosedSequence) -> Choice:
+        """Reference and targets of a scene of validation or test.
+
+        Raises:
+            DataError: the sequence has not got the frames that are asked for.
+        """
+
+    def evaluated_names(self, split: str, names: list[str]) -> list[str]:
+        """Of the sequences of a split those that are used."""
+        return names
+
+    def setup(self, stage: str | None = None) -> None:
+        """List the sequences (pictures are read later).
+
+        Raises:
+            DataError: missing or malformed files, or no sequences for this stage.
+        """
+        for split in SPLITS_OF_STAGE.get(stage or "", ()):
+            self.store(split)
+
+    def source(self, split: str) -> SequenceSource:
+        """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
+
+        Raises:
+            DataError: missing or malformed files, prepared with other settings, or broken where that is to be raised.
+        """
+        if split not in self._sources:
+            if is_prepared(self.root):
+                settings_must_match(read_manifest(self.root), self.prepared_settings())
+                self._sources[split] = PreparedSource(self.root, split)
+            else:
+                self._sources |= self.open(split)
+            source = self._sources[split]
+            if source.refused and self.policy[0] == "raise":
+                raise source.refused[0]
+            self._tell(split, source)
+        return self._sources[split]
+
+    def _tell(self, split: str, source: SequenceSource) -> None:
+        left_out = "".join(f"; {len(names)} left out: {reason}" for reason, names in source.left_out.items())
+        logger.info("%s: %d sequences%s", split, len(source.names), left_out)
+        if source.refused:
+            logger.warning("%d annotations are broken; the first: %s", len(source.refused), source.refused[0])
+
+    def store(self, split: str) -> SceneStore:
+        """The scenes of a split.
+
+        Raises:
+            DataError: as `source`, or it has no sequences.
+        """
+        if split not in self._stores:
+            source = self.source(split)
+            names = self.evaluated_names(split, source.names)
+            if not names:
+                raise DataError(f"no {split} sequences that can be used", str(self.root))
+            self._stores[split] = SceneStore(source, names, self.mask_threshold, self.cache)
+        return self._stores[split]
+
+    def train_dataloader(self) -> SceneLoader:
+        """Random views of all training sequences, in random order."""
+        scenes = TrainingScenes(
+            self.store("train"), self.training_views, self.augment, self.references_per_sequence, self.seed
+        )
+        return SceneLoader(
+            scenes, self.batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy
+        )
+
+    def val_dataloader(self) -> SceneLoader:
+        """The validation sequences."""
+        return self._evaluation_loader("val")
+
+    def test_dataloader(self) -> SceneLoader:
+        """The test sequences."""
+        return self._evaluation_loader("test")
+
+    def _evaluation_loader(self, split: str) -> SceneLoader:
+        scenes = EvaluationScenes(self.store(split), self.evaluation_views)
+        batch_size = self.evaluation_batch_size if scenes.stackable() else 1
+        return SceneLoader(scenes, batch_size, None, self.workers, *self.policy)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The data's fingerprint, for checkpoints."""
+        return {"fingerprint": self.source("train").fingerprint()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Warn if the run that is resumed was trained on other data."""
+        if state_dict["fingerprint"] != self.source("train").fingerprint():
+            logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
+
+    def typical_camera(self) -> TypicalCamera:
+        """The mean camera of some training frames: 8 of each of 256 sequences at most."""
+        chosen = [(sequence, frames) for sequence, frames in self._excerpts()]
+        return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
+
+    def mean_image(self) -> Float[Tensor, "3 height width"]:
+        """Mean of some training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
+        store = self.store("train")
+        total, count = torch.zeros(3, self.image_size, self.image_size, dtype=torch.float64), 0
+        for sequence, frames in self._excerpts():
+            for frame in frames:
+                with suppress(DataError):
+                    total += store.image(sequence, frame)
+                    count += 1
+        return (total / (255 * max(count, 1))).float()
+
+    def _excerpts(self) -> Iterator[tuple[PosedSequence, list[int]]]:
+        """The first sequences that can be read, each with evenly spaced frames."""
+        store = self.store("train")
+        for name in store.names[:SEQUENCES_OF_MEANS]:
+            with suppress(DataError):
+                sequence = store.source.read(name)
+                count = len(sequence.frames)
+                yield sequence, sorted({i * count // FRAMES_OF_MEANS for i in range(FRAMES_OF_MEANS)})

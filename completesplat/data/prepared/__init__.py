@@ -1,0 +1,1 @@
+"""Sequences cropped, resized and encoded once: a folder of Arrow files that is read memory-mapped."""

@@ -1,0 +1,220 @@
+"""Making a prepared store: planned, estimated, written by several processes, continued after an interruption."""
+
+import hashlib
+import json
+import logging
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from rich.filesize import decimal
+from rich.progress import Progress
+
+from completesplat.data.checks import field, read_json
+from completesplat.data.prepared.estimate import check_space
+from completesplat.data.prepared.manifest import (
+    FORMAT,
+    MANIFEST,
+    Manifest,
+    Refusal,
+    Scalar,
+    Split,
+    differences,
+    is_prepared,
+    write_json,
+    write_manifest,
+)
+from completesplat.data.prepared.pictures import CODECS
+from completesplat.data.prepared.shards import (
+    UNFINISHED,
+    OnBad,
+    ShardPlan,
+    ShardRecord,
+    ShardWriter,
+    cut,
+    kept_record,
+    start_worker,
+    write_in_worker,
+)
+from completesplat.data.sequences import SPLITS, SequenceSource
+from completesplat.errors import CompleteSplatError, DataError
+
+PLAN = "plan.json"
+
+logger = logging.getLogger(__name__)
+
+
+def prepare(
+    sources: Mapping[str, SequenceSource],
+    settings: Mapping[str, Scalar],
+    out: Path,
+    codec: str = "png",
+    sequences_per_shard: int = 32,
+    workers: int | None = None,
+    on_bad: OnBad = "skip",
+    most_bad: float = 0.1,
+    progress: bool = True,
+) -> Path:
+    """Write sequences into a prepared store. The same input gives the same bytes, whatever the number of workers.
+
+    An interrupted run continues when it is started again; a complete store of the same data is left as it is. A shard
+    that is missing or of another size is made again.
+
+    Args:
+        sources: by split.
+        settings: what is baked into the pictures and cameras, for those who read them.
+        codec: of the images, "png" (without loss) or "jpeg".
+        sequences_per_shard: some hundred MB at 128 x 128 pixels and 200 frames.
+        workers: processes; by default one for each core.
+        on_bad: leave out frames and sequences that cannot be read, and record that; or raise.
+        most_bad: the largest share of frames, and of sequences, that may be left out so.
+
+    Returns:
+        The folder.
+
+    Raises:
+        DataError: the folder holds something else, too little space, too much or (on_bad="raise") anything bad.
+    """
+    if codec not in CODECS:
+        raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
+    splits = [split for split in SPLITS if split in sources]
+    plans = cut(sources, splits, sequences_per_shard)
+    _claim(out, _plan(sources, splits, settings, codec, plans))
+    listed = [Refusal.of(error) for split in splits for error in sources[split].refused]
+    if on_bad == "raise" and listed:
+        raise next(error for split in splits for error in sources[split].refused)
+    records = {plan: kept_record(out, plan, on_bad) for plan in plans}
+    missing = [plan for plan, record in records.items() if record is None]
+    if is_prepared(out) and not missing:
+        logger.info("%s already holds these sequences", out)
+        return out
+    _remove_unfinished(out)
+    if missing:
+        writer = ShardWriter({split: sources[split] for split in splits}, out, codec, on_bad)
+        check_space(writer, missing)
+        workers = min(workers or os.cpu_count() or 1, len(missing))
+        records.update(zip(missing, _with_progress(missing, _write(writer, missing, workers), progress), strict=True))
+    made = [record for record in records.values() if record is not None]
+    _check_share(out, made, listed, most_bad)
+    splits_made = {
+        split: _split(sources[split], [record for record in made if record.split == split]) for split in splits
+    }
+    manifest = Manifest(out, codec, dict(settings), splits_made)
+    write_manifest(manifest)
+    _report(manifest)
+    return out
+
+
+def _plan(
+    sources: Mapping[str, SequenceSource],
+    splits: Sequence[str],
+    settings: Mapping[str, Scalar],
+    codec: str,
+    plans: Sequence[ShardPlan],
+) -> dict[str, Any]:
+    """All that the shards' bytes depend on."""
+    shards = json.dumps([[plan.file, *plan.names] for plan in plans])
+    return {
+        "settings": dict(settings),
+        "made from": {
+            "format": FORMAT,
+            "codec": codec,
+            **{f"fingerprint of {split}": sources[split].fingerprint() for split in splits},
+            "shards": hashlib.sha256(shards.encode()).hexdigest(),
+        },
+    }
+
+
+def _claim(out: Path, plan: dict[str, Any]) -> None:
+    path = out / PLAN
+    if not path.is_file():
+        if out.exists() and (not out.is_dir() or any(entry.name != f"{PLAN}{UNFINISHED}" for entry in out.iterdir())):
+            raise DataError("already holds something else: choose another folder", str(out))
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(path, plan)
+    found = read_json(path)
+    for part, asked in plan.items():
+        differing = differences(field(found, part, dict), asked)
+        if differing:
+            raise DataError(f"was made with {differing}: choose another folder, or remove this one", str(out))
+
+
+def _remove_unfinished(out: Path) -> None:
+    # What it says may no longer be so until it is written again.
+    (out / MANIFEST).unlink(missing_ok=True)
+    for path in out.glob(f"*{UNFINISHED}"):
+        path.unlink()
+
+
+def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int) -> Iterator[ShardRecord]:
+    if workers == 1:
+        yield from map(writer.write, plans)
+        return
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=start_worker, initargs=(writer,)) as pool:
+        try:
+            yield from pool.map(write_in_worker, plans)
+        except BrokenProcessPool:
+            advice = "run the same command again, with fewer workers, to continue"
+            raise CompleteSplatError(f"a worker process ended unexpectedly (out of memory?): {advice}") from None
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _with_progress(plans: Sequence[ShardPlan], records: Iterator[ShardRecord], progress: bool) -> Iterator[ShardRecord]:
+    with Progress(disable=not progress) as bar:
+        task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in plans))
+        for record in records:
+            bar.advance(task, len(record.names))
+            yield record
+
+
+def _check_share(out: Path, records: Sequence[ShardRecord], listed: Sequence[Refusal], most_bad: float) -> None:
+    refused = [*listed, *(refusal for record in records for refusal in record.refused)]
+    kept = sum(len(record.shard.sequences) for record in records)
+    kinds = _by_kind(refused)
+    if not kept:
+        raise DataError(f"not one sequence can be used: {kinds}", str(out))
+    bad_frames = sum(refusal.frame is not None for refusal in refused)
+    bad_sequences = len({refusal.sequence or refusal.file for refusal in refused if refusal.frame is None})
+    frames = sum(record.shard.frames for record in records)
+    share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + kept))
+    if share > most_bad:
+        advice = "see the .json beside the shards, and put the data right (then remove this folder) or raise most_bad"
+        raise DataError(f"{share:.1%} of the data are bad, at most {most_bad:.1%} may be ({kinds}): {advice}", str(out))
+
+
+def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
+    there = {name for record in records for name in record.shard.sequences}
+    refused = [Refusal.of(error) for error in source.refused]
+    return Split(
+        source.fingerprint(),
+        tuple(name for name in source.names if name in there),
+        tuple(record.shard for record in records),
+        (*refused, *(refusal for record in records for refusal in record.refused)),
+        {reason: len(names) for reason, names in source.left_out.items()},
+    )
+
+
+def _by_kind(refused: Sequence[Refusal]) -> str:
+    counts = Counter(refusal.kind for refusal in refused)
+    return ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing refused"
+
+
+def _report(manifest: Manifest) -> None:
+    splits = manifest.splits.values()
+    shards = [shard for split in splits for shard in split.shards]
+    sequences, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)
+    size, refused = (
+        decimal(sum(shard.bytes for shard in shards)),
+        [entry for split in splits for entry in split.refused],
+    )
+    logger.info(
+        "%s: %s frames of %s sequences, %s in %s shards; refused: %s",
+        *(manifest.root, f"{frames:,}", f"{sequences:,}", size, f"{len(shards):,}", _by_kind(refused)),
+    )

@@ -1,0 +1,172 @@
+"""Scenes made of sequences: views in the reference's frame; what cannot be read is passed on, not raised."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.data.view_selection import draws
+from completesplat.errors import DataError
+from completesplat.scene import SceneBatch, Views
+from completesplat.tensors import stack
+
+# So many other items are tried in the place of one that cannot be read.
+ATTEMPTS = 10
+
+Choice = tuple[int, list[int]]  # reference, targets
+
+
+class Loaded(NamedTuple):
+    """A scene, or a batch of them, and what could not be read on the way."""
+
+    scenes: SceneBatch | None
+    refused: tuple[DataError, ...]
+
+
+class SceneStore:
+    """Makes scenes of some of a source's sequences.
+
+    Args:
+        names: the sequences, in order.
+        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay
+            probabilities.
+        cache: keep decoded pictures (uint8) in memory, each from its first use on.
+    """
+
+    def __init__(
+        self, source: SequenceSource, names: Sequence[str], mask_threshold: float | None = None, cache: bool = False
+    ) -> None:
+        self.source = source
+        self.names = list(names)
+        self.mask_threshold = mask_threshold
+        self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
+
+    def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
+        """One scene in the reference camera's frame, from the frames of these indices.
+
+        Raises:
+            DataError: a picture that cannot be read.
+        """
+        views = [reference, *targets]
+        pictures = [self._picture(sequence, view) for view in views]
+        images = torch.stack([picture.image for picture in pictures]).float().div(255)
+        masks = torch.stack([self._mask(picture) for picture in pictures])
+        cameras = sequence.cameras.relative_to(sequence.cameras[reference])[views].to(torch.float32)
+        seen = Views(images, cameras, masks)
+        visible = torch.ones_like(masks[0])
+        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, sequence.name)
+
+    def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
+        """One picture.
+
+        Raises:
+            DataError: it cannot be read.
+        """
+        return self._picture(sequence, view).image
+
+    def _picture(self, sequence: PosedSequence, view: int) -> Picture:
+        key = sequence.name, view
+        if self._pictures is None:
+            return sequence.read(view)
+        if key not in self._pictures:
+            self._pictures[key] = sequence.read(view)
+        return self._pictures[key]
+
+    def _mask(self, picture: Picture) -> Tensor:
+        if picture.mask is None:
+            return torch.ones_like(picture.image[:1], dtype=torch.float32)
+        probability = picture.mask.float().div(255)
+        return probability if self.mask_threshold is None else (probability >= self.mask_threshold).float()
+
+
+class TrainingScenes(Dataset[Loaded]):
+    """Scenes of random views; a key is (epoch, index), see `EpochSampler`.
+
+    An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
+    only.
+
+    Args:
+        choose: (number of a sequence's frames, random generator) -> views.
+        augment: (scene, random generator) -> scene.
+        references: items of a sequence in one epoch.
+    """
+
+    def __init__(
+        self,
+        store: SceneStore,
+        choose: Callable[[int, np.random.Generator], Choice],
+        augment: Callable[[SceneBatch, np.random.Generator], SceneBatch],
+        references: int,
+        seed: int,
+    ) -> None:
+        self.store = store
+        self.choose = choose
+        self.augment = augment
+        self.references = references
+        self.seed = seed
+
+    def __len__(self) -> int:
+        return len(self.store.names) * self.references
+
+    def __getitem__(self, key: tuple[int, int]) -> Loaded:
+        epoch, index = key
+        rng = draws(self.seed, epoch, index)
+        refused: list[DataError] = []
+        for _ in range(ATTEMPTS):
+            try:
+                sequence = self.store.source.read(self.store.names[index // self.references])
+                scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
+                return Loaded(self.augment(scene, rng), tuple(refused))
+            except DataError as error:
+                refused.append(error)
+                index = int(rng.integers(len(self)))
+        return Loaded(None, tuple(refused))
+
+    def groups(self) -> list[list[int]]:
+        """Items that are best loaded one after the other."""
+        several = range(self.references)
+        groups = self.store.source.groups(self.store.names)
+        return [[name * self.references + i for name in group for i in several] for group in groups]
+
+
+class EvaluationScenes(Dataset[Loaded]):
+    """Every sequence once.
+
+    Args:
+        choose: sequence -> views. Raises `DataError` where it has not got them.
+    """
+
+    def __init__(self, store: SceneStore, choose: Callable[[PosedSequence], Choice]) -> None:
+        self.store = store
+        self.choose = choose
+
+    def __len__(self) -> int:
+        return len(self.store.names)
+
+    def __getitem__(self, index: int) -> Loaded:
+        name = self.store.names[index]
+        try:
+            sequence = self.store.source.read(name)
+            return Loaded(self.store.scene(sequence, *self.choose(sequence)), ())
+        except DataError as error:
+            return Loaded(None, (error,))
+
+    def stackable(self) -> bool:
+        """Whether all scenes have the same number of targets, as far as they can be read."""
+        counts = set()
+        for name in self.store.names:
+            with suppress(DataError):
+                counts.add(len(self.choose(self.store.source.read(name))[1]))
+        return len(counts) <= 1
+
+
+def collate(items: Sequence[Loaded]) -> Loaded:
+    """A batch of the scenes that are there."""
+    scenes = [item.scenes for item in items if item.scenes is not None]
+    return Loaded(stack(scenes) if scenes else None, tuple(error for item in items for error in item.refused))

@@ -1,0 +1,69 @@
+"""Sequences of pictures with cameras: what a data set is, once its own files and conventions are behind it."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import Cameras
+
+SPLITS = ("train", "val", "test")
+
+
+class Picture(NamedTuple):
+    """One square picture (sRGB) and its foreground probability (0 to 255), if the data set has one."""
+
+    image: UInt8[Tensor, "3 size size"]
+    mask: UInt8[Tensor, "1 size size"] | None
+
+
+@dataclass(frozen=True)
+class PosedSequence:
+    """The frames of one video, cropped to squares and at the common scale.
+
+    Attributes:
+        frames: the numbers that the data set gives them, in order.
+        cameras: [view], float64, of the square pictures; the world is the sequence's own.
+        depth_ranges: (near, far) with each of the frames as the reference, float32, in units of the cameras.
+        read: index of a frame (not its number) -> its picture. Raises `DataError` if it cannot be read.
+    """
+
+    name: str
+    frames: tuple[int, ...]
+    cameras: Cameras
+    depth_ranges: Float[Tensor, "view 2"]
+    read: Callable[[int], Picture]
+
+
+@runtime_checkable
+class SequenceSource(Protocol):
+    """The sequences of one split, wherever they lie.
+
+    Attributes:
+        names: of the sequences that can be read, as far as listing them showed.
+        refused: what listing them found broken.
+        left_out: names that were left out although nothing is broken, by reason.
+    """
+
+    names: list[str]
+    refused: list[DataError]
+    left_out: dict[str, list[str]]
+
+    def read(self, name: str) -> PosedSequence:
+        """One sequence: its cameras now, its pictures when asked for.
+
+        Raises:
+            DataError: it cannot be used as a whole.
+        """
+        ...
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """Indices into `names` of the sequences that are best read one after the other."""
+        ...
+
+    def fingerprint(self) -> str:
+        """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
+        ...

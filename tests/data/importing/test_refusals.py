@@ -1,0 +1,175 @@
+"""Captures that are refused: what is wrong, in which file, at which frame; nothing is left behind."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from completesplat.data.checks import (
+    BadAnnotation,
+    BadCamera,
+    BadPicture,
+    MissingFile,
+    OutsidePath,
+    TooFewFrames,
+    UnreadableFile,
+)
+from completesplat.data.importing import import_capture
+from completesplat.errors import CompleteSplatError, DataError
+
+
+def of_frame(number, **values):
+    return lambda content: content["frames"][number].update(values)
+
+
+def entry_of_pose(row, column, value):
+    def change(content):
+        content["frames"][3]["transform_matrix"][row][column] = value
+
+    return change
+
+
+def scaled_pose(content):
+    matrix = np.array(content["frames"][3]["transform_matrix"])
+    matrix[:3, :3] *= 2
+    content["frames"][3]["transform_matrix"] = matrix.tolist()
+
+
+def mirrored_pose(content):
+    for row in content["frames"][3]["transform_matrix"][:3]:
+        row[0] *= -1
+
+
+def without(*keys):
+    return lambda content: [content.pop(key) for key in keys]
+
+
+TRANSFORMS = {
+    "no frames": (without("frames"), BadAnnotation, r"transforms\.json: no frames"),
+    "five frames": (lambda c: c["frames"].__delitem__(slice(5, None)), TooFewFrames, "5 frames; .* at least 6"),
+    "NaN in a pose": (entry_of_pose(0, 3, float("nan")), BadAnnotation, r"transforms\.json, frame 3: .* not finite"),
+    "a pose of text": (entry_of_pose(0, 3, "1"), BadAnnotation, r"transforms\.json, frame 3: .* 4 x 4 numbers"),
+    "no pose": (of_frame(3, transform_matrix=None), BadAnnotation, "frame 3: transform_matrix must be 4 x 4"),
+    "a sheared pose": (entry_of_pose(0, 0, 0.3), BadCamera, r"transforms\.json, frame 3: .* not orthonormal"),
+    "a scaled pose": (scaled_pose, BadCamera, r"transforms\.json, frame 3: transform_matrix scales by 2;"),
+    "a mirrored pose": (mirrored_pose, BadCamera, "frame 3: .* reflection"),
+    "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
+    "a missing picture": (of_frame(2, file_path="images/x"), MissingFile, r"images/x, frame 2: no such file, with or"),
+    "a picture twice": (of_frame(2, file_path="./images/r_1"), BadAnnotation, "frame 2: the same picture as frame 1"),
+    "a picture outside": (
+        of_frame(2, file_path="../r_2.png"),
+        OutsidePath,
+        r"transforms\.json, frame 2: leads outside",
+    ),
+    "an absolute path": (of_frame(2, file_path="/etc/hosts"), OutsidePath, "frame 2: leads outside"),
+    "no file path": (lambda c: c["frames"][2].pop("file_path"), BadAnnotation, "frame 2: no file_path"),
+    "a frame that is none": (lambda c: c["frames"].insert(2, 5), BadAnnotation, "frame 2: no file_path in 5"),
+    "a missing mask": (of_frame(4, mask_path="m.png"), MissingFile, r"m\.png, frame 4: no such file"),
+    "no focal length": (without("fl_x"), BadAnnotation, "frame 0: neither fl_x nor camera_angle_x"),
+    "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
+    "an infinite focal length": (of_frame(1, fl_x=float("inf")), BadAnnotation, "frame 1: fl_x is not finite"),
+    "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
+    "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
+    "half a pixel": (lambda c: c.update(w=210.5), BadAnnotation, "w must be a whole number"),
+    "another size": (lambda c: c.update(h=151), BadPicture, r"r_0\.png, in, frame 0: has 150 x 210 .* says 151 x 210"),
+    "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
+    "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
+    "a fourth coefficient": (lambda c: c.update(k4=0.1), BadCamera, "k4 = 0.1 has no meaning for camera model OPENCV"),
+    "a distorted pinhole": (lambda c: c.update(camera_model="PINHOLE", k1=0.1), BadCamera, "k1 = 0.1 has no meaning"),
+    "a folded picture": (lambda c: c.update(k1=-4.0), BadCamera, r"r_0\.png, in, frame 0: distortion .* usable"),
+    "a missing point cloud": (lambda c: c.update(ply_file_path="x.ply"), MissingFile, r"x\.ply: no such file"),
+    "a point cloud that is none": (
+        lambda c: c.update(ply_file_path="transforms.json"),
+        UnreadableFile,
+        r"transforms\.json: not a point cloud",
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "kind", "message"), TRANSFORMS.values(), ids=TRANSFORMS)
+def test_a_bad_transforms_file_is_refused(captures, tmp_path, change, kind, message):
+    path = captures.edit(captures.write_transforms(tmp_path / "in", captures.Shot()), change)
+    with pytest.raises(kind, match=message):
+        import_capture(tmp_path / "out", "desk", path, progress=False)
+    assert not list(tmp_path.glob("out/*"))
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def turn(path):
+    exif = Image.Exif()
+    exif[274] = 3  # Upside down: the size is the same.
+    Image.open(path).save(path, exif=exif)
+
+
+def flip_a_bit(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 16
+    path.write_bytes(content)
+
+
+def flip_a_bit_of_transparency(path):
+    Image.open(path).convert("RGBA").save(path)
+    flip_a_bit(path)
+
+
+PICTURES = {
+    "cut off": (cut, "cannot be decoded"),
+    "upside down by EXIF": (turn, r"EXIF orientation 3"),
+    "damaged": (flip_a_bit, "cannot be decoded"),
+    "damaged, with alpha": (flip_a_bit_of_transparency, "cannot be decoded"),
+    "no picture": (lambda path: path.write_text("hello"), "not an image"),
+    "of another size, with alpha": (lambda p: Image.new("RGBA", (150, 210)).save(p), "has 210 x 150 pixels"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), PICTURES.values(), ids=PICTURES)
+def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
+    path = captures.write_transforms(tmp_path / "in", captures.Shot())
+    damage(tmp_path / "in/images/r_5.png")
+    with pytest.raises(BadPicture, match=rf"images/r_5\.png, in, frame 5: .*{message}"):
+        import_capture(tmp_path / "out", "desk", path, progress=False)
+    assert not list(tmp_path.glob("out/*"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "either transforms=FILE or colmap=FOLDER"),
+        ({"transforms": "a", "colmap": "b", "images": "c"}, "either transforms=FILE or colmap=FOLDER"),
+        ({"colmap": "b"}, "colmap=FOLDER goes with images=FOLDER"),
+        ({"transforms": "a", "images": "c"}, "colmap=FOLDER goes with images=FOLDER"),
+        ({"transforms": "a", "masks": "c"}, "colmap=FOLDER goes with images=FOLDER"),
+        ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
+        ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
+        ({"transforms": "a", "category": "a/b"}, "category must be a folder name"),
+        ({"transforms": "a", "category": ".."}, "category must be a folder name"),
+        ({"transforms": "a", "sequence": ""}, "sequence must be a folder name"),
+        ({"transforms": "nowhere.json"}, r"nowhere\.json: no such file"),
+        ({"colmap": "nowhere", "images": "c"}, "nowhere: no such folder"),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(tmp_path, settings, message):
+    if "colmap" in settings:
+        pytest.importorskip("pycolmap")
+    with pytest.raises(CompleteSplatError, match=message):
+        import_capture(tmp_path, **{"category": "desk", **settings}, progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_there_is_left_alone(captures, tmp_path):
+    path = captures.write_transforms(tmp_path / "in", captures.Shot())
+    (tmp_path / "out/desk").mkdir(parents=True)
+    (tmp_path / "out/desk/notes.txt").write_text("mine")
+    with pytest.raises(DataError, match=r"out/desk: is there already"):
+        import_capture(tmp_path / "out", "desk", path, progress=False)
+    assert [p.name for p in (tmp_path / "out/desk").iterdir()] == ["notes.txt"]
+
+
+def test_the_remains_of_an_interrupted_import_are_no_obstacle(captures, tmp_path):
+    path = captures.write_transforms(tmp_path / "in", captures.Shot())
+    (tmp_path / "out/.desk.unfinished/in/images").mkdir(parents=True)
+    category = import_capture(tmp_path / "out", "desk", path, progress=False)
+    assert len(captures.annotations(category)) == 8
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["desk"]

@@ -1,0 +1,172 @@
+"""Checking finds every planted fault once and nothing else, and counts what is left."""
+
+from pathlib import Path
+
+import pytest
+from checked_sources import Prepared, Source
+from support import strict_json
+
+from completesplat.data.checking import Findings, check, show
+from completesplat.data.checks import BadPicture, ChangedFile, MissingFile, TooFewFrames
+
+
+def check_quietly(**sources: Source) -> Findings:
+    return check(sources, workers=1, progress=False)
+
+
+def places(findings: Findings) -> set[tuple[str, str | None, int | None]]:
+    return {(error.kind, error.sequence, error.frame) for error in findings.refused}
+
+
+def damaged() -> dict[str, Source]:
+    """Two splits that share a sequence; planted: 8 faults, of which 1 is seen through both."""
+    shared = MissingFile("no such file", "shared.txt")
+    train = Source(
+        {"a": (1, 2, 3), "b": (10, 20, 30), "c": (5, 6), "d": (7, 8), "e": (9,)},
+        broken_pictures={("a", 2), ("c", 6)},
+        broken_sequences={"d"},
+        refused=[shared],
+        left_out={"score below 0.5": ["x", "y"]},
+    )
+    val = Prepared(
+        {"b": (20, 30, 40, 50), "f": (1, 2)},
+        broken_pictures={("b", 50)},
+        refused=[MissingFile("no such file", "shared.txt")],
+        changed=[ChangedFile("not its SHA-256", "shard-0")],
+    )
+    return {"train": train, "val": val}
+
+
+PLANTED = {
+    ("missing file", None, None),
+    ("left out", "x", None),
+    ("left out", "y", None),
+    ("changed file", None, None),
+    ("unusable picture", "a", 2),
+    ("unusable picture", "c", 6),
+    ("malformed annotation", "d", None),
+    ("too few frames", "e", None),
+    ("unusable picture", "b", 50),
+}
+
+
+def test_sound_data_are_usable_as_a_whole() -> None:
+    findings = check_quietly(train=Source({"a": (1, 2, 3), "b": (4, 5)}), val=Source({"c": (1, 2)}))
+    assert (findings.sequences, findings.frames, findings.refused) == (3, 7, [])
+    assert findings.splits == {"train": {"sequences": 2, "frames": 5}, "val": {"sequences": 1, "frames": 2}}
+
+
+def test_every_planted_fault_is_found_once_and_nothing_else() -> None:
+    findings = check_quietly(**damaged())
+    assert places(findings) == PLANTED
+    assert len(findings.refused) == len(PLANTED)
+
+
+def test_a_sequence_is_usable_with_two_usable_frames() -> None:
+    """`a` keeps 1 and 3, `b` 10 to 40, `f` both; `c` and `e` keep one frame, `d` none."""
+    findings = check_quietly(**damaged())
+    assert (findings.sequences, findings.frames) == (3, 2 + 4 + 2)
+    assert findings.splits == {"train": {"sequences": 2, "frames": 2 + 3}, "val": {"sequences": 2, "frames": 3 + 2}}
+
+
+def test_refusals_name_their_place_and_keep_their_reason() -> None:
+    picture = next(error for error in check_quietly(**damaged()).refused if error.frame == 2)
+    assert isinstance(picture, BadPicture)
+    assert (picture.file, picture.sequence, picture.reason) == ("a/2.jpg", "a", "truncated")
+    short = next(error for error in check_quietly(**damaged()).refused if error.sequence == "e")
+    assert isinstance(short, TooFewFrames)
+
+
+def test_pictures_in_several_splits_are_read_once(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    train = Source({"a": (1, 2, 3), "b": (1, 2)}, broken_pictures={("a", 3)}, log=log)
+    val = Source({"a": (2, 3, 4)}, broken_pictures={("a", 3)}, log=log)
+    findings = check_quietly(train=train, val=val)
+    assert sorted(log.read_text().splitlines()) == ["a 1", "a 2", "a 3", "a 4", "b 1", "b 2"]
+    assert places(findings) == {("unusable picture", "a", 3)}
+    assert findings.frames == 5
+    assert findings.splits["val"] == {"sequences": 1, "frames": 2}
+
+
+def test_a_sequence_refused_in_one_split_is_still_read_in_the_other() -> None:
+    findings = check_quietly(train=Source({"a": (1, 2)}, broken_sequences={"a"}), val=Source({"a": (3, 4)}))
+    assert places(findings) == {("malformed annotation", "a", None)}
+    assert findings.splits == {"train": {"sequences": 0, "frames": 0}, "val": {"sequences": 1, "frames": 2}}
+
+
+def test_too_few_frames_are_reported_only_where_nothing_else_explains_them() -> None:
+    findings = check_quietly(train=Source({"a": (1, 2), "b": (1,)}, broken_pictures={("a", 1)}))
+    assert places(findings) == {("unusable picture", "a", 1), ("too few frames", "b", None)}
+    assert (findings.sequences, findings.frames) == (0, 0)
+
+
+def test_nothing_at_all_is_usable_in_empty_or_wholly_broken_data() -> None:
+    assert (check_quietly().sequences, check_quietly(train=Source({})).frames) == (0, 0)
+    broken = check_quietly(train=Source(dict.fromkeys("abc", (1, 2)), broken_sequences=set("abc")))
+    assert broken.json()["usable"] == {"sequences": 0, "frames": 0}
+    assert len(broken.refused) == 3
+
+
+@pytest.mark.parametrize("at_once", [1, 40])
+def test_two_processes_find_the_same_in_the_same_order(at_once: int) -> None:
+    sources = damaged()
+    sources["train"].frames |= {f"more {i}": (1, 2, 3) for i in range(40)}
+    sources["train"].at_once = at_once
+    alone, together = (check(sources, workers=workers, progress=False) for workers in (1, 2))
+    assert together.json() == alone.json()
+    assert [type(error) for error in together.refused] == [type(error) for error in alone.refused]
+    assert together.sequences == 43
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_mistake_in_a_reader_is_no_refusal(workers: int) -> None:
+    source = Source(dict.fromkeys("abcd", (1, 2)), bugs={"c"})
+    with pytest.raises(ZeroDivisionError, match="a mistake in the reader"):
+        check({"train": source}, workers=workers, progress=False)
+
+
+def test_the_file_holds_what_was_found(tmp_path: Path) -> None:
+    findings = check_quietly(**damaged())
+    findings.write(tmp_path / "check.json")
+    written = strict_json(tmp_path / "check.json")
+    assert written == findings.json()
+    assert written["usable"] == {"sequences": 3, "frames": 8}
+    assert {"sequence": "a", "frame": 2, "file": "a/2.jpg", "reason": "truncated"} in written["refused"]
+    assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
+    assert written["counts"] == {
+        "unusable picture": 3,
+        "left out: score below 0.5": 2,
+        "missing file": 1,
+        "changed file": 1,
+        "malformed annotation": 1,
+        "too few frames": 1,
+    }
+
+
+def test_what_is_shown_names_counts_examples_and_what_is_left(capsys: pytest.CaptureFixture[str]) -> None:
+    show(check_quietly(**damaged()))
+    shown = capsys.readouterr().out
+    for text in ("left out: score below 0.5", "unusable picture", "a/2.jpg, a, frame 2: truncated"):
+        assert text in shown
+    assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"
+
+
+def test_long_and_strange_names_are_shown_whole_and_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """Neither markup nor control characters nor undecodable bytes in a name change how the table looks."""
+    name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
+    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= 120
+    cell = "".join(line.split("│")[3].strip() for line in shown.splitlines() if "│" in line)
+    # Lines may end at a space, which is then not shown.
+    assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")
+
+
+def test_sound_data_show_no_table(capsys: pytest.CaptureFixture[str]) -> None:
+    show(check_quietly(train=Source({"a": (1, 2)})))
+    assert capsys.readouterr().out == "usable sequences: 1, their usable frames: 2 (train 1 and 2)\n"
+
+
+def test_the_bar_ends_with_all_sequences(capsys: pytest.CaptureFixture[str]) -> None:
+    check({"train": Source({"a": (1, 2), "b": (1, 2)})}, workers=1)
+    assert "100%" in capsys.readouterr().out

@@ -1,0 +1,200 @@
+import hashlib
+import json
+import logging
+import pickle
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+from prepared_sequences import ListedSource, contents
+
+from completesplat.data.checks import BadPicture, TooFewFrames
+from completesplat.data.prepared import estimate
+from completesplat.data.prepared.manifest import read_manifest
+from completesplat.data.prepared.source import PreparedSource
+from completesplat.data.prepared.writing import prepare
+from completesplat.errors import CompleteSplatError, DataError
+
+SETTINGS = {"image_size": 16, "category": "chair", "crop": None}
+NAMES = [f"s{number}" for number in range(8)]
+
+
+def make(source: ListedSource, out: Path, **options: object) -> Path:
+    keywords = {"sequences_per_shard": 2, "workers": 1, "progress": False, **options}
+    return prepare({"train": source}, SETTINGS, out, **keywords)  # type: ignore[arg-type]
+
+
+def test_the_same_input_gives_the_same_bytes_in_one_process_and_in_two(tmp_path: Path) -> None:
+    one = make(ListedSource(NAMES[:4]), tmp_path / "one")
+    two = make(ListedSource(NAMES[:4]), tmp_path / "two", workers=2)
+    assert len(contents(one)) == 2 + 2 * 2
+    assert contents(one) == contents(two)
+
+
+def test_the_manifest_holds_the_checksum_and_the_size_of_every_shard(tmp_path: Path) -> None:
+    store = make(ListedSource(NAMES), tmp_path / "store")
+    shards = read_manifest(store).splits["train"].shards
+    arrow = {path.name for path in store.glob("*.arrow")}
+    assert {shard.file for shard in shards} == arrow == {f"train-{number:05d}-of-00004.arrow" for number in range(4)}
+    for shard in shards:
+        content = (store / shard.file).read_bytes()
+        assert (shard.sha256, shard.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
+        assert shard.frames == 8
+
+
+def test_an_interrupted_run_continues_with_the_shards_that_are_missing(tmp_path: Path) -> None:
+    out = tmp_path / "store"
+    # Three are read for the estimate, then five: two shards are whole, the third has one of its two.
+    with pytest.raises(KeyboardInterrupt):
+        make(ListedSource(NAMES, stop_after=8), out)
+    assert not (out / "manifest.json").exists()
+    assert any(path.name.endswith(".unfinished") for path in out.iterdir())
+    before = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrow")}
+    assert len(before) == 2
+
+    again = ListedSource(NAMES)
+    make(again, out)
+    assert set(again.was_read) == set(NAMES[4:])
+    assert {name: (out / name).stat().st_mtime_ns for name in before} == before
+    assert contents(out) == contents(make(ListedSource(NAMES), tmp_path / "at once"))
+
+
+def test_an_interrupted_run_is_not_continued_with_other_data_or_settings(tmp_path: Path) -> None:
+    out = tmp_path / "store"
+    with pytest.raises(KeyboardInterrupt):
+        make(ListedSource(NAMES, stop_after=6), out)
+    with pytest.raises(DataError, match=r"image_size=16 \(asked for: 32\).*another folder"):
+        prepare({"train": ListedSource(NAMES)}, {**SETTINGS, "image_size": 32}, out, sequences_per_shard=2)
+    for source, options in [
+        (ListedSource(NAMES, content="b"), {}),
+        (ListedSource(NAMES[:-1]), {}),
+        (ListedSource(NAMES), {"codec": "jpeg"}),
+        (ListedSource(NAMES), {"sequences_per_shard": 3}),
+    ]:
+        with pytest.raises(DataError, match="another folder"):
+            make(source, out, **options)
+        assert source.was_read == []
+
+
+def test_a_complete_store_is_left_as_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    out = make(ListedSource(NAMES), tmp_path / "store")
+    before = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    again = ListedSource(NAMES)
+    with caplog.at_level(logging.INFO):
+        make(again, out)
+    assert "already holds" in caplog.text
+    assert again.was_read == []
+    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == before
+
+
+@pytest.mark.parametrize("damage", ["remove", "shorten"])
+def test_a_shard_that_is_missing_or_shorter_is_made_again(damage: str, tmp_path: Path) -> None:
+    out = make(ListedSource(NAMES), tmp_path / "store")
+    before, shard = contents(out), sorted(out.glob("*.arrow"))[1]
+    if damage == "remove":
+        shard.unlink()
+    else:
+        shard.write_bytes(shard.read_bytes()[:-1])
+    again = ListedSource(NAMES)
+    make(again, out)
+    assert set(again.was_read) == {"s2", "s3"}
+    assert contents(out) == before
+
+
+def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(DataError, match="something else"):
+        make(ListedSource(NAMES), tmp_path)
+    assert list(contents(tmp_path)) == ["notes.txt"]
+
+
+def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> None:
+    source = ListedSource(NAMES, bad_frames={"s1": [2], "s4": [0, 1, 3]}, bad_sequences=["s6"])
+    source.left_out = {"too short": ["a", "b"]}
+    source.refused = [DataError("no annotations", "x.json", "s9")]
+    split = read_manifest(make(source, tmp_path / "store", most_bad=0.5)).splits["train"]
+    assert split.names == ("s0", "s1", "s2", "s3", "s5", "s7")
+    assert split.left_out == {"too short": 2}
+    found = [(entry.kind, entry.file, entry.sequence, entry.frame) for entry in split.refused]
+    assert found == [
+        ("not as expected", "x.json", "s9", None),
+        (BadPicture.kind, "s1/2.jpg", "s1", 16),
+        *[(BadPicture.kind, f"s4/{index}.jpg", "s4", 10 + 3 * index) for index in (0, 1, 3)],
+        (TooFewFrames.kind, None, "s4", None),
+        (TooFewFrames.kind, "s6.txt", "s6", None),
+    ]
+    assert PreparedSource(tmp_path / "store", "train").read("s1").frames == (10, 13, 19)
+
+
+def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(BadPicture) as caught:
+        make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", on_bad="raise")
+    # Worker processes send their refusals as pickles.
+    for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):
+        assert (error.file, error.sequence, error.frame) == ("s1/2.jpg", "s1", 16)
+    assert not (tmp_path / "store" / "manifest.json").exists()
+
+
+def test_what_was_skipped_before_is_raised_if_that_is_asked_for_now(tmp_path: Path) -> None:
+    bad = {"s1": [2]}
+    with pytest.raises(DataError, match="are bad"):
+        make(ListedSource(NAMES, bad_frames=bad), tmp_path / "store", most_bad=0)
+    with pytest.raises(BadPicture):
+        make(ListedSource(NAMES, bad_frames=bad), tmp_path / "store", on_bad="raise")
+
+
+@pytest.mark.parametrize(
+    "bad", [{"bad_frames": {name: [1] for name in NAMES[:4]}}, {"bad_sequences": ["s3"]}], ids=["frames", "sequences"]
+)
+def test_more_than_the_allowed_share_of_bad_input_is_an_error(bad: dict, tmp_path: Path) -> None:
+    # 4 of 32 frames, or 1 of 8 sequences.
+    with pytest.raises(DataError, match=r"12\.5% of the data are bad"):
+        make(ListedSource(NAMES, **bad), tmp_path / "store", most_bad=0.12)
+    assert not (tmp_path / "store" / "manifest.json").exists()
+    make(ListedSource(NAMES, **bad), tmp_path / "store", most_bad=0.13)
+    assert (tmp_path / "store" / "manifest.json").exists()
+
+
+def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not one sequence"):
+        make(ListedSource(NAMES, bad_sequences=NAMES), tmp_path / "store", most_bad=1)
+
+
+def test_sequences_of_one_chunk_stay_together(tmp_path: Path) -> None:
+    store = make(ListedSource(NAMES, group_size=3), tmp_path / "store", sequences_per_shard=4)
+    shards = read_manifest(store).splits["train"].shards
+    assert [shard.sequences for shard in shards] == [("s0", "s1", "s2"), ("s3", "s4", "s5"), ("s6", "s7")]
+
+
+def test_a_chunk_that_is_too_large_is_cut_evenly(tmp_path: Path) -> None:
+    store = make(ListedSource(NAMES, group_size=8), tmp_path / "store", sequences_per_shard=3)
+    assert sorted(len(shard.sequences) for shard in read_manifest(store).splits["train"].shards) == [2, 3, 3]
+
+
+def test_too_little_space_is_noticed_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = namedtuple("usage", ["total", "used", "free"])
+    monkeypatch.setattr(estimate.shutil, "disk_usage", lambda path: usage(10**6, 0, 5000))
+    with pytest.raises(DataError, match="not enough space: about .* 32 frames of 8 sequences in 4 shards"):
+        make(ListedSource(NAMES), tmp_path / "store")
+    assert not list((tmp_path / "store").glob("*.arrow*"))
+
+
+def test_the_estimate_is_near_the_size_of_the_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        store = make(ListedSource(NAMES, frames=40), tmp_path / "store", sequences_per_shard=8)
+    amount = float(caplog.messages[0].removeprefix("about ").split(" kB for 320 frames")[0])
+    actual = sum(path.stat().st_size for path in store.glob("*.arrow")) / 1000
+    assert amount == pytest.approx(actual, rel=0.15)
+
+
+def test_another_codec_than_the_two_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CompleteSplatError, match="png, jpeg"):
+        make(ListedSource(NAMES), tmp_path / "store", codec="webp")
+
+
+def test_the_plan_is_json_that_says_what_was_baked_in(tmp_path: Path) -> None:
+    store = make(ListedSource(NAMES), tmp_path / "store")
+    assert json.loads((store / "plan.json").read_text())["settings"] == SETTINGS
+    assert read_manifest(store).settings == SETTINGS

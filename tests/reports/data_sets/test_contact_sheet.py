@@ -1,0 +1,123 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from completesplat.data.checks import BadPicture, OutsidePath
+from completesplat.data.sequences import Picture
+from completesplat.geometry.cameras import project
+from completesplat.reports.data_sets.contact_sheet import CELL, GAP, MARGIN, MASK, MOST_SEQUENCES, show
+from completesplat.reports.data_sets.cross import place_cross
+from completesplat.reports.data_sets.frusta import CROSS_COLORS
+
+SIZE = 24
+
+
+def sheet_of(sequences, path, pictures=3, title="title"):
+    show(sequences, path / "show.png", pictures, title)
+    return np.asarray(Image.open(path / "show.png").convert("RGB"))
+
+
+def cells(sheet, sequences, pictures):
+    """[sequence picture CELL CELL 3], found by the rule that rows are of equal height and the pictures stand above
+    their captions: the first row of a cell is where the colour of its corner begins."""
+    lefts = [MARGIN + column * (CELL + GAP) for column in range(pictures)]
+    filled = (sheet[:, lefts[0]] != 255).any(-1) & (sheet[:, lefts[0] + CELL - 1] != 255).any(-1)
+    tops = [row for row in range(1, len(sheet)) if filled[row : row + CELL].sum() == CELL and not filled[row - 1]]
+    assert len(tops) == sequences
+    return np.stack([[sheet[top : top + CELL, left : left + CELL] for left in lefts] for top in tops])
+
+
+def test_the_sheet_grows_by_equal_steps(orbit, tmp_path):
+    sizes = [
+        sheet_of([orbit(4)] * rows, tmp_path, pictures).shape for rows, pictures in [(1, 4), (2, 4), (3, 4), (1, 5)]
+    ]
+    assert sizes[2][0] - sizes[1][0] == sizes[1][0] - sizes[0][0] > CELL
+    assert sizes[3][1] - sizes[0][1] == CELL + GAP
+    assert sizes[0][1] == 2 * MARGIN + 6 * CELL + 5 * GAP
+
+
+def test_pictures_are_evenly_spaced_in_time(orbit, tmp_path):
+    """Each frame's picture has its own grey: 10 times the index."""
+    sequence = orbit(24, read=lambda i: Picture(torch.full((3, SIZE, SIZE), 10 * i, dtype=torch.uint8), None))
+    shown = cells(sheet_of([sequence], tmp_path, 6), 1, 6)[0]
+    indices = [int(cell[0, 0, 0]) // 10 for cell in shown]
+    assert (indices[0], indices[-1]) == (0, 23)
+    assert set(np.diff(indices)) <= {4, 5}
+
+
+def test_a_picture_is_shown_upright_and_unmirrored(orbit, tmp_path):
+    picture = (torch.rand(3, SIZE, SIZE) * 255).byte()
+    shown = cells(sheet_of([orbit(1, read=lambda i: Picture(picture, None))], tmp_path, 1), 1, 1)[0, 0]
+    large = picture.permute(1, 2, 0).numpy().repeat(CELL // SIZE, axis=0).repeat(CELL // SIZE, axis=1)
+    assert (shown[:40] == large[:40]).all()
+    assert (shown[-40:] == large[-40:]).all()
+
+
+def test_the_cross_is_drawn_where_it_projects(orbit, tmp_path):
+    sequence = orbit(12, height=1.2, center=(0.3, 0.2, -0.4), turn=75.0)
+    shown = cells(sheet_of([sequence], tmp_path, 12), 1, 12)[0]
+    ends = place_cross(sequence.cameras, sequence.depth_ranges[0]).ends()
+    pixels = project(sequence.cameras, ends.flatten(0, 1))[0].unflatten(1, (3, 2)) * CELL / SIZE
+    for cell, arms in zip(shown, pixels.numpy(), strict=True):
+        rows, columns = np.nonzero((cell == CROSS_COLORS[1]).all(-1))
+        (left, top), (right, bottom) = arms[1].min(axis=0) - 4, arms[1].max(axis=0) + 4
+        assert left < columns.min() <= columns.max() < right
+        assert top < rows.min() <= rows.max() < bottom
+        # Other arms may hide its foot. All ends are seen.
+        for color, (_, (x, y)) in zip(CROSS_COLORS, arms, strict=True):
+            near = cell[max(0, int(y) - 4) : int(y) + 5, max(0, int(x) - 4) : int(x) + 5]
+            assert (near == color).all(-1).any()
+
+
+def test_a_cross_behind_the_camera_is_not_drawn(walk, tmp_path):
+    """The second camera is 9 ahead of the first and aside, the cross at most 2 before the first."""
+    sequence = walk((0.0, 0.0, 0.0), (50.0, 0.0, 9.0), depth_range=(1.0, 2.0))
+    first, second = cells(sheet_of([sequence], tmp_path, 2), 1, 2)[0]
+    assert (first == CROSS_COLORS[1]).all(-1).any()
+    assert (second == 120).all()
+
+
+def test_the_outline_of_a_mask_runs_where_it_crosses_one_half(orbit, tmp_path):
+    mask = torch.zeros(1, SIZE, SIZE, dtype=torch.uint8)
+    mask[:, :, : SIZE // 4], mask[:, :, SIZE // 4 : SIZE // 3] = 255, 100
+    image = torch.full((3, SIZE, SIZE), 60, dtype=torch.uint8)
+    shown = cells(sheet_of([orbit(1, read=lambda i: Picture(image, mask))], tmp_path, 1), 1, 1)[0, 0]
+    yellow = (shown == MASK).all(-1)
+    assert set(np.flatnonzero(yellow.any(0))) == {CELL // 4 - 1}
+    assert yellow[:, CELL // 4 - 1].mean() > 0.9
+
+
+def test_a_picture_that_is_refused_is_a_grey_cell_that_tells_why(orbit, tmp_path):
+    def read(index):
+        if index in (1, 2):
+            raise (BadPicture if index == 1 else OutsidePath)("this one", "file.jpg")
+        return Picture(torch.full((3, SIZE, SIZE), 120, dtype=torch.uint8), None)
+
+    shown = cells(sheet_of([orbit(4, read=read)], tmp_path, 4), 1, 4)[0]
+    for cell in shown[1:3]:
+        assert (cell[0, 0] == cell[-1, -1]).all()
+        text = (cell != cell[0, 0]).any(-1)
+        assert 20 < text.sum() < 0.1 * CELL**2
+        assert not text[:, :3].any()
+        assert not text[:, -3:].any()
+    assert (shown[1] != shown[2]).any()
+    for cell in shown[[0, 3]]:
+        assert (cell == CROSS_COLORS[1]).all(-1).any()
+
+
+def test_nothing_is_written_beyond_the_margins(orbit, tmp_path):
+    sequence = replace(orbit(2), name="a name without an end " * 8)
+    for pictures in (1, 4):
+        sheet = sheet_of([sequence], tmp_path, pictures, "a title without an end " * 8)
+        assert (sheet[:, : MARGIN - 1] == 255).all()
+        assert (sheet[:, -MARGIN:] == 255).all()
+        assert (sheet[-MARGIN // 2 :] == 255).all()
+
+
+def test_more_sequences_than_fit_are_refused(orbit, tmp_path):
+    for sequences, pictures in [([], 3), ([orbit(2)] * (MOST_SEQUENCES + 1), 3), ([orbit(2)], 0)]:
+        with pytest.raises(ValueError, match="sheet"):
+            show(sequences, tmp_path / "show.png", pictures)
