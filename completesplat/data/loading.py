@@ -84,6 +84,7 @@ class SceneLoader:
         self.dataset = scenes
         self.batch_size = batch_size
         self.sampler = sampler
+        self.batch_sampler = None  # Lightning asks for it wherever there is a sampler
         self.on_bad = on_bad
         self.most_bad = most_bad
         self.refused: list[DataError] = []

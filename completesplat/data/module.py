@@ -142,17 +142,16 @@ class SceneDataModule(LightningDataModule):
                 self._sources[split] = PreparedSource(self.root, split)
             else:
                 self._sources |= self.open(split)
-            source = self._sources[split]
-            if source.refused and self.policy[0] == "raise":
-                raise source.refused[0]
-            self._tell(split, source)
-        return self._sources[split]
+        source = self._sources[split]
+        if source.refused and self.policy[0] == "raise":
+            raise source.refused[0]
+        return source
 
     def _tell(self, split: str, source: SequenceSource) -> None:
         left_out = "".join(f"; {len(names)} left out: {reason}" for reason, names in source.left_out.items())
         logger.info("%s: %d sequences%s", split, len(source.names), left_out)
         if source.refused:
-            logger.warning("%d annotations are broken; the first: %s", len(source.refused), source.refused[0])
+            logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
 
     def store(self, split: str) -> SceneStore:
         """The scenes of a split.
@@ -165,6 +164,7 @@ class SceneDataModule(LightningDataModule):
             names = self.evaluated_names(split, source.names)
             if not names:
                 raise DataError(f"no {split} sequences that can be used", str(self.root))
+            self._tell(split, source)
             self._stores[split] = SceneStore(source, names, self.mask_threshold, self.cache)
         return self._stores[split]
 

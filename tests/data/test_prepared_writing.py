@@ -176,7 +176,7 @@ def test_too_little_space_is_noticed_before_anything_is_written(
 ) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
     monkeypatch.setattr(estimate.shutil, "disk_usage", lambda path: usage(10**6, 0, 5000))
-    with pytest.raises(DataError, match="not enough space: about .* 32 frames of 8 sequences in 4 shards"):
+    with pytest.raises(DataError, match=r"not enough space: about .* 32 frames of 8 sequences in 4 shards"):
         make(ListedSource(NAMES), tmp_path / "store")
     assert not list((tmp_path / "store").glob("*.arrow*"))
 

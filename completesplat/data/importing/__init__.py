@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 def import_capture(
     out: Path | str,
-    category: str,
+    category: str | None,
     transforms: Path | str | None = None,
     colmap: Path | str | None = None,
     images: Path | str | None = None,
@@ -52,6 +52,8 @@ def import_capture(
         )
     if hold_out < 2 or not 1 <= quality <= 100:
         raise CompleteSplatError(f"hold_out must be at least 2 and quality 1 to 100, not {hold_out} and {quality}")
+    if category is None:
+        raise CompleteSplatError("category is needed: give category=NAME")
     folder = Path(out) / _plain("category", str(category))
     if folder.exists():
         raise DataError("is there already: remove it or choose another category", str(folder))
@@ -106,7 +108,7 @@ def _report(folder: Path, sequence: str, written: Written) -> None:
         written.frames - written.held_out,
         written.held_out,
     )
-    logger.info("%d points in its point cloud" if written.points else "no point cloud (%d points)", written.points)
+    logger.info("point cloud: %s", f"{written.points} points" if written.points else "none")
     root = shlex.quote(f"data.root={folder.parent}")
     data = f"data=co3d_category {root} data.category={folder.name} data.subset={SUBSET}"
     logger.info("to look at it:  completesplat data show %s", data)

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -133,11 +133,11 @@ def kept_record(folder: Path, plan: ShardPlan, on_bad: OnBad) -> ShardRecord | N
     return ShardRecord(plan.split, names, shard, refused)
 
 
-def cut(sources: Mapping[str, SequenceSource], splits: Sequence[str], sequences_per_shard: int) -> list[ShardPlan]:
+def cut(sources: Mapping[str, SequenceSource], sequences_per_shard: int) -> list[ShardPlan]:
     """Which sequences go into which shard; those of one group of a source stay together as far as they fit."""
     plans = []
-    for split in splits:
-        parts = _parts(sources[split], sequences_per_shard)
+    for split, source in sources.items():
+        parts = _parts(source, sequences_per_shard)
         plans += [
             ShardPlan(f"{split}-{number:05d}-of-{len(parts):05d}.arrow", split, names)
             for number, names in enumerate(parts)

@@ -82,49 +82,34 @@ def prepare(
     """
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
-    splits = [split for split in SPLITS if split in sources]
-    plans = cut(sources, splits, sequences_per_shard)
-    _claim(out, _plan(sources, splits, settings, codec, plans))
-    listed = [Refusal.of(error) for split in splits for error in sources[split].refused]
-    if on_bad == "raise" and listed:
-        raise next(error for split in splits for error in sources[split].refused)
+    writer = ShardWriter({split: sources[split] for split in sorted(sources, key=SPLITS.index)}, out, codec, on_bad)
+    plans = cut(writer.sources, sequences_per_shard)
+    _claim(out, _plan(writer, settings, plans))
     records = {plan: kept_record(out, plan, on_bad) for plan in plans}
     missing = [plan for plan, record in records.items() if record is None]
     if is_prepared(out) and not missing:
         logger.info("%s already holds these sequences", out)
         return out
     _remove_unfinished(out)
+    listed = [error for source in writer.sources.values() for error in source.refused]
+    if on_bad == "raise" and listed:
+        raise listed[0]
     if missing:
-        writer = ShardWriter({split: sources[split] for split in splits}, out, codec, on_bad)
         check_space(writer, missing)
-        workers = min(workers or os.cpu_count() or 1, len(missing))
-        records.update(zip(missing, _with_progress(missing, _write(writer, missing, workers), progress), strict=True))
-    made = [record for record in records.values() if record is not None]
-    _check_share(out, made, listed, most_bad)
-    splits_made = {
-        split: _split(sources[split], [record for record in made if record.split == split]) for split in splits
-    }
-    manifest = Manifest(out, codec, dict(settings), splits_made)
-    write_manifest(manifest)
-    _report(manifest)
+        records.update(zip(missing, _write_all(writer, missing, workers, progress), strict=True))
+    _finish(writer, settings, [record for record in records.values() if record is not None], most_bad)
     return out
 
 
-def _plan(
-    sources: Mapping[str, SequenceSource],
-    splits: Sequence[str],
-    settings: Mapping[str, Scalar],
-    codec: str,
-    plans: Sequence[ShardPlan],
-) -> dict[str, Any]:
+def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[ShardPlan]) -> dict[str, Any]:
     """All that the shards' bytes depend on."""
     shards = json.dumps([[plan.file, *plan.names] for plan in plans])
     return {
         "settings": dict(settings),
         "made from": {
             "format": FORMAT,
-            "codec": codec,
-            **{f"fingerprint of {split}": sources[split].fingerprint() for split in splits},
+            "codec": writer.codec,
+            **{f"fingerprint of {split}": source.fingerprint() for split, source in writer.sources.items()},
             "shards": hashlib.sha256(shards.encode()).hexdigest(),
         },
     }
@@ -166,27 +151,43 @@ def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int) -> Ite
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _with_progress(plans: Sequence[ShardPlan], records: Iterator[ShardRecord], progress: bool) -> Iterator[ShardRecord]:
+def _write_all(
+    writer: ShardWriter, plans: Sequence[ShardPlan], workers: int | None, progress: bool
+) -> Iterator[ShardRecord]:
+    workers = min(workers or os.cpu_count() or 1, len(plans))
     with Progress(disable=not progress) as bar:
         task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in plans))
-        for record in records:
+        for record in _write(writer, plans, workers):
             bar.advance(task, len(record.names))
             yield record
 
 
-def _check_share(out: Path, records: Sequence[ShardRecord], listed: Sequence[Refusal], most_bad: float) -> None:
-    refused = [*listed, *(refusal for record in records for refusal in record.refused)]
-    kept = sum(len(record.shard.sequences) for record in records)
-    kinds = _by_kind(refused)
+def _finish(
+    writer: ShardWriter, settings: Mapping[str, Scalar], records: Sequence[ShardRecord], most_bad: float
+) -> None:
+    splits = {
+        split: _split(source, [record for record in records if record.split == split])
+        for split, source in writer.sources.items()
+    }
+    manifest = Manifest(writer.folder, writer.codec, dict(settings), splits)
+    _check_share(manifest, most_bad)
+    write_manifest(manifest)
+    _report(manifest)
+
+
+def _check_share(manifest: Manifest, most_bad: float) -> None:
+    splits, out = manifest.splits.values(), str(manifest.root)
+    refused = [refusal for split in splits for refusal in split.refused]
+    kept, kinds = sum(len(split.names) for split in splits), _by_kind(refused)
     if not kept:
-        raise DataError(f"not one sequence can be used: {kinds}", str(out))
+        raise DataError(f"not one sequence can be used: {kinds}", out)
     bad_frames = sum(refusal.frame is not None for refusal in refused)
     bad_sequences = len({refusal.sequence or refusal.file for refusal in refused if refusal.frame is None})
-    frames = sum(record.shard.frames for record in records)
+    frames = sum(shard.frames for split in splits for shard in split.shards)
     share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + kept))
     if share > most_bad:
         advice = "see the .json beside the shards, and put the data right (then remove this folder) or raise most_bad"
-        raise DataError(f"{share:.1%} of the data are bad, at most {most_bad:.1%} may be ({kinds}): {advice}", str(out))
+        raise DataError(f"{share:.1%} of the data are bad, at most {most_bad:.1%} may be ({kinds}): {advice}", out)
 
 
 def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:

@@ -121,7 +121,7 @@ def _with_outline(picture: Picture) -> Image.Image:
     pixels = np.array(image.resize((CELL, CELL), Image.Resampling.BOX))
     if picture.mask is not None:
         mask = Image.fromarray(np.ascontiguousarray(picture.mask[0].numpy()))
-        inside = np.array(mask.resize((CELL, CELL), Image.Resampling.BOX)) >= 64
+        inside = np.array(mask.resize((CELL, CELL), Image.Resampling.BOX)) >= 128
         padded = np.pad(inside, 1, mode="edge")
         neighbors = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
         pixels[inside & ~neighbors] = MASK

@@ -143,6 +143,7 @@ def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
         ({"transforms": "a", "masks": "c"}, "colmap=FOLDER goes with images=FOLDER"),
         ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
         ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
+        ({"transforms": "a", "category": None}, "category is needed: give category=NAME"),
         ({"transforms": "a", "category": "a/b"}, "category must be a folder name"),
         ({"transforms": "a", "category": ".."}, "category must be a folder name"),
         ({"transforms": "a", "sequence": ""}, "sequence must be a folder name"),

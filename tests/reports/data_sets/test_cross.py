@@ -31,6 +31,16 @@ def test_it_stands_farther_away_where_the_cameras_would_walk_past_it(walk):
     assert depth[0, 0] < 12
 
 
+@pytest.mark.parametrize("turned", [1, 12])
+def test_it_does_not_stand_where_axes_meet_behind_a_camera(orbit, turned):
+    """Around the origin, where the first cameras, or all, look outwards."""
+    cameras = orbit(12).cameras
+    poses = cameras.world_to_camera.clone()
+    poses[:turned] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])).double() @ poses[:turned]
+    wrong = Cameras(poses, cameras.intrinsics, cameras.image_size)
+    assert place_cross(wrong, torch.tensor([1.0, 3.0])).center.norm() > 0.3
+
+
 def test_inverted_poses_do_not_hold_the_cross_in_its_place(orbit):
     """Right poses show an orbit's cross in the middle of all pictures, from where it is looked at."""
     sequence = orbit(12, height=1.0, center=(0.5, 0.0, 0.5))

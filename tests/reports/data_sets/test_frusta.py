@@ -2,7 +2,9 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
+from completesplat.geometry.cameras import project
 from completesplat.reports.data_sets.cross import place_cross
 from completesplat.reports.data_sets.frusta import drawings, time_color
 
@@ -65,6 +67,14 @@ def test_a_frustum_opens_by_its_field_of_view(walk, fov):
     top, apex = pixels[:, 1].min(), pixels[:, 1].max() - 2
     width = np.ptp(pixels[:, 0])
     assert width / (apex - top) == pytest.approx(2 * math.tan(math.radians(fov / 2)), rel=0.12)
+
+
+def test_frusta_end_in_the_corners_of_the_pictures(orbit):
+    sequence = orbit(5, height=1.0, fov=70.0)
+    pixels, depth = project(sequence.cameras, drawn(sequence).frusta[:, 1:5])
+    corners = torch.tensor([[0, 0], [24, 0], [24, 24], [0, 24]]).double()
+    assert torch.allclose(pixels, corners.expand(5, 4, 2), atol=1e-6)
+    assert (depth > 0).all()
 
 
 def test_the_tick_at_the_upper_edge_tells_which_way_up_a_camera_is(walk):
