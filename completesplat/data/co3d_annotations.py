@@ -136,7 +136,9 @@ def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
 
 def _depth(root: Path, entry: object) -> DepthMap:
     path = inside(root, field(entry, "path", str))
-    return DepthMap(path, float(finite_array(field(entry, "scale_adjustment", float), (), "scale_adjustment")))
+    # Some writers leave out the fraction of a whole number.
+    scale = entry.get("scale_adjustment") if isinstance(entry, dict) else None
+    return DepthMap(path, float(finite_array(scale, (), "scale_adjustment")))
 
 
 def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) -> Cameras:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from completesplat.data.checks import BadAnnotation, Refuse
+from completesplat.data.checks import BadAnnotation, Refuse, inside
 from completesplat.data.co3d_annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
 from completesplat.data.co3d_splits import SeededSplit, read_set_list, set_list_path, split_by_seed
 from completesplat.data.sequences import SPLITS
@@ -52,9 +52,9 @@ def read_category(root: Path, category: str, subset: str | None, seeded: SeededS
     Frames that the set list does not name are not looked at.
 
     Raises:
-        DataError: the category, its annotations or its set list is missing or unreadable as a whole.
+        DataError: the category, its annotations or its set list is missing, outside of `root`, or unreadable as a whole.
     """
-    folder = root / category
+    folder = inside(root, category)
     if not folder.is_dir():
         raise DataError("no such CO3D category", str(folder))
     frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"

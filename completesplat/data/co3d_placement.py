@@ -73,8 +73,11 @@ def from_depth_maps(frames: Sequence[CO3DFrame]) -> Placement:
         BadPlacement: no foreground with a known depth.
     """
     chosen = [frames[i * len(frames) // DEPTH_MAPS] for i in range(DEPTH_MAPS)] if len(frames) > DEPTH_MAPS else frames
-    points = np.concatenate([_foreground(frame) for frame in chosen])
-    return _placement(points, DEPTH_QUANTILE, "the depth maps' foreground")
+    points = []
+    for frame in chosen:
+        with at(frame=frame.number):
+            points.append(_foreground(frame))
+    return _placement(np.concatenate(points), DEPTH_QUANTILE, "the depth maps' foreground")
 
 
 def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:

@@ -75,7 +75,8 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> dic
     if len(frames) < FEWEST_SEQUENCES:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
-    train, val = split_by_hash(rest, rule.val_fraction, rule.seed)
+    # The rest's hashes lie above the test fraction, so the next share of them is validation's.
+    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.seed)
     if not train:
         raise DataError(
             f"no training sequences with val_fraction={rule.val_fraction}, test_fraction={rule.test_fraction}"

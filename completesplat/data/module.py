@@ -24,8 +24,8 @@ from completesplat.data.typical_camera import TypicalCamera, typical_camera
 from completesplat.errors import CompleteSplatError, DataError
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
-# A mean over all of RealEstate10K's 66,033 training clips would take hours.
-SEQUENCES_OF_MEANS, FRAMES_OF_MEANS = 256, 8
+# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
+SEQUENCES_OF_MEANS, PICTURES_OF_MEANS = 400, 8192
 
 logger = logging.getLogger(__name__)
 
@@ -200,12 +200,12 @@ class SceneDataModule(LightningDataModule):
             logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
 
     def typical_camera(self) -> TypicalCamera:
-        """The mean camera of some training frames: 8 of each of 256 sequences at most."""
+        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences."""
         chosen = [(sequence, frames) for sequence, frames in self._excerpts()]
         return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
-        """Mean of some training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
+        """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
         store = self.store("train")
         total, count = torch.zeros(3, self.image_size, self.image_size, dtype=torch.float64), 0
         for sequence, frames in self._excerpts():
@@ -218,8 +218,10 @@ class SceneDataModule(LightningDataModule):
     def _excerpts(self) -> Iterator[tuple[PosedSequence, list[int]]]:
         """The first sequences that can be read, each with evenly spaced frames."""
         store = self.store("train")
-        for name in store.names[:SEQUENCES_OF_MEANS]:
+        names = store.names[:SEQUENCES_OF_MEANS]
+        most = PICTURES_OF_MEANS // len(names)
+        for name in names:
             with suppress(DataError):
                 sequence = store.source.read(name)
                 count = len(sequence.frames)
-                yield sequence, sorted({i * count // FRAMES_OF_MEANS for i in range(FRAMES_OF_MEANS)})
+                yield sequence, sorted({i * count // most for i in range(most)})

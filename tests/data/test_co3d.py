@@ -5,12 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, write_tree
 from lightning import LightningModule, Trainer
 from PIL import Image
 from plyfile import PlyData
 
 from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.co3d_annotations import object_placement
+from completesplat.data.co3d_category import Filters, SplitMembers, read_category
+from completesplat.data.co3d_placement import from_point_cloud
+from completesplat.data.co3d_splits import SeededSplit
 from completesplat.data.toy import write_objects
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import project
@@ -21,6 +24,15 @@ def module(root: Path, **settings) -> CO3DDataModule:
     data = CO3DDataModule(str(root), "toy_objects", **{"image_size": 16, "batch_size": 2, "targets": 2, **settings})
     data.setup()
     return data
+
+
+def members(root: Path, split: str) -> SplitMembers:
+    return read_category(root, "toy_objects", SUBSET, SeededSplit(0.1, 0.1, 0), Filters()).splits[split]
+
+
+def scene(data: CO3DDataModule, split: str, index: int, reference: int, targets: list[int]) -> SceneBatch:
+    store = data.store(split)
+    return store.scene(store.source.read(store.names[index]), reference, targets)
 
 
 def epoch(loader, number: int) -> list[SceneBatch]:
@@ -62,37 +74,37 @@ def test_the_world_is_the_reference_frame(toy_root):
 
 def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
     """The point cloud, brought into the reference frame, spans 0.57 and projects onto every view's mask."""
-    store = module(toy_root, depth_before=1.0, depth_after=2.0).store("test")
-    scene = store.scene(0, 0, [1, 2, 3])
-    cloud = store.sequences[0].point_cloud
-    center, factor = object_placement(cloud)
+    seen = scene(module(toy_root, depth_before=1.0, depth_after=2.0), "test", 0, 0, [1, 2, 3])
+    ((name, frames),) = members(toy_root, "test").frames.items()
+    cloud = toy_root / "toy_objects" / name / "pointcloud.ply"
+    center, half_size = from_point_cloud(cloud)
+    factor = 0.57 / half_size
     vertices = PlyData.read(str(cloud))["vertex"]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     assert np.abs(points - center.numpy()).max() * factor == pytest.approx(0.57)
-    pose = store.sequences[0].frames[0].camera.world_to_camera.numpy()
+    pose = frames[0].camera.world_to_camera.numpy()
     local = torch.from_numpy((points @ pose[:3, :3].T + pose[:3, 3]) * factor).float()
     for view in range(3):
-        pixels = project(scene.targets.cameras[view], local)[0].long()
-        mask = scene.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]]
+        pixels = project(seen.targets.cameras[view], local)[0].long()
+        mask = seen.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]]
         assert (mask > 0).float().mean() > 0.97
     middle = local.mean(dim=0)[2].item()
-    assert scene.depth_range.tolist() == pytest.approx([middle - 1, middle + 2], abs=1e-4)
+    assert seen.depth_range.tolist() == pytest.approx([middle - 1, middle + 2], abs=1e-4)
     assert 1.8 < middle < 2.4
 
 
 def test_the_near_end_stays_in_front_of_the_camera(toy_root):
-    near, far = module(toy_root, depth_before=50.0).store("test").scene(0, 0, [1]).depth_range.tolist()
+    near, far = scene(module(toy_root, depth_before=50.0), "test", 0, 0, [1]).depth_range.tolist()
     assert 0 < near < far
 
 
 def test_pictures_are_the_files_where_nothing_is_resized(toy_root):
-    store = module(toy_root, image_size=32).store("train")
-    scene = store.scene(1, 2, [0])
-    frame = store.sequences[1].frames[2]
+    seen = scene(module(toy_root, image_size=32), "train", 1, 2, [0])
+    frame = members(toy_root, "train").frames[seen.names][2]
     expected = torch.from_numpy(np.asarray(Image.open(frame.image)).copy()).permute(2, 0, 1) / 255
-    torch.testing.assert_close(scene.reference.images, expected)
+    torch.testing.assert_close(seen.reference.images, expected)
     mask = torch.from_numpy(np.asarray(Image.open(frame.mask)).copy())[None] / 255
-    torch.testing.assert_close(scene.reference.masks, mask)
+    torch.testing.assert_close(seen.reference.masks, mask)
 
 
 def test_epochs_differ_and_can_be_repeated(toy_root):
@@ -106,8 +118,9 @@ def test_epochs_differ_and_can_be_repeated(toy_root):
 
 def test_an_item_draws_other_views_in_another_epoch(toy_root):
     items = module(toy_root, references_per_sequence=4).train_dataloader().dataset
-    assert not equal([items[0, i] for i in range(8)], [items[1, i] for i in range(8)])
-    assert equal([items[1, i] for i in range(8)], [items[1, i] for i in range(8)])
+    drawn = [[items[epoch, i].scenes for i in range(8)] for epoch in (0, 1, 1)]
+    assert not equal(drawn[0], drawn[1])
+    assert equal(drawn[1], drawn[2])
 
 
 def test_neither_workers_nor_the_cache_change_what_is_drawn(toy_root):
@@ -121,20 +134,19 @@ def test_evaluation_goes_from_the_first_frame_to_all_others(toy_root):
     data = module(toy_root)
     for loader, split in ((data.test_dataloader(), "test"), (data.val_dataloader(), "val")):
         (batch,) = list(loader)
-        expected = data.store(split).scene(0, 0, [1, 2, 3])
-        assert batch.names == (data.store(split).sequences[0].name,)
+        expected = scene(data, split, 0, 0, [1, 2, 3])
+        assert batch.names == tuple(members(toy_root, split).frames)
         assert torch.equal(batch.reference.images[0], expected.reference.images)
         assert torch.equal(batch.targets.images[0], expected.targets.images)
     (batch,) = list(module(toy_root, evaluation_targets=1).test_dataloader())
     assert batch.targets.images.shape[1] == 1
 
 
-def test_evaluation_scenes_of_unequal_length_come_one_by_one(toy_root):
-    data = module(toy_root, evaluation_batch_size=2)
-    members = data.store("train").sequences
-    shorter = type(members[0])("shorter", members[0].frames[:3], members[0].point_cloud)
-    data.store("test").sequences.append(shorter)
+def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
+    write_tree(tmp_path, {"a": 4, "b": 3, "c": 4}, {"train": ["c"], "val": ["a", "c"], "test": ["a", "b"]})
+    data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, evaluation_batch_size=2)
     assert [batch.targets.images.shape[:2] for batch in data.test_dataloader()] == [(1, 3), (1, 2)]
+    assert [batch.targets.images.shape[:2] for batch in data.val_dataloader()] == [(2, 3)]
 
 
 class Recorder(LightningModule):
@@ -171,23 +183,49 @@ def test_lightning_tells_the_sampler_the_epoch(toy_root, workers):
 def test_typical_camera_is_the_mean_of_the_training_frames(toy_root):
     data = module(toy_root, depth_before=1.0, depth_after=2.0)
     fov, (near, far), _ = data.typical_camera()
-    scenes = [data.store("train").scene(i, f, [0]) for i in range(2) for f in range(4)]
-    ranges = torch.stack([scene.depth_range for scene in scenes])
+    scenes = [scene(data, "train", i, f, [0]) for i in range(2) for f in range(4)]
+    ranges = torch.stack([seen.depth_range for seen in scenes])
     assert (near, far) == pytest.approx(tuple(ranges.mean(dim=0).tolist()))
     # Half of the image over the focal length is the tangent of half of the angle.
-    angles = [2 * np.degrees(np.arctan(8 / scene.reference.cameras.intrinsics[0, 0].item())) for scene in scenes]
+    angles = [2 * np.degrees(np.arctan(8 / seen.reference.cameras.intrinsics[0, 0].item())) for seen in scenes]
     assert fov == pytest.approx(np.mean(angles))
 
 
 def test_mean_image_is_the_mean_of_the_training_frames(toy_root):
     data = module(toy_root)
-    images = [data.store("train").scene(i, f, [0]).reference.images for i in range(2) for f in range(4)]
+    images = [scene(data, "train", i, f, [0]).reference.images for i in range(2) for f in range(4)]
     torch.testing.assert_close(data.mean_image(), torch.stack(images).mean(dim=0))
 
 
 def test_an_empty_split_is_refused_where_it_is_needed(tmp_path):
     write_objects(tmp_path, scenes=1, frames=2, size=8, seed=0, workers=1, progress=False)
     data = CO3DDataModule(str(tmp_path), "toy_objects")
-    for stage in ("fit", "validate", "test"):
-        with pytest.raises(DataError, match="fewview_train"):
+    for stage, split in (("fit", "val"), ("validate", "val"), ("test", "test")):
+        with pytest.raises(DataError, match=f"no {split} sequences") as caught:
             data.setup(stage)
+        assert caught.value.file == str(tmp_path)
+
+
+@pytest.mark.parametrize("threshold", [0.25, 0.5, 1.0])
+def test_masks_are_soft_or_cut_at_a_probability(toy_root, threshold):
+    soft = scene(module(toy_root), "test", 0, 0, [1, 2]).targets.masks
+    cut = scene(module(toy_root, mask_threshold=threshold), "test", 0, 0, [1, 2]).targets.masks
+    assert ((soft > 0) & (soft < 1)).any()
+    assert torch.equal(cut, (soft >= threshold).float())
+
+
+def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
+    category = write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+
+    def fingerprint() -> str:
+        return CO3DDataModule(str(tmp_path), CATEGORY, image_size=8).source("train").fingerprint()
+
+    found = [fingerprint(), fingerprint()]
+    change(category / SEQUENCES, lambda entries: entries[0].update(viewpoint_quality_score=0.5))
+    found.append(fingerprint())
+    change(category / FRAMES, lambda entries: entries[0]["viewpoint"].update(focal_length=[3, 3.1]))
+    found.append(fingerprint())
+    change(category / SET_LIST, lambda splits: splits["val"].clear())
+    found.append(fingerprint())
+    assert found[0] == found[1]
+    assert len(set(found)) == 4

@@ -101,11 +101,11 @@ def test_a_shard_that_is_missing_or_shorter_is_made_again(damage: str, tmp_path:
     assert contents(out) == before
 
 
-def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(DataError, match="something else"):
+def test_a_folder_with_other_shards_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "train-00000-of-00001.arrow").write_text("mine")
+    with pytest.raises(DataError, match="other prepared sequences"):
         make(ListedSource(NAMES), tmp_path)
-    assert list(contents(tmp_path)) == ["notes.txt"]
+    assert list(contents(tmp_path)) == ["train-00000-of-00001.arrow"]
 
 
 def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> None:

@@ -118,8 +118,8 @@ def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[S
 def _claim(out: Path, plan: dict[str, Any]) -> None:
     path = out / PLAN
     if not path.is_file():
-        if out.exists() and (not out.is_dir() or any(entry.name != f"{PLAN}{UNFINISHED}" for entry in out.iterdir())):
-            raise DataError("already holds something else: choose another folder", str(out))
+        if is_prepared(out) or any(out.glob("*.arrow")):
+            raise DataError("already holds other prepared sequences: choose another folder", str(out))
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, plan)
     found = read_json(path)
@@ -204,7 +204,7 @@ def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
 
 def _by_kind(refused: Sequence[Refusal]) -> str:
     counts = Counter(refusal.kind for refusal in refused)
-    return ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing refused"
+    return ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
 
 
 def _report(manifest: Manifest) -> None:

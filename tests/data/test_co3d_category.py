@@ -1,0 +1,233 @@
+"""Which sequences and frames of a category are taken for which split: set lists, a split by seed, filters."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from co3d_trees import (
+    CATEGORY,
+    FRAMES,
+    SEQUENCES,
+    SET_LIST,
+    SUBSET,
+    change,
+    frame_entry,
+    look,
+    orbit,
+    sequence_entry,
+    write_annotations,
+    write_tree,
+)
+
+from completesplat.data.checks import BadCamera, OutsidePath
+from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.co3d_category import Category, Filters, read_category
+from completesplat.data.co3d_placement import from_depth_maps
+from completesplat.data.co3d_splits import SeededSplit
+from completesplat.errors import CompleteSplatError, DataError
+
+SPLITS = ("train", "val", "test")
+
+
+def annotate(
+    root: Path,
+    counts: Mapping[str, int],
+    splits: Mapping[str, Sequence[str]] | None = None,
+    qualities: Mapping[str, tuple[float | None, float | None]] | None = None,
+) -> None:
+    """Annotations without any picture."""
+    viewpoints = [look(eye, np.zeros(3)) for eye in orbit(max(counts.values(), default=0))]
+    frames = [frame_entry(name, i, viewpoints[i]) for name, count in counts.items() for i in range(count)]
+    write_annotations(root, frames, [sequence_entry(n, *(qualities or {}).get(n, (1.0, 1.0))) for n in counts], splits)
+
+
+def read(root: Path, subset: str | None = SUBSET, rule: SeededSplit | None = None, **filters) -> Category:
+    return read_category(root, CATEGORY, subset, rule or SeededSplit(0.2, 0.3, 0), Filters(**filters))
+
+
+def names(category: Category) -> dict[str, set[str]]:
+    return {split: set(category.splits[split].frames) for split in SPLITS}
+
+
+def numbers(category: Category, split: str, name: str) -> list[int]:
+    return [frame.number for frame in category.splits[split].frames[name]]
+
+
+def many(count: int) -> dict[str, int]:
+    return {f"{i:03}_{i * i}": 2 for i in range(count)}
+
+
+def test_frames_come_in_order_whatever_the_file_says(tmp_path):
+    annotate(tmp_path, {"a": 4, "b": 4, "c": 4}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+    change(tmp_path / CATEGORY / FRAMES, lambda entries: entries.reverse())
+    change(tmp_path / CATEGORY / SET_LIST, lambda splits: splits["train"].reverse())
+    category = read(tmp_path)
+    assert [numbers(category, split, name) for split, name in zip(SPLITS, "abc", strict=True)] == [[0, 1, 2, 3]] * 3
+    assert category.splits["train"].frames["a"][0].camera.image_size == (24, 32)
+
+
+def test_without_set_lists_whole_sequences_are_split_by_seed(tmp_path):
+    annotate(tmp_path, many(60))
+    category = read(tmp_path)
+    taken = names(category)
+    assert taken["train"] | taken["val"] | taken["test"] == set(many(60))
+    assert sum(map(len, taken.values())) == 60
+    assert all(len(frames) == 2 for split in SPLITS for frames in category.splits[split].frames.values())
+    assert taken != names(read(tmp_path, rule=SeededSplit(0.2, 0.3, 1)))
+    assert taken == names(read(tmp_path, subset=None))
+
+
+@pytest.mark.parametrize(("val", "test"), [(0.05, 0.1), (0.1, 0.05), (0.3, 0.3)])
+def test_a_split_by_seed_holds_out_the_asked_shares(tmp_path, val, test):
+    """Within four standard deviations of a binomial share."""
+    annotate(tmp_path, many(400))
+    taken = names(read(tmp_path, rule=SeededSplit(val, test, 0)))
+    for split, share in (("val", val), ("test", test)):
+        assert abs(len(taken[split]) - 400 * share) < 4 * math.sqrt(400 * share * (1 - share))
+
+
+def test_sequences_stay_in_their_split_when_others_come(tmp_path):
+    annotate(tmp_path / "few", many(40))
+    annotate(tmp_path / "more", many(100))
+    few, more = names(read(tmp_path / "few")), names(read(tmp_path / "more"))
+    assert all(few[split] == more[split] & set(many(40)) for split in SPLITS)
+    assert all(few.values())
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_fewer_than_three_sequences_cannot_be_split(tmp_path, count):
+    annotate(tmp_path, many(count))
+    with pytest.raises(DataError, match=f"{count} sequences cannot be split"):
+        read(tmp_path)
+
+
+def test_three_sequences_are_one_for_each_split(tmp_path):
+    annotate(tmp_path, many(3))
+    assert [len(taken) for taken in names(read(tmp_path, rule=SeededSplit(0, 0, 0))).values()] == [1, 1, 1]
+
+
+def test_a_split_by_seed_without_training_sequences_is_refused(tmp_path):
+    annotate(tmp_path, many(5))
+    with pytest.raises(DataError, match="no training sequences with val_fraction=0.6, test_fraction=0.4"):
+        read(tmp_path, rule=SeededSplit(0.6, 0.4, 0))
+
+
+def test_null_splits_by_seed_where_there_are_set_lists(tmp_path):
+    annotate(tmp_path, many(30), {"train": list(many(30)), "val": [], "test": []})
+    assert names(read(tmp_path))["test"] == set()
+    assert len(names(read(tmp_path, subset=None))["test"]) > 0
+
+
+def test_an_unknown_subset_is_refused_with_those_that_are_there(tmp_path):
+    annotate(tmp_path, many(3), {"train": list(many(3)), "val": [], "test": []})
+    (tmp_path / CATEGORY / "set_lists/set_lists_manyview_dev_0.json").write_text("{}")
+    with pytest.raises(DataError, match=r"'other'.*fewview_train, manyview_dev_0") as caught:
+        read(tmp_path, subset="other")
+    assert caught.value.file == str(tmp_path / CATEGORY / "set_lists")
+
+
+def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
+    """It has lists for many views only, each of one sequence whose frames are divided."""
+    category = write_tree(tmp_path, {"one": 9, "two": 3}, None)
+    parts = {"train": [0, 1, 3, 4], "val": [2, 5], "test": [6, 7, 8]}
+    listed = {split: [["one", i, f"{CATEGORY}/one/images/x"] for i in part] for split, part in parts.items()}
+    (category / "set_lists").mkdir()
+    (category / "set_lists/set_lists_manyview_dev_0.json").write_text(json.dumps(listed))
+    data = CO3DDataModule(str(tmp_path), CATEGORY, subset="manyview_dev_0", image_size=8, on_bad="raise")
+    data.setup("fit")
+    data.setup("test")
+    assert {s: {n: data.source(s).read(n).frames for n in data.source(s).names} for s in SPLITS} == {
+        split: {"one": tuple(part)} for split, part in parts.items()
+    }
+    assert [batch.names for batch in data.train_dataloader()] == [("one",)]
+    with pytest.raises(DataError, match="among manyview_dev_0"):
+        CO3DDataModule(str(tmp_path), CATEGORY).setup("fit")
+
+
+def test_sequences_with_few_frames_are_left_out_and_named(tmp_path):
+    annotate(tmp_path, {"a": 1, "b": 2, "c": 5, "d": 5}, {"train": "abc", "val": ["d"], "test": ["a", "d"]})
+    category = read(tmp_path)
+    assert names(category) == {"train": {"b", "c"}, "val": {"d"}, "test": {"d"}}
+    assert [category.splits[s].left_out for s in SPLITS] == [
+        {"fewer than 2 frames": ["a"]}, {}, {"fewer than 2 frames": ["a"]},
+    ]  # fmt: skip
+    assert category.refused == []
+    assert read(tmp_path, min_frames=5).splits["train"].left_out == {"fewer than 5 frames": ["a", "b"]}
+    with pytest.raises(CompleteSplatError, match="min_frames=1"):
+        CO3DDataModule(str(tmp_path), CATEGORY, min_frames=1)
+
+
+def test_scores_below_the_least_or_not_given_leave_a_sequence_out(tmp_path):
+    qualities = {"a": (0.5, 0.2), "b": (0.49, 0.9), "c": (None, 0.9), "d": (0.9, None), "e": (-1.0, 0.9)}
+    everything = {"train": "abcde", "val": "abcde", "test": "abcde"}
+    annotate(tmp_path, dict.fromkeys("abcde", 2), everything, qualities)
+    for split in SPLITS:
+        assert read(tmp_path).splits[split].left_out == {}
+        by_views = read(tmp_path, min_viewpoint_quality=0.5).splits[split]
+        assert set(by_views.frames) == set(by_views.point_clouds) == {"a", "d"}
+        assert by_views.left_out == {"viewpoint quality below 0.5, or not given": ["b", "c", "e"]}
+        both = read(tmp_path, min_viewpoint_quality=0.0, min_point_cloud_quality=0.3, min_frames=2).splits[split]
+        assert set(both.frames) == {"b"}
+        assert both.left_out == {
+            "viewpoint quality below 0, or not given": ["c", "e"],
+            "point cloud quality below 0.3, or not given": ["a", "d"],
+        }
+
+
+def test_of_the_training_sequences_the_best_are_kept(tmp_path):
+    """Ties go by name; a sequence without a score is the last; validation and test keep all."""
+    qualities = {"a": (0.1, 1), "b": (0.9, 1), "c": (None, 1), "d": (0.7, 1), "e": (0.9, 1)}
+    annotate(
+        tmp_path, dict.fromkeys("abcde", 2), {"train": "abcde", "val": "abcde", "test": "abc"}, qualities
+    )  # fmt: skip
+    for most, kept in ((1, "b"), (2, "be"), (3, "bde"), (4, "abde"), (5, "abcde"), (9, "abcde")):
+        category = read(tmp_path, most_training_sequences=most)
+        assert names(category) == {"train": set(kept), "val": set("abcde"), "test": set("abc")}
+        gone = [name for reason in category.splits["train"].left_out.values() for name in reason]
+        assert set(gone) == set("abcde") - set(kept)
+        assert len(gone) == 5 - len(kept)
+
+
+def test_cameras_that_do_not_move_are_refused(tmp_path):
+    """Within a hundredth of their distance to the object, also where they turn."""
+    category = write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+
+    def stand(entries):
+        eye = np.array([0.0, 0.0, -4.0])
+        for i in range(3):
+            entries[i]["viewpoint"] = look(eye + [0.019 * i, 0, 0], np.array([0.3 * i, 0, 0]))
+            entries[3 + i]["viewpoint"] = look(eye + [0.022 * i, 0, 0], np.array([0.3 * i, 0, 0]))
+
+    change(category / FRAMES, stand)
+    data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8)
+    with pytest.raises(BadCamera, match="do not move") as caught:
+        data.source("train").read("a")
+    assert (caught.value.file, caught.value.sequence) == (str(category / FRAMES), "a")
+    assert data.source("val").read("b").frames == (0, 1, 2)
+
+
+def test_missing_and_outside_categories_are_refused(tmp_path):
+    annotate(tmp_path / "root", many(3))
+    annotate(tmp_path, many(3))
+    with pytest.raises(DataError, match="no such CO3D category") as caught:
+        read_category(tmp_path / "root", "none", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+    assert caught.value.file == str(tmp_path / "root/none")
+    for outside in (f"../{CATEGORY}", f"{CATEGORY}/../../{CATEGORY}", str(tmp_path / CATEGORY), ""):
+        with pytest.raises(OutsidePath):
+            read_category(tmp_path / "root", outside, SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+
+
+def test_sequences_without_a_cloud_are_placed_by_their_depth_maps(tmp_path):
+    """The maps of `write_tree` show a disc across the axis of each camera, at the origin: its distance stays 4."""
+    category = write_tree(tmp_path, {"a": 6, "b": 2, "c": 2}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+    change(category / SEQUENCES, lambda entries: entries[0].update(point_cloud=None))
+    data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, on_bad="raise", depth_before=0.5, depth_after=0.7)
+    frames = read(tmp_path).splits["train"].frames["a"]
+    distance = 4 * 0.57 / from_depth_maps(frames).half_size
+    sequence = data.source("train").read("a")
+    np.testing.assert_allclose(sequence.cameras.centers.norm(dim=-1), distance)
+    np.testing.assert_allclose(sequence.depth_ranges, [[distance - 0.5, distance + 0.7]] * 6, rtol=1e-6)
+    assert from_depth_maps(frames).half_size < 4 * 10 / 36

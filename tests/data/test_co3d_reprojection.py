@@ -1,0 +1,111 @@
+"""A known point stays on its pixel through annotations, crop, resizing and mirroring."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from co3d_trees import (
+    CATEGORY,
+    frame_entry,
+    look,
+    orbit,
+    pytorch3d_pixels,
+    sequence_entry,
+    write_annotations,
+    write_cloud,
+)
+from PIL import Image
+from torch import Tensor
+
+from completesplat.data.co3d import CO3DDataModule
+from completesplat.geometry.cameras import project
+from completesplat.scene import SceneBatch
+
+CENTER, HALF_SIZE = np.array([5.0, -3.0, 2.0]), 2.5
+POINT = CENTER + [0.35, 0.5, -0.3]
+FRAMES = 5
+SPREAD = 3.0  # of the blob, in pixels of the files
+SIZES = {"landscape": (90, 130), "portrait": (140, 96), "square": (100, 100)}
+LAYOUTS = ["ndc_norm_image_bounds", "ndc_isotropic"]
+PRINCIPAL_POINTS = {"central": [0.0, 0.0], "off_centre": [0.12, -0.2]}
+
+
+def picture(pixel: np.ndarray, size: tuple[int, int], number: int) -> np.ndarray:
+    """Red: a blob at `pixel`. Green: the frame's number. Blue: rises to the right, so that mirroring is seen."""
+    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    blob = 255 * np.exp(-((x - pixel[0]) ** 2 + (y - pixel[1]) ** 2) / (2 * SPREAD**2))
+    return np.stack([blob, 0 * x + 40 * number, 250 * x / size[1]], axis=-1).round().astype(np.uint8)
+
+
+def viewpoints(name: str, layout: str, principal_point: list[float]) -> list[dict]:
+    """Cameras that look past the object's centre, with focal lengths of their own for each axis and frame."""
+    return [
+        look(
+            eye, CENTER + [0.1 * number, 0, 0], layout,
+            focal_length=[3.0 + 0.1 * number, 3.3], principal_point=principal_point,
+        )
+        for number, eye in enumerate(CENTER + orbit(FRAMES, start=float("abc".index(name)), radius=12.0))
+    ]  # fmt: skip
+
+
+def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[float]) -> None:
+    """Three sequences of pictures of the point, without depth maps."""
+    entries = []
+    for name in "abc":
+        for part in ("images", "masks"):
+            (root / CATEGORY / name / part).mkdir(parents=True)
+        for number, viewpoint in enumerate(viewpoints(name, layout, principal_point)):
+            entry = frame_entry(name, number, viewpoint, size)
+            (pixel,), _ = pytorch3d_pixels(viewpoint, size, POINT[None])
+            pixels = picture(pixel, size, number)
+            Image.fromarray(pixels).save(root / entry["image"]["path"])
+            Image.fromarray(pixels[..., 0]).save(root / entry["mask"]["path"])
+            entries.append({**entry, "depth": None})
+        cube = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+        write_cloud(root / CATEGORY / name / "pointcloud.ply", CENTER + HALF_SIZE * cube)
+    write_annotations(root, entries, [sequence_entry(n) for n in "abc"], {"train": "a", "val": "b", "test": "c"})
+
+
+def centroid(values: Tensor) -> Tensor:
+    """(x, y) of the blob in a picture [height width], in pixels."""
+    weights = (values - 0.05).clamp(min=0)
+    y, x = (torch.arange(n) + 0.5 for n in values.shape)
+    return torch.stack([(weights.sum(0) * x).sum(), (weights.sum(1) * y).sum()]) / weights.sum()
+
+
+def point_in_reference(viewpoint: dict, is_mirrored: bool) -> Tensor:
+    """The point [1 3] as the reference's camera sees it (+x right, +y down), at the common scale."""
+    left, up, forward = POINT @ np.array(viewpoint["R"]) + viewpoint["T"]
+    seen = np.array([left if is_mirrored else -left, -up, forward]) * 0.57 / HALF_SIZE
+    return torch.tensor(seen[None], dtype=torch.float32)
+
+
+def mirrored(batch: SceneBatch) -> bool:
+    blue = batch.all_views().images[0, :, 2]
+    falls = {bool(view[:, 2].mean() > view[:, -3].mean()) for view in blue}
+    assert len(falls) == 1
+    return falls.pop()
+
+
+@pytest.mark.parametrize("principal_point", PRINCIPAL_POINTS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("size", SIZES)
+def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_point):
+    write(tmp_path, SIZES[size], layout, PRINCIPAL_POINTS[principal_point])
+    data = CO3DDataModule(
+        str(tmp_path), CATEGORY, image_size=48, batch_size=1, targets=3, on_bad="raise", mirroring=True,
+        references_per_sequence=5,
+    )  # fmt: skip
+    training = list(data.train_dataloader())
+    evaluation = [*data.val_dataloader(), *data.test_dataloader()]
+    assert {mirrored(batch) for batch in training} == {True, False}
+    assert [mirrored(batch) for batch in evaluation] == [False, False]
+    for batch in [*training, *evaluation]:
+        views, (name,) = batch.all_views(), batch.names
+        number = round(255 / 40 * batch.reference.images[0, 1].mean().item())
+        viewpoint = viewpoints(name, layout, PRINCIPAL_POINTS[principal_point])[number]
+        pixels, depth = project(views.cameras[0], point_in_reference(viewpoint, mirrored(batch)))
+        for seen in (views.images[0, :, 0], views.masks[0, :, 0]):
+            assert max((centroid(one) - pixel).norm() for one, pixel in zip(seen, pixels[:, 0], strict=True)) < 0.1
+        assert batch.depth_range[0, 0] < depth[0] < batch.depth_range[0, 1]
