@@ -27,7 +27,7 @@ def orbit(frames: int, start: float = 0.2, radius: float = RADIUS) -> np.ndarray
 
 
 def look(eye: np.ndarray, target: np.ndarray, layout: str = "ndc_isotropic", **intrinsics: Any) -> dict[str, Any]:
-    """PyTorch3D's camera at `eye` that sees `target` on its optical axis: X_cam = X R + T, +x left, +y up, +z forward."""
+    """PyTorch3D's camera at `eye` that sees `target` on its axis: X_cam = X R + T, +x left, +y up, +z forward."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     left = np.cross([0.0, 1.0, 0.0], forward)
     left /= np.linalg.norm(left)
@@ -120,7 +120,9 @@ def write_annotations(
     if splits is not None:
         listed = {
             split: [
-                [f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames if f["sequence_name"] in names
+                [f["sequence_name"], f["frame_number"], f["image"]["path"]]
+                for f in frames
+                if f["sequence_name"] in names
             ]
             for split, names in splits.items()
         }

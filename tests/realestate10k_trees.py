@@ -1,4 +1,4 @@
-"""Tiny RealEstate10K trees in both forms, with clips whose content is known."""
+"""Tiny RealEstate10K trees in both forms, with clips whose content is known, and what tests do with their batches."""
 
 import io
 import json
@@ -8,6 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+
+from completesplat.data.loading import SceneLoader
+from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.errors import DataError
+from completesplat.scene import SceneBatch
 
 HEIGHT, WIDTH = 18, 32
 
@@ -60,7 +65,7 @@ def chunk_entry(clip: StoredClip) -> dict:
         "url": "https://video.example/watch?v=x",
         "timestamps": torch.tensor(clip.timestamps, dtype=torch.int64),
         "cameras": torch.from_numpy(clip.rows),
-        "images": [torch.frombuffer(bytearray(picture), dtype=torch.uint8) for picture in clip.pictures],
+        "images": [torch.from_numpy(np.frombuffer(picture, np.uint8).copy()) for picture in clip.pictures],
         "key": clip.key,
     }
 
@@ -77,3 +82,44 @@ def write_chunk_form(folder: Path, clips: list[StoredClip], clips_per_chunk: int
 
 
 FORMS = {"text": write_text_form, "chunks": write_chunk_form}
+
+
+def write_tree(root: Path, form: str, train: list[StoredClip], test: list[StoredClip]) -> Path:
+    FORMS[form](root / "train", train)
+    FORMS[form](root / "test", test)
+    return root
+
+
+def module(root: Path, **settings) -> RE10KDataModule:
+    return RE10KDataModule(str(root), **{"image_size": 16, "batch_size": 2, "targets": 2, "max_gap": 2, **settings})
+
+
+def epoch(loader: SceneLoader, number: int) -> list[SceneBatch]:
+    loader.sampler.set_epoch(number)
+    return list(loader)
+
+
+def same(a: SceneBatch, b: SceneBatch) -> bool:
+    """Bit by bit."""
+
+    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
+        views = batch.all_views()
+        cameras = views.cameras
+        return [
+            *(views.images, views.masks, cameras.world_to_camera, cameras.intrinsics),
+            *(batch.depth_range, batch.visible),
+        ]
+
+    return a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
+
+
+def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
+    return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
+
+
+def assert_refusal(error: DataError, kind: type[DataError], file: Path | str, clip: str | None, frame: int | None):
+    """Its kind, and where it says that it happened, in one line."""
+    assert (type(error), error.file, error.sequence, error.frame) == (kind, str(file), clip, frame)
+    place = [str(file), *([clip] if clip else []), *([] if frame is None else [f"frame {frame}"])]
+    assert str(error) == f"{', '.join(place)}: {error.reason}"
+    assert "\n" not in str(error)

@@ -103,7 +103,8 @@ def require_file(path: Path) -> Path:
     Raises:
         MissingFile: no such file.
     """
-    if not path.is_file():
+    # `Path.is_file` raises where a name is too long or a folder may not be entered.
+    if not os.path.isfile(path):
         raise MissingFile("no such file", str(path))
     return path
 
@@ -174,8 +175,9 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
         array = np.array(None)
     # Strings that look like numbers, truth values and None become arrays of other kinds.
     if array.shape != shape or array.dtype.kind not in "iuf":
-        sides = " x ".join(map(str, shape)) or "one"
-        raise BadAnnotation(f"{what} must be {sides} numbers, not {_shortened(value)}")
+        sides = " x ".join(map(str, shape))
+        numbers = f"{sides} numbers" if shape else "a number"
+        raise BadAnnotation(f"{what} must be {numbers}, not {_shortened(value)}")
     if not np.isfinite(array).all():
         raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
     return array.astype(np.float64)

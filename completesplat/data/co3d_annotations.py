@@ -3,6 +3,7 @@
 Layout: facebookresearch/co3d, `co3d/dataset/data_types.py`.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,7 @@ class CO3DFrame:
 
 @dataclass(frozen=True)
 class CO3DVideo:
-    """What is annotated of a whole sequence; the qualities are None where they are not given."""
+    """What is annotated of a whole sequence; the qualities are None where they are not given, or NaN."""
 
     point_cloud: Path | None
     point_cloud_quality: float | None
@@ -81,7 +82,11 @@ def _video(root: Path, entry: dict[str, Any]) -> CO3DVideo:
 
 
 def _optional_number(entry: dict[str, Any], key: str) -> float | None:
-    return None if entry.get(key) is None else float(finite_array(entry[key], (), key))
+    value = entry.get(key)
+    # CO3D's writer has NaN where there was nothing to compute a score from.
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return None
+    return float(finite_array(value, (), key))
 
 
 def read_frames(

@@ -1,5 +1,6 @@
 """Which sequences and frames of a CO3D category are taken, and for which split."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,10 +53,10 @@ def read_category(root: Path, category: str, subset: str | None, seeded: SeededS
     Frames that the set list does not name are not looked at.
 
     Raises:
-        DataError: the category, its annotations or its set list is missing, outside of `root`, or unreadable as a whole.
+        DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below `root`.
     """
     folder = inside(root, category)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise DataError("no such CO3D category", str(folder))
     frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
     set_list, refused = set_list_path(folder, subset), list[DataError]()
@@ -68,6 +69,7 @@ def read_category(root: Path, category: str, subset: str | None, seeded: SeededS
     for name in sorted(frames.keys() - videos.keys()):
         if (name, None) not in places:
             refuse(BadAnnotation("the sequence is not annotated", str(videos_file), name))
+            places.add((name, None))
         del frames[name]
     if listed is None:
         listed = split_by_seed(frames, seeded)

@@ -110,18 +110,30 @@ class SceneLoader:
         """The batches of an epoch, or the rest of it after `load_state_dict`.
 
         Raises:
-            DataError: something cannot be read and is not to be skipped, or too much cannot be read.
+            DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.
         """
         self.refused, resume, self._resume = [], self._resume, {}
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
         if self.sampler is not None:
             self.sampler.start = self._batches * self.batch_size
-        for scenes, refused in self._loader:
-            self._batches += 1
-            self._account(refused, scenes is None)
-            if scenes is not None:
-                yield scenes
-        self._report()
+        try:
+            for scenes, refused in self._loader:
+                self._batches += 1
+                self._account(refused, scenes is None)
+                if self._batches == len(self):
+                    # Not behind the loop: whoever knows how many batches there are, as Lightning, asks for no more.
+                    self._report()
+                if scenes is not None:
+                    yield scenes
+        except GeneratorExit:  # The rest of the epoch is not wanted.
+            if self._batches < len(self):
+                self._report()
+            raise
+
+    @property
+    def _items(self) -> int:
+        """Of this process in an epoch."""
+        return len(self.dataset if self.sampler is None else self.sampler)
 
     @property
     def _epoch(self) -> int:
@@ -139,11 +151,14 @@ class SceneLoader:
         if refused and self.on_bad == "raise":
             raise refused[0]
         self.refused += refused
-        too_many = len(self.refused) > max(1, self.most_bad * len(self.dataset))
-        if too_many or (empty and self.sampler is not None):
+        too_many = len(self.refused) > max(1, self.most_bad * self._items)
+        # Evaluation has nothing in the place of what cannot be read.
+        nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
+        if too_many or nothing:
+            reason = f"more than data.most_bad={self.most_bad:g} allows" if too_many else "and nothing in their place"
             raise DataError(
-                f"{len(self.refused)} of {len(self.dataset)} items cannot be read, more than data.most_bad="
-                f"{self.most_bad:g} allows; see `completesplat data check`; the last one: {self.refused[-1]}"
+                f"{len(self.refused)} of {self._items} items cannot be read, {reason}; see `completesplat data check`; "
+                f"the last one: {self.refused[-1]}"
             )
 
     def _report(self) -> None:
@@ -151,5 +166,5 @@ class SceneLoader:
             kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(e.kind for e in self.refused).most_common())
             logger.warning(
                 "skipped %d of %d items (%s); the first: %s",
-                *(len(self.refused), len(self.dataset), kinds, self.refused[0]),
+                *(len(self.refused), self._items, kinds, self.refused[0]),
             )

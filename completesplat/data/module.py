@@ -121,6 +121,10 @@ class SceneDataModule(LightningDataModule):
         """Of the sequences of a split those that are used."""
         return names
 
+    def stackable(self, scenes: EvaluationScenes) -> bool:
+        """Whether all evaluation scenes have the same number of targets."""
+        return scenes.stackable()
+
     def setup(self, stage: str | None = None) -> None:
         """List the sequences (pictures are read later).
 
@@ -187,7 +191,7 @@ class SceneDataModule(LightningDataModule):
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
         scenes = EvaluationScenes(self.store(split), self.evaluation_views)
-        batch_size = self.evaluation_batch_size if scenes.stackable() else 1
+        batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         return SceneLoader(scenes, batch_size, None, self.workers, *self.policy)
 
     def state_dict(self) -> dict[str, Any]:

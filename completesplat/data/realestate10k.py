@@ -11,7 +11,7 @@ from completesplat.data.checks import BadAnnotation
 from completesplat.data.module import SceneDataModule
 from completesplat.data.realestate10k_evaluation import choose_clips
 from completesplat.data.realestate10k_source import CROPS, Framing, RE10KSource, open_clips
-from completesplat.data.scenes import Choice
+from completesplat.data.scenes import Choice, EvaluationScenes
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.splits import split_by_hash
 from completesplat.data.view_selection import evaluation_views_within, nearby_views
@@ -96,6 +96,11 @@ class RE10KDataModule(SceneDataModule):
         counts = ", ".join(f"{count} {reason}" for reason, count in chosen.left_out.items())
         logger.info("%d clips to test%s", len(chosen.keys), f"; left out: {counts}" if counts else "")
         return chosen.keys
+
+    def stackable(self, scenes: EvaluationScenes) -> bool:
+        """Known from the evaluation index; reading all clips for it would take hours."""
+        views = self._test_views or {}
+        return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
 
     def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
         """A random reference and random targets near it."""

@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import torch
 from jaxtyping import UInt8
@@ -70,10 +70,10 @@ class ChunkedClips:
             DataError: the chunk cannot be read, does not hold the clip, or holds a malformed one.
         """
         path = self._files[key]
-        chunk = self._chunk(path)
-        if key not in chunk:
-            raise BadAnnotation("the chunk does not hold this clip, which index.json says it does", str(path), key)
         with at(path, key):
+            chunk = self._chunk(path)
+            if key not in chunk:
+                raise BadAnnotation("the chunk does not hold this clip, which index.json says it does")
             return _clip_from_entry(path, key, chunk[key])
 
     def fingerprint(self) -> str:
@@ -105,10 +105,14 @@ def read_chunk(path: Path) -> Chunk:
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(record.file_size for record in archive.infolist())
-        # torch.save compresses nothing, so a chunk that says it is larger than its file was made to fill the memory.
-        content = torch.load(path, map_location="cpu", weights_only=True) if size <= path.stat().st_size else None
+            # torch.save compresses nothing, so a chunk that says it is larger than its file is made to fill the memory.
+            # PyTorch does not look at the checksums.
+            whole = size <= path.stat().st_size and archive.testzip() is None
+        content = torch.load(path, map_location="cpu", weights_only=True) if whole else None
     except Exception as error:  # the unpickler's refusals have no common class
         raise UnreadableFile(f"not a chunk that can be read safely ({type(error).__name__})", str(path)) from None
+    if not whole:
+        raise UnreadableFile("damaged, or larger than its file", str(path))
     if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
         raise BadAnnotation("not a list of clips with keys", str(path))
     chunk = {entry["key"]: entry for entry in content}
@@ -121,9 +125,9 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
     images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
     if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
         raise BadAnnotation("images are not a list of JPEG files (uint8)")
-    if not isinstance(rows, Tensor) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):
+    if not _is_plain(rows) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):
         raise BadAnnotation(f"cameras are not {CAMERA_NUMBERS} columns of floats")
-    if not isinstance(times, Tensor) or times.dtype != torch.int64 or times.ndim != 1:
+    if not _is_plain(times) or times.dtype != torch.int64 or times.ndim != 1:
         raise BadAnnotation("timestamps are not int64")
     if not len(images) == len(rows) == len(times):
         raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
@@ -134,7 +138,13 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
 
 
 def _is_bytes(image: Any) -> bool:
-    return isinstance(image, Tensor) and image.dtype == torch.uint8 and image.ndim == 1 and image.is_contiguous()
+    return _is_plain(image) and image.dtype == torch.uint8 and image.ndim == 1 and image.is_contiguous()
+
+
+def _is_plain(value: Any) -> TypeGuard[Tensor]:
+    """A tensor with numbers in memory, which is not part of a graph."""
+    strided = isinstance(value, Tensor) and value.layout == torch.strided
+    return strided and value.device.type == "cpu" and not value.requires_grad
 
 
 def _read(

@@ -12,15 +12,24 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
-from completesplat.data.checks import ROTATION_TOLERANCE, BadAnnotation, BadCamera, BadPicture, TooFewFrames
-from completesplat.data.images import MOST_PIXELS
+from completesplat.data.checks import (
+    ROTATION_TOLERANCE,
+    BadAnnotation,
+    BadCamera,
+    BadPicture,
+    TooFewFrames,
+    require_file,
+)
+from completesplat.data.images import MOST_PIXELS, check_pixels, damage_refused
 from completesplat.data.transforms import Square
+from completesplat.errors import ImageError
 from completesplat.geometry.cameras import Cameras
 
 CAMERA_NUMBERS = 18
+FORMATS = ("JPEG", "PNG")
 
 
 @dataclass(frozen=True)
@@ -87,13 +96,13 @@ def picture_size(source: Path | bytes, file: str) -> tuple[int, int]:
         file: what refusals name.
 
     Raises:
+        MissingFile: no such file.
         BadPicture: no JPEG or PNG image, or one of more than 50 million pixels.
     """
+    opened = BytesIO(source) if isinstance(source, bytes) else require_file(source)
     try:
-        with Image.open(BytesIO(source) if isinstance(source, bytes) else source, formats=("JPEG", "PNG")) as image:
-            width, height = image.size
-    except (UnidentifiedImageError, OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise BadPicture(f"not a readable image ({type(error).__name__})", file) from None
-    if width * height > MOST_PIXELS:
-        raise BadPicture(f"{width} x {height} are more than {MOST_PIXELS:,} pixels", file)
-    return height, width
+        with damage_refused(FORMATS, MOST_PIXELS), Image.open(opened, formats=FORMATS) as image:
+            check_pixels(image, MOST_PIXELS)
+            return image.height, image.width
+    except ImageError as error:
+        raise BadPicture(str(error), file) from None

@@ -20,6 +20,7 @@ from completesplat.data.transforms import Square, read_square
 from completesplat.errors import DataError
 
 PICTURES = (".png", ".jpg")
+MOST_BYTES = 2**26  # a frame needs some 300
 
 
 class TextClips:
@@ -34,7 +35,7 @@ class TextClips:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         with os.scandir(folder) as entries:
-            folders = {entry.name: entry.is_dir() for entry in entries}
+            folders = {entry.name: _is_folder(entry) for entry in entries}
         texts = sorted(name.removesuffix(".txt") for name in folders if name.endswith(".txt"))
         self.keys = [key for key in texts if folders.get(key)]
         self.missing = [key for key in texts if not folders.get(key)]
@@ -67,17 +68,29 @@ class TextClips:
 
     def fingerprint(self) -> str:
         """SHA-256 of the texts' names and sizes (there are tens of thousands)."""
-        sizes = [(key, (self.folder / f"{key}.txt").stat().st_size) for key in self.keys]
+        texts = {key: self.folder / f"{key}.txt" for key in self.keys}
+        sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts.items()]
         return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a ring of links
+        return False
 
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     """Timestamps and camera rows."""
     timestamps, rows = [], []
     try:
-        lines = require_file(path).read_text(encoding="utf-8").splitlines()[1:]
-    except UnicodeDecodeError:
-        raise UnreadableFile("not a text file") from None
+        with require_file(path).open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise UnreadableFile(f"more than {MOST_BYTES:,} bytes")
+        lines = content.decode("utf-8").splitlines()[1:]
+    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadableFile(f"not a text file ({type(error).__name__})") from None
     for frame, columns in enumerate(line.split() for line in lines if line.strip()):
         with at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:

@@ -15,6 +15,7 @@ from completesplat.data.checks import BadPicture, MissingFile
 from completesplat.data.images import decode, read_depth
 from completesplat.errors import DataError
 
+
 def refuse(read: Callable[[], object], name: str, part: str, kind: type[DataError] = BadPicture) -> None:
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")

@@ -111,7 +111,7 @@ def test_three_sequences_are_one_for_each_split(tmp_path):
 
 def test_a_split_by_seed_without_training_sequences_is_refused(tmp_path):
     annotate(tmp_path, many(5))
-    with pytest.raises(DataError, match="no training sequences with val_fraction=0.6, test_fraction=0.4"):
+    with pytest.raises(DataError, match=r"no training sequences with val_fraction=0\.6, test_fraction=0\.4"):
         read(tmp_path, rule=SeededSplit(0.6, 0.4, 0))
 
 
@@ -161,7 +161,7 @@ def test_sequences_with_few_frames_are_left_out_and_named(tmp_path):
 
 
 def test_scores_below_the_least_or_not_given_leave_a_sequence_out(tmp_path):
-    qualities = {"a": (0.5, 0.2), "b": (0.49, 0.9), "c": (None, 0.9), "d": (0.9, None), "e": (-1.0, 0.9)}
+    qualities = {"a": (0.5, 0.2), "b": (0.49, 0.9), "c": (float("nan"), 0.9), "d": (0.9, None), "e": (-1.0, 0.9)}
     everything = {"train": "abcde", "val": "abcde", "test": "abcde"}
     annotate(tmp_path, dict.fromkeys("abcde", 2), everything, qualities)
     for split in SPLITS:
@@ -196,10 +196,10 @@ def test_cameras_that_do_not_move_are_refused(tmp_path):
     category = write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
 
     def stand(entries):
-        eye = np.array([0.0, 0.0, -4.0])
         for i in range(3):
-            entries[i]["viewpoint"] = look(eye + [0.019 * i, 0, 0], np.array([0.3 * i, 0, 0]))
-            entries[3 + i]["viewpoint"] = look(eye + [0.022 * i, 0, 0], np.array([0.3 * i, 0, 0]))
+            target = np.array([0.3 * i, 0, 0])
+            entries[i]["viewpoint"] = look(np.array([0.019 * i, 0, -4]), target)
+            entries[3 + i]["viewpoint"] = look(np.array([0.022 * i, 0, -4]), target)
 
     change(category / FRAMES, stand)
     data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8)

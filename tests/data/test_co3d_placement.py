@@ -74,7 +74,7 @@ def test_off_centre_principal_points_make_the_square_smaller():
 
 def test_parallel_axes_and_axes_that_meet_behind_the_cameras_are_refused():
     eyes = orbit(4)
-    parallel = [frame(look(eye, eye + [0, 0, 1])) for eye in eyes]
+    parallel = [frame(look(eye, eye + np.array([0, 0, 1]))) for eye in eyes]
     away = [frame(look(eye, 2 * eye)) for eye in eyes]
     with pytest.raises(BadPlacement, match="do not meet"):
         from_cameras(parallel)
@@ -83,7 +83,7 @@ def test_parallel_axes_and_axes_that_meet_behind_the_cameras_are_refused():
 
 
 def plane(folder: Path, map_size: tuple[int, int], scale: float = 1.0) -> CO3DFrame:
-    """A camera at the origin that looks along z at a plane of depth 2 `scale`, seen in a part of its 24 x 32 picture."""
+    """A camera at the origin that looks along z at a plane of depth 2 `scale`, seen in a part of its 24 x 32 pixels."""
     mask = np.zeros((24, 32), dtype=np.uint8)
     mask[8:20, 4:28] = 255
     folder.mkdir()
@@ -104,7 +104,10 @@ def test_a_plane_is_placed_where_it_is_also_by_smaller_depth_maps(tmp_path, map_
 
 
 def test_depth_maps_count_in_units_of_their_scale(tmp_path):
-    near, far = from_depth_maps([plane(tmp_path / "a", (24, 32))]), from_depth_maps([plane(tmp_path / "b", (24, 32), 3)])
+    near, far = (
+        from_depth_maps([plane(tmp_path / "a", (24, 32))]),
+        from_depth_maps([plane(tmp_path / "b", (24, 32), 3)]),
+    )
     torch.testing.assert_close(far.center, 3 * near.center)
     assert far.half_size == pytest.approx(3 * near.half_size)
 

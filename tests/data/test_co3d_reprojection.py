@@ -23,7 +23,7 @@ from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
 
 CENTER, HALF_SIZE = np.array([5.0, -3.0, 2.0]), 2.5
-POINT = CENTER + [0.35, 0.5, -0.3]
+POINT = CENTER + np.array([0.35, 0.5, -0.3])
 FRAMES = 5
 SPREAD = 3.0  # of the blob, in pixels of the files
 SIZES = {"landscape": (90, 130), "portrait": (140, 96), "square": (100, 100)}
@@ -42,7 +42,7 @@ def viewpoints(name: str, layout: str, principal_point: list[float]) -> list[dic
     """Cameras that look past the object's centre, with focal lengths of their own for each axis and frame."""
     return [
         look(
-            eye, CENTER + [0.1 * number, 0, 0], layout,
+            eye, CENTER + np.array([0.1 * number, 0, 0]), layout,
             focal_length=[3.0 + 0.1 * number, 3.3], principal_point=principal_point,
         )
         for number, eye in enumerate(CENTER + orbit(FRAMES, start=float("abc".index(name)), radius=12.0))

@@ -9,14 +9,12 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer
-from realestate10k_trees import FORMS, HEIGHT, WIDTH, StoredClip, encode, make_clip
+from realestate10k_trees import FORMS, HEIGHT, WIDTH, encode, epoch, equal, make_clip, module, same, write_tree
 from support import SMALL, compose_config
 
-from completesplat.data.realestate10k import RE10KDataModule
-from completesplat.data.realestate10k_scenes import split_by_hash
+from completesplat.data.splits import split_by_hash
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
-from completesplat.scene import SceneBatch
 
 TRAIN = [make_clip(f"train{i}", frames=5 + i % 3) for i in range(7)]
 TEST = [make_clip(f"test{i}", frames=8) for i in range(5)]
@@ -39,41 +37,14 @@ def both(tmp_path_factory) -> list[Path]:
     return folders
 
 
-def module(root: Path, **settings) -> RE10KDataModule:
-    return RE10KDataModule(str(root), **{"image_size": 16, "batch_size": 2, "targets": 2, "max_gap": 2, **settings})
-
-
-def tree(tmp_path: Path, form: str, train: list[StoredClip], test: list[StoredClip] = TEST) -> Path:
-    FORMS[form](tmp_path / "train", train)
-    FORMS[form](tmp_path / "test", test)
-    return tmp_path
-
-
-def epoch(loader, number: int) -> list[SceneBatch]:
-    loader.sampler.set_epoch(number)
-    return list(loader)
-
-
-def same(a: SceneBatch, b: SceneBatch) -> bool:
-    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
-        views = batch.all_views()
-        return [views.images, views.masks, views.cameras.world_to_camera, views.cameras.intrinsics, batch.depth_range]
-
-    return a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
-
-
-def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
-    return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
-
-
 def test_both_forms_give_the_same_batches(both):
     text, chunks = (module(folder, scale=2.0) for folder in both)
     assert equal(list(text.test_dataloader()), list(chunks.test_dataloader()))
     assert equal(list(text.val_dataloader()), list(chunks.val_dataloader()))
-    key = {name: split.store("train").keys for name, split in (("text", text), ("chunks", chunks))}
+    key = {name: split.store("train").names for name, split in (("text", text), ("chunks", chunks))}
     assert sorted(key["text"]) == sorted(key["chunks"])
     for name in key["text"]:
-        scenes = [data.store("train").scene(data.store("train").clips.clip(name), 1, [0, 3]) for data in (text, chunks)]
+        scenes = [data.store("train").scene(data.store("train").source.read(name), 1, [0, 3]) for data in (text, chunks)]
         assert same(*scenes)
     torch.testing.assert_close(text.mean_image(), chunks.mean_image())
     assert text.typical_camera() == chunks.typical_camera()
@@ -105,9 +76,9 @@ def test_a_point_reprojects_onto_its_pixel(tmp_path, form, crop):
         u, v = width * (row[0] * x / z + row[2]), height * (row[1] * y / z + row[3])
         disc = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18)
         clip.pictures[frame] = encode(disc[..., None].repeat(3, axis=2).astype(np.uint8))
-    root = tree(tmp_path, form, [clip, make_clip("b")])
+    root = write_tree(tmp_path, form, [clip, make_clip("b")], TEST)
     store = module(root, image_size=64, crop=crop, scale=2.0, val_fraction=0.0).store("train")
-    scene = store.scene(store.clips.clip("a"), 1, [0, 2, 3])
+    scene = store.scene(store.source.read("a"), 1, [0, 2, 3])
     pose = clip.rows[1, 6:].reshape(3, 4)
     point = torch.tensor(2.0 * (pose[:, :3] @ world + pose[:, 3]), dtype=torch.float32)
     views = scene.all_views()
@@ -129,9 +100,9 @@ def test_targets_stay_near_the_reference(root):
     items = data.train_dataloader().dataset
     for number in range(10):
         for index in range(len(items)):
-            scene = items[number, index]
-            clip = store.clips.clip(scene.names)
-            frames = [(store.image(clip, f).float() / 255) for f in range(len(clip.timestamps))]
+            scene = items[number, index].scenes
+            clip = store.source.read(scene.names)
+            frames = [(store.image(clip, f).float() / 255) for f in range(len(clip.frames))]
 
             def found(image, frames=frames):
                 return next(f for f, picture in enumerate(frames) if torch.equal(image, picture))
@@ -148,14 +119,14 @@ def test_epochs_and_seeds_differ_and_can_be_repeated(root):
 
 
 def test_every_item_comes_once_an_epoch(root):
-    names = [n for b in epoch(module(root, references_per_clip=3).train_dataloader(), 0) for n in b.names]
-    assert sorted(names) == sorted(module(root).store("train").keys * 3)
+    names = [n for b in epoch(module(root, references_per_sequence=3).train_dataloader(), 0) for n in b.names]
+    assert sorted(names) == sorted(module(root).store("train").names * 3)
 
 
 def test_workers_do_not_change_the_batches(root):
-    expected = [epoch(module(root, references_per_clip=2).train_dataloader(), number) for number in (0, 1)]
+    expected = [epoch(module(root, references_per_sequence=2).train_dataloader(), number) for number in (0, 1)]
     for workers in (1, 2):
-        loader = module(root, references_per_clip=2, workers=workers).train_dataloader()
+        loader = module(root, references_per_sequence=2, workers=workers).train_dataloader()
         for number in (0, 1):
             assert equal(epoch(loader, number), expected[number])
 
@@ -164,8 +135,8 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
     data = module(root, evaluation_targets=2, evaluation_gap=4, evaluation_batch_size=5)
     (batch,) = list(data.test_dataloader())
     store = data.store("test")
-    for number, key in enumerate(store.keys):
-        assert same(batch[number], store.scene(store.clips.clip(key), 0, [1, 3]))
+    for number, key in enumerate(store.names):
+        assert same(batch[number], store.scene(store.source.read(key), 0, [1, 3]))
     assert sorted(batch.names) == sorted(clip.key for clip in TEST)
 
 
@@ -180,10 +151,11 @@ def test_the_evaluation_index_decides(root, tmp_path, caplog):
         (batch,) = list(data.test_dataloader())
     assert batch.names == ("test0", "test3")
     store = data.store("test")
-    assert same(batch[0], store.scene(store.clips.clip("test0"), 2, [3, 5]))
-    (line,) = caplog.messages
+    assert same(batch[0], store.scene(store.source.read("test0"), 2, [3, 5]))
+    line, sequences = caplog.messages
     assert "2 clips to test" in line
-    for count in ("0 missing", "1 null in the index", "1 in the index, not in the data", "1 not in the index"):
+    assert sequences == "test: 5 sequences"
+    for count in ("1 null in the index", "1 in the index, not in the data", "1 not in the index"):
         assert count in line
     for count in ("1 in the list, not in the data", "1 not in the list"):
         assert count in line
@@ -209,18 +181,20 @@ def test_a_bad_evaluation_index_is_refused_by_name(root, tmp_path, entry):
 def test_missing_clips_are_counted_and_left_out(root, tmp_path, caplog):
     if (root / "train/index.json").exists():
         index = json.loads((root / "train/index.json").read_text())
-        tree(tmp_path, "chunks", TRAIN)
+        write_tree(tmp_path, "chunks", TRAIN, TEST)
         (tmp_path / "train/index.json").write_text(json.dumps(index | {"x": "000099.torch", "y": "000099.torch"}))
     else:
-        tree(tmp_path, "text", TRAIN)
+        write_tree(tmp_path, "text", TRAIN, TEST)
         (tmp_path / "train/x.txt").write_text("address\n")
         (tmp_path / "train/y.txt").write_text("address\n")
     with caplog.at_level(logging.INFO, logger="completesplat"):
         data = module(tmp_path)
         data.setup("fit")
-    assert sorted(data.store("train").keys + data.store("val").keys) == sorted(clip.key for clip in TRAIN)
-    assert len(caplog.messages) == 1
-    assert "left out: 2 missing" in caplog.messages[0]
+    assert sorted(data.store("train").names + data.store("val").names) == sorted(clip.key for clip in TRAIN)
+    assert data.source("train").left_out == {"frames are missing": ["x", "y"]}
+    assert caplog.messages == [
+        f"{split}: {count} sequences; 2 left out: frames are missing" for split, count in (("train", 6), ("val", 1))
+    ]
 
 
 def test_a_clip_stays_on_its_side_when_others_come():
@@ -237,8 +211,8 @@ def test_a_clip_stays_on_its_side_when_others_come():
 def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
     with pytest.raises(DataError, match="train"):
         module(tmp_path).setup("fit")
-    with pytest.raises(DataError, match="no train clips"):
-        module(tree(tmp_path, "text", TRAIN[:1])).setup("fit")
+    with pytest.raises(DataError, match="no train sequences"):
+        module(write_tree(tmp_path, "text", TRAIN[:1], TEST)).setup("fit")
     for settings in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"crop": "left"}, {"scale": -1.0}):
         with pytest.raises(CompleteSplatError, match="data"):
             module(tmp_path, **settings)
@@ -247,8 +221,8 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
 def test_means_of_the_training_frames(root):
     data = module(root, crop="center", image_size=HEIGHT)
     store = data.store("train")
-    clips = [store.clips.clip(key) for key in store.keys]
-    images = [store.image(clip, f).double() / 255 for clip in clips for f in range(len(clip.timestamps))]
+    clips = [store.source.read(key) for key in store.names]
+    images = [store.image(clip, f).double() / 255 for clip in clips for f in range(len(clip.frames))]
     torch.testing.assert_close(data.mean_image(), torch.stack(images).mean(dim=0).float())
     camera = data.typical_camera()
     # Half of the square over the focal length (half of the picture's width) is the tangent of half of the angle.

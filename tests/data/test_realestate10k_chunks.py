@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from realestate10k_trees import chunk_entry, make_clip, write_chunk_form
+from realestate10k_trees import assert_refusal, chunk_entry, make_clip, write_chunk_form
 
 from completesplat.data import realestate10k_chunks
+from completesplat.data.checks import BadAnnotation, OutsidePath, UnreadableFile
 from completesplat.data.realestate10k import RE10KDataModule
 from completesplat.data.realestate10k_chunks import ChunkedClips, read_chunk
 from completesplat.errors import DataError
@@ -64,18 +65,35 @@ def test_a_chunk_larger_than_its_file_is_refused(tmp_path):
         read_chunk(path)
 
 
-@pytest.mark.parametrize("index", ['{"a": "../0.torch"}', '{"a": "/0.torch"}', '{"a": 1}', "[]", "{"])
-def test_an_index_that_is_malformed_or_leads_elsewhere_is_refused(tmp_path, index):
+@pytest.mark.parametrize(
+    ("index", "kind"), [('{"a": 1}', BadAnnotation), ("[]", BadAnnotation), ("{", UnreadableFile), ("", UnreadableFile)]
+)
+def test_a_malformed_index_is_refused(tmp_path, index, kind):
     (tmp_path / "index.json").write_text(index)
-    with pytest.raises(DataError):
+    with pytest.raises(DataError) as caught:
         ChunkedClips(tmp_path)
+    assert_refusal(caught.value, kind, tmp_path / "index.json", None, None)
+
+
+def test_entries_of_an_index_that_lead_elsewhere_are_refused(tmp_path):
+    folder = tmp_path / "train"
+    write_chunk_form(folder, [make_clip("a")])
+    (tmp_path / "0.torch").write_bytes((folder / "000000.torch").read_bytes())
+    (folder / "link.torch").symlink_to("../0.torch")
+    bad = {"b": "../0.torch", "c": str(tmp_path / "0.torch"), "d": "link.torch", "e": ""}
+    (folder / "index.json").write_text(json.dumps({"a": "000000.torch", **bad}))
+    clips = ChunkedClips(folder)
+    assert (clips.keys, clips.missing) == (["a"], [])
+    for error, key in zip(clips.refused, bad, strict=True):
+        assert_refusal(error, OutsidePath, folder / "index.json", key, None)
 
 
 def test_a_clip_in_another_chunk_than_the_index_says_is_refused(tmp_path):
     write_chunk_form(tmp_path, [make_clip("a")])
     (tmp_path / "index.json").write_text(json.dumps({"b": "000000.torch"}))
-    with pytest.raises(DataError, match=r"000000\.torch does not hold clip b"):
+    with pytest.raises(DataError, match="does not hold this clip") as caught:
         ChunkedClips(tmp_path).clip("b")
+    assert_refusal(caught.value, BadAnnotation, tmp_path / "000000.torch", "b", None)
 
 
 @pytest.fixture
@@ -99,7 +117,7 @@ def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
     names, counts = loads
     for split in ("train", "test"):
         write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
-    data = RE10KDataModule(str(tmp_path), image_size=8, batch_size=4, references_per_clip=2, val_fraction=0.0)
+    data = RE10KDataModule(str(tmp_path), image_size=8, batch_size=4, references_per_sequence=2, val_fraction=0.0)
     loader = data.train_dataloader()
     loader.sampler.set_epoch(0)
     first = [name for batch in loader for name in batch.names]

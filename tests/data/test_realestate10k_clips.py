@@ -3,15 +3,25 @@
 import numpy as np
 import pytest
 import torch
-from realestate10k_trees import FORMS, chunk_entry, encode, make_clip, write_chunk_form, write_text_form
+from realestate10k_trees import (
+    FORMS,
+    assert_refusal,
+    chunk_entry,
+    encode,
+    make_clip,
+    write_chunk_form,
+    write_text_form,
+)
 
+from completesplat.data.checks import BadAnnotation, BadCamera, BadPicture, MissingFile, TooFewFrames
 from completesplat.data.realestate10k_chunks import ChunkedClips
-from completesplat.data.realestate10k_scenes import open_clips
+from completesplat.data.realestate10k_source import Framing, RE10KSource, open_clips
 from completesplat.data.realestate10k_text import TextClips
 from completesplat.data.transforms import Square
 from completesplat.errors import DataError
 
 WHOLE = Square(0, 0, 18)
+FILE = {"text": "clip7.txt", "chunks": "000000.torch"}
 
 
 def broken(change) -> list:
@@ -59,9 +69,10 @@ CAMERA_FAULTS = [nan_pose, infinite_focal, sheared, mirrored, scaled, no_focal, 
 @pytest.mark.parametrize("fault", CAMERA_FAULTS)
 def test_a_bad_camera_is_refused_with_file_clip_and_frame(tmp_path, form, fault):
     FORMS[form](tmp_path, broken(fault))
-    file = "clip7.txt" if form == "text" else "000000.torch"
-    with pytest.raises(DataError, match=rf"{file}, clip clip7, frame 3: .*"):
+    with pytest.raises(DataError) as caught:
         open_clips(tmp_path).clip("clip7")
+    kind = BadAnnotation if fault in (nan_pose, infinite_focal) else BadCamera
+    assert_refusal(caught.value, kind, tmp_path / FILE[form], "clip7", 3)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -73,21 +84,25 @@ def test_a_pose_within_the_tolerance_is_accepted(tmp_path, form):
 @pytest.mark.parametrize("form", FORMS)
 def test_too_few_frames_are_refused(tmp_path, form):
     FORMS[form](tmp_path, [make_clip("a", frames=1), make_clip("b", frames=0)])
-    for key in "ab":
-        with pytest.raises(DataError, match=f"clip {key}: . frames"):
+    for key, count in (("a", 1), ("b", 0)):
+        with pytest.raises(DataError, match=f"{count} frames") as caught:
             open_clips(tmp_path).clip(key)
+        file = f"{key}.txt" if form == "text" else FILE[form]
+        assert_refusal(caught.value, TooFewFrames, tmp_path / file, key, None)
 
 
 def test_repeated_timestamps_are_refused(tmp_path):
     write_chunk_form(tmp_path / "c", broken(lambda clip: clip.timestamps.__setitem__(3, clip.timestamps[1])))
-    with pytest.raises(DataError, match="clip7, frame 1: another frame has its timestamp"):
+    with pytest.raises(DataError, match="another frame has its timestamp") as caught:
         ChunkedClips(tmp_path / "c").clip("clip7")
+    assert_refusal(caught.value, BadAnnotation, tmp_path / "c/000000.torch", "clip7", 1)
     write_text_form(tmp_path / "t", [make_clip("clip7")])
     path = tmp_path / "t/clip7.txt"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[3]]))
-    with pytest.raises(DataError, match="clip7, frame 2: another frame has its timestamp"):
+    with pytest.raises(DataError, match="another frame has its timestamp") as caught:
         TextClips(tmp_path / "t").clip("clip7")
+    assert_refusal(caught.value, BadAnnotation, path, "clip7", 2)
 
 
 @pytest.mark.parametrize(
@@ -98,8 +113,9 @@ def test_a_malformed_line_is_refused(tmp_path, line, reason):
     write_text_form(tmp_path, [make_clip("clip7")])
     with (tmp_path / "clip7.txt").open("a") as file:
         file.write(line)
-    with pytest.raises(DataError, match=f"clip7.txt, clip clip7, frame 6: {reason}"):
+    with pytest.raises(DataError, match=reason) as caught:
         TextClips(tmp_path).clip("clip7")
+    assert_refusal(caught.value, BadAnnotation, tmp_path / "clip7.txt", "clip7", 6)
 
 
 def test_a_missing_frame_is_refused_and_png_will_do(tmp_path):
@@ -107,8 +123,9 @@ def test_a_missing_frame_is_refused_and_png_will_do(tmp_path):
     write_text_form(tmp_path, [clip])
     path = tmp_path / f"clip7/{clip.timestamps[3]}.jpg"
     path.unlink()
-    with pytest.raises(DataError, match=rf"clip clip7, frame 3: no picture .*{path.name}"):
+    with pytest.raises(DataError, match="no picture") as caught:
         TextClips(tmp_path).clip("clip7")
+    assert_refusal(caught.value, MissingFile, path, "clip7", 3)
     pixels = np.arange(18 * 32 * 3, dtype=np.uint8).reshape(18, 32, 3)
     path.with_suffix(".png").write_bytes(encode(pixels, "PNG"))
     image = TextClips(tmp_path).clip("clip7").read(3, WHOLE, 18)
@@ -125,11 +142,13 @@ def test_pictures_that_are_broken_or_of_another_size_are_refused(tmp_path, form,
     clip = make_clip("clip7")
     clip.pictures[3] = fault(clip.pictures[3])
     FORMS[form](tmp_path, [clip])
-    name = f"{clip.timestamps[3]}.jpg" if form == "text" else "000000.torch, clip clip7, frame 3"
-    read = open_clips(tmp_path).clip("clip7").read
-    assert read(2, WHOLE, 8).shape == (3, 8, 8)
-    with pytest.raises(DataError, match=name):
-        read(3, WHOLE, 8)
+    name = f"clip7/{clip.timestamps[3]}.jpg" if form == "text" else FILE[form]
+    framing = Framing(8, "center", 1.0, 0.7, 10.0)
+    sequence = RE10KSource(open_clips(tmp_path), ["clip7"], framing).read("clip7")
+    assert sequence.read(2).image.shape == (3, 8, 8)
+    with pytest.raises(DataError) as caught:
+        sequence.read(3)
+    assert_refusal(caught.value, BadPicture, tmp_path / name, "clip7", 3)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -137,8 +156,10 @@ def test_a_clip_whose_first_picture_is_none_is_refused(tmp_path, form):
     clip = make_clip("clip7")
     clip.pictures[0] = b"<html>"
     FORMS[form](tmp_path, [clip])
-    with pytest.raises(DataError, match=r"clip7, frame 0.*not a readable image"):
+    with pytest.raises(DataError, match="not an image") as caught:
         open_clips(tmp_path).clip("clip7")
+    file = f"clip7/{clip.timestamps[0]}.jpg" if form == "text" else FILE[form]
+    assert_refusal(caught.value, BadPicture, tmp_path / file, "clip7", 0)
 
 
 @pytest.mark.parametrize(
@@ -158,5 +179,6 @@ def test_a_clip_whose_first_picture_is_none_is_refused(tmp_path, form):
 def test_fields_of_another_type_or_shape_are_refused(tmp_path, field, value, reason):
     torch.save([chunk_entry(make_clip("clip7")) | {field: value}], tmp_path / "0.torch")
     (tmp_path / "index.json").write_text('{"clip7": "0.torch"}')
-    with pytest.raises(DataError, match=rf"0\.torch, clip clip7: .*{reason}"):
+    with pytest.raises(DataError, match=reason) as caught:
         ChunkedClips(tmp_path).clip("clip7")
+    assert_refusal(caught.value, BadAnnotation, tmp_path / "0.torch", "clip7", None)

@@ -1,7 +1,5 @@
 """Time and memory of one rendering: what is counted, and what is not."""
 
-import datetime
-import json
 import threading
 import time
 from collections.abc import Callable
@@ -11,7 +9,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from support import strict_json
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -19,7 +16,7 @@ from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.kernels import buffers
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.reports.rasterizers import timing
-from completesplat.reports.rasterizers.timing import machine, milliseconds, peak_megabytes
+from completesplat.reports.rasterizers.timing import milliseconds, peak_megabytes
 from completesplat.reports.rasterizers.workloads import splatter_scene
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system has no /proc")
@@ -119,13 +116,3 @@ def test_an_error_in_the_work_comes_through_and_leaves_no_thread() -> None:
     with pytest.raises(ZeroDivisionError):
         peak_megabytes(lambda: 1 / 0, "cpu")
     assert threading.active_count() == before
-
-
-def test_the_machine_can_be_written_as_json(tmp_path: Path) -> None:
-    (tmp_path / "machine.json").write_text(json.dumps(machine()))
-    found = strict_json(tmp_path / "machine.json")
-    assert found == machine()
-    assert found["processor"]
-    assert found["threads"] == torch.get_num_threads()
-    assert found["torch"] == torch.__version__
-    assert datetime.date.fromisoformat(found["date"]) <= datetime.date.today()

@@ -1,0 +1,1 @@
+"""How fast training batches are read, and what that takes."""

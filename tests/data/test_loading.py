@@ -1,0 +1,109 @@
+"""Batches depend on (seed, epoch, item) only: not on workers, on what came before, or on an interruption."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from realestate10k_trees import FORMS, epoch, equal, make_clip, module, same, write_tree
+
+from completesplat.data.loading import EpochSampler, SceneLoader
+from completesplat.scene import SceneBatch
+
+AUGMENTED = {
+    "color_jitter": {"brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.1},
+    "box_masks": {"probability": 0.7},
+    "mirroring": True,
+}
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def root(request, tmp_path_factory) -> Path:
+    """Nine clips, one of which has a picture that cannot be read."""
+    clips = [make_clip(f"c{i}", frames=3) for i in range(9)]
+    clips[4].pictures[1] = b"<html>"
+    return write_tree(tmp_path_factory.mktemp("root"), request.param, clips, clips[:2])
+
+
+def loader(root: Path, workers: int = 0, **settings) -> SceneLoader:
+    """Eight items an epoch in batches of three."""
+    settings = {"batch_size": 3, "val_fraction": 0.0, "most_bad": 10.0, **AUGMENTED, **settings}
+    return module(root, workers=workers, **settings).train_dataloader()
+
+
+@pytest.fixture(scope="module")
+def epochs(root) -> list[list[SceneBatch]]:
+    """What is to come in two epochs."""
+    expected = loader(root)
+    batches = [epoch(expected, 0), epoch(expected, 1)]
+    assert [len(part) for part in batches] == [3, 3]
+    assert not equal(*batches)
+    return batches
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 4])
+def test_workers_do_not_change_the_batches_nor_what_is_skipped(root, epochs, workers):
+    one, other = loader(root), loader(root, workers)
+    for number, expected in enumerate(epochs):
+        assert equal(epoch(other, number), expected)
+        epoch(one, number)
+        assert [str(error) for error in other.refused] == [str(error) for error in one.refused]
+        assert one.refused
+
+
+def test_an_item_is_drawn_from_seed_epoch_and_index_alone(root):
+    items = loader(root).dataset
+    later = [items[1, 5].scenes, items[0, 2].scenes]
+    torch.manual_seed(7)
+    again = loader(root).dataset
+    assert same(again[0, 2].scenes, later[1])
+    assert same(again[1, 5].scenes, later[0])
+    assert not same(again[2, 5].scenes, later[0])
+    assert not same(loader(root, seed=1).dataset[1, 5].scenes, later[0])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_resumed_iteration_continues_exactly(root, epochs, workers):
+    for done in range(4):
+        interrupted = loader(root, workers)
+        interrupted.sampler.set_epoch(1)
+        batches: Iterator[SceneBatch] = iter(interrupted)
+        assert equal([next(batches) for _ in range(done)], epochs[1][:done])
+        state = interrupted.state_dict()
+        resumed = loader(root, workers)
+        resumed.load_state_dict(state)
+        # Before its first batch an iteration has no epoch of its own.
+        assert equal(epoch(resumed, 1), epochs[1][done:])
+        assert equal(epoch(resumed, 1), epochs[1])
+
+
+def test_the_state_of_another_epoch_means_from_the_start(root, epochs):
+    resumed = loader(root)
+    resumed.load_state_dict({"epoch": 0, "batches": 2})
+    assert equal(epoch(resumed, 1), epochs[1])
+    assert equal(epoch(resumed, 0), epochs[0])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_abandoned_iteration_does_not_change_the_next(root, epochs, workers):
+    abandoned = loader(root, workers)
+    assert same(next(iter(abandoned)), epochs[0][0])
+    assert equal(epoch(abandoned, 1), epochs[1])
+    assert abandoned.state_dict() == {"epoch": 1, "batches": 3}
+
+
+@pytest.mark.parametrize("world_size", [1, 2, 3])
+def test_processes_have_their_own_items_and_equally_many(root, monkeypatch, world_size):
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: world_size)
+    groups, parts = [[0, 1, 2, 3], [4, 5], [6]], []
+    for rank in range(world_size):
+        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        sampler = EpochSampler(groups, 0)
+        sampler.set_epoch(2)
+        parts.append(list(sampler))
+        assert len(sampler) == len(parts[-1]) == 7 // world_size
+        assert len(loader(root)) == -(-(8 // world_size) // 3)
+    keys = [key for part in parts for key in part]
+    assert len(set(keys)) == len(keys) == 7 // world_size * world_size
+    assert set(keys) <= {(2, index) for index in range(7)}

@@ -1,0 +1,110 @@
+"""What cannot be read: raised with its place in every process, or counted, told and limited."""
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from realestate10k_trees import assert_refusal, epoch, make_clip, module, write_tree
+
+from completesplat.data.checks import BadCamera, BadPicture
+from completesplat.errors import CompleteSplatError, DataError
+
+KEYS = [f"c{i}" for i in range(9)]
+
+
+def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
+    """Clips of which some have broken pictures, others broken cameras."""
+    clips = [make_clip(key, frames=3) for key in KEYS]
+    for clip in clips:
+        if clip.key in pictures:
+            clip.pictures = [clip.pictures[0], b"<html>", b"<html>"]
+        if clip.key in cameras:
+            clip.rows[1, 0] = 0
+    return write_tree(root, "text", clips, clips)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
+    root = make_tree(tmp_path, ["c4"], ["c2"])
+    data = module(root, on_bad="raise", workers=workers, evaluation_batch_size=1)
+    with pytest.raises(DataError) as caught:
+        list(data.test_dataloader())
+    assert_refusal(caught.value, BadCamera, root / "test/c2.txt", "c2", 1)
+    with pytest.raises(DataError) as caught:
+        list(data.train_dataloader())
+    assert caught.value.sequence in ("c2", "c4")
+
+
+def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog):
+    data = module(make_tree(tmp_path, ["c4"], ["c2"]), val_fraction=0.0, most_bad=1.0)
+    loader = data.train_dataloader()
+    for number in (0, 1):
+        caplog.clear()
+        epoch(loader, number)
+        kinds = [type(error) for error in loader.refused]
+        assert kinds.count(BadPicture) >= 1 <= kinds.count(BadCamera)
+        (message,) = caplog.messages
+        assert message.startswith(f"skipped {len(kinds)} of 8 items (")
+        assert f"{kinds.count(BadPicture)} {BadPicture.kind}" in message
+        assert f"{kinds.count(BadCamera)} {BadCamera.kind}" in message
+        assert message.endswith(f"the first: {loader.refused[0]}")
+
+
+def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
+    loader = module(make_tree(tmp_path, ["c4"], ["c2"]), most_bad=0.5, evaluation_batch_size=2).test_dataloader()
+    assert [name for batch in loader for name in batch.names] == [key for key in KEYS if key not in ("c2", "c4")]
+    assert [error.sequence for error in loader.refused] == ["c2", "c4"]
+    assert [message[:20] for message in caplog.messages] == ["skipped 2 of 9 items"]
+
+
+def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
+    root = make_tree(tmp_path, ["c4"], ["c2", "c6"])
+    loader = module(root, most_bad=0.25).test_dataloader()
+    with pytest.raises(DataError, match=r"3 of 9 items .* data\.most_bad=0\.25 .*last one: .*c6, frame 1") as caught:
+        list(loader)
+    assert "\n" not in str(caught.value)
+    assert len(list(module(root, most_bad=0.34, evaluation_batch_size=1).test_dataloader())) == 6
+
+
+def test_one_bad_item_is_no_share(tmp_path):
+    assert len(list(module(make_tree(tmp_path, ["c4"]), most_bad=0.0, evaluation_batch_size=1).test_dataloader())) == 8
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("most_bad", [0.1, 100.0])
+def test_nothing_that_can_be_read_is_an_error(tmp_path, workers, most_bad):
+    data = module(make_tree(tmp_path, KEYS), most_bad=most_bad, workers=workers)
+    for loader in (data.train_dataloader(), data.test_dataloader()):
+        with pytest.raises(DataError, match="items cannot be read"):
+            list(loader)
+
+
+def test_an_unknown_policy_is_refused(tmp_path):
+    with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
+        module(make_tree(tmp_path, []), on_bad="ignore").train_dataloader()
+
+
+class Listener(LightningModule):
+    """Trains nothing."""
+
+    def training_step(self, batch, index):
+        return None
+
+    def configure_optimizers(self):
+        return None
+
+
+@pytest.mark.parametrize("limit", [1.0, 3])
+def test_lightning_hears_it_at_the_end_of_each_epoch(tmp_path, caplog, limit):
+    """Lightning stops after the number of batches it knows of, and never looks whether there is another."""
+    data = module(make_tree(tmp_path, [], ["c1", "c2", "c4"]), val_fraction=0.0, most_bad=10.0, batch_size=2)
+    trainer = Trainer(
+        max_epochs=2, limit_train_batches=limit, accelerator="cpu", logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    with caplog.at_level(logging.WARNING, logger="completesplat"):
+        trainer.fit(Listener(), data.train_dataloader())
+    assert [message[:7] for message in caplog.messages] == ["skipped", "skipped"]
+    assert torch.is_grad_enabled()
