@@ -4,11 +4,11 @@ import os
 import sys
 
 VERBS = {
-    "data": "make data sets",
+    "data": "make, check, look at, import and prepare data sets",
     "fit": "train a model, one stage at a time",
     "test": "score a checkpoint on held-out scenes",
     "predict": "draw complete scenes from one photograph",
-    "bench": "time the rasterizer backends (bench rasterizers)",
+    "bench": "time rasterizers and data loading (bench rasterizers, bench data)",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
     f"  {verb:9} {description}" for verb, description in VERBS.items()

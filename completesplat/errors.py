@@ -6,7 +6,7 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """Something of a data set that is missing, broken or not in the expected layout; see `data/checks.py` for its kinds.
+    """Something of a data set that is missing, broken or not in the expected layout; its kinds: `data/checks.py`.
 
     Args:
         reason: what is wrong, without the place.

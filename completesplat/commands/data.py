@@ -88,8 +88,8 @@ def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
             missing.append(error)
     if not sources:
         raise missing[0]
-    for error in missing:
-        logger.warning("left out: %s", error)
+    for left_out in missing:
+        logger.warning("left out: %s", left_out)
     return sources
 
 

@@ -19,7 +19,7 @@ FRAME_CASES, ENTRY_CASES, FILE_CASES = 47, 22, 5
 # What else than nothing a bad entry takes away: frame 2 of sequence a, or all of it.
 WITHOUT_FRAME = {"frame_without_number", "number_is_text", "number_is_a_fraction", "number_is_true", "name_is_a_number"}
 WITHOUT_SEQUENCE = {
-    "sequence_without_name", "cloud_without_path", "cloud_is_text", "cloud_outside", "nan_cloud_quality",
+    "sequence_without_name", "cloud_without_path", "cloud_is_text", "cloud_outside", "infinite_cloud_quality",
     "quality_is_text", "sequence_not_annotated",
 }  # fmt: skip
 CONSEQUENCES = {"name_is_a_number", "sequence_without_name"}

@@ -21,6 +21,9 @@ class Recorder(LightningModule):
         self.seen.append((self.current_epoch, index, batch.names, batch.all_views().images.double().sum().item()))
         return self.weight**2
 
+    def validation_step(self, batch, index):
+        """So that epochs are interrupted by validation."""
+
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), 0.1)
 

@@ -44,7 +44,9 @@ def test_both_forms_give_the_same_batches(both):
     key = {name: split.store("train").names for name, split in (("text", text), ("chunks", chunks))}
     assert sorted(key["text"]) == sorted(key["chunks"])
     for name in key["text"]:
-        scenes = [data.store("train").scene(data.store("train").source.read(name), 1, [0, 3]) for data in (text, chunks)]
+        scenes = [
+            data.store("train").scene(data.store("train").source.read(name), 1, [0, 3]) for data in (text, chunks)
+        ]
         assert same(*scenes)
     torch.testing.assert_close(text.mean_image(), chunks.mean_image())
     assert text.typical_camera() == chunks.typical_camera()

@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.console import Console
 
-from completesplat.reports.rasterizers.tables import Column, table
+from completesplat.reports.tables import Column, table
 
 READING: list[Column] = [
     ("form", "form", ""),

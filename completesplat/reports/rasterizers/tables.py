@@ -1,12 +1,11 @@
 """The benchmark's figures for people."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
-Column = tuple[str, str, str]  # heading, key of the row, format
+from completesplat.reports.tables import Column, table
 
 SPEED: list[Column] = [
     ("backend", "backend", ""),
@@ -65,17 +64,6 @@ def show(results: dict[str, Any]) -> None:
             console.print(table(title, columns, compared))
     for name, reason in results["not_measured"].items():
         console.print(f"{name}: not measured, because {reason}")
-
-
-def table(title: str, columns: Sequence[Column], rows: Iterable[dict[str, Any]]) -> Table:
-    """One line for each row; what a row lacks stays empty."""
-    shown = Table(title=title, title_justify="left")
-    for heading, _, form in columns:
-        shown.add_column(heading, justify="right" if form else "left", no_wrap=True)
-    for row in rows:
-        values = [(row.get(key), form) for _, key, form in columns]
-        shown.add_row(*("" if value is None else format(value, form) for value, form in values))
-    return shown
 
 
 def against_tiled(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
