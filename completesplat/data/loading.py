@@ -3,12 +3,15 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any
 
 import torch
 from torch.utils.data import DataLoader, Sampler
 
+from completesplat.data.processes import processes
 from completesplat.data.scenes import EvaluationScenes, TrainingScenes, collate
+from completesplat.data.streaming import StreamedScenes
 from completesplat.data.view_selection import draws
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
@@ -39,23 +42,15 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return sum(map(len, self.groups)) // _processes()[1]
+        return sum(map(len, self.groups)) // processes()[1]
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         # The index behind the last belongs to no item, so the order is independent of what the items draw.
         rng = draws(self.seed, self.epoch, sum(map(len, self.groups)))
         order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
-        rank, processes = _processes()
-        own = order[rank::processes][: len(self)]
+        rank, count = processes()
+        own = order[rank::count][: len(self)]
         return iter([(self.epoch, int(index)) for index in own[self.start :]])
-
-
-def _processes() -> tuple[int, int]:
-    """This training process's number, and how many there are."""
-    distributed = torch.distributed
-    if distributed.is_available() and distributed.is_initialized():
-        return distributed.get_rank(), distributed.get_world_size()
-    return 0, 1
 
 
 class SceneLoader:
@@ -64,7 +59,7 @@ class SceneLoader:
     It is a loader of its own for Lightning, which restores `state_dict` in the middle of an epoch.
 
     Args:
-        sampler: the order; None: as they are.
+        sampler: the order (streamed scenes are their own); None: as they are.
         workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
         most_bad: skipping more than this share of an epoch's items is an error.
@@ -72,9 +67,9 @@ class SceneLoader:
 
     def __init__(
         self,
-        scenes: TrainingScenes | EvaluationScenes,
+        scenes: TrainingScenes | EvaluationScenes | StreamedScenes,
         batch_size: int,
-        sampler: EpochSampler | None,
+        sampler: EpochSampler | StreamedScenes | None,
         workers: int,
         on_bad: str = "skip",
         most_bad: float = 0.1,
@@ -93,10 +88,11 @@ class SceneLoader:
         self._loader = DataLoader(
             scenes,
             batch_size,
-            sampler=sampler,
+            sampler=None if isinstance(sampler, StreamedScenes) else sampler,
             num_workers=workers,
-            # Workers hold what is cached, so they live on from one epoch to the next.
-            persistent_workers=workers > 0,
+            # Workers hold what is cached, so they live on from one epoch to the next; those of a stream hold nothing,
+            # and learn from a new start which epoch it is.
+            persistent_workers=workers > 0 and not isinstance(sampler, StreamedScenes),
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
             # Its own, so that the numbers which training draws do not depend on the number of workers.
@@ -114,10 +110,13 @@ class SceneLoader:
         """
         self.refused, resume, self._resume = [], self._resume, {}
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
+        surplus = 0
         if self.sampler is not None:
             self.sampler.start = self._batches * self.batch_size
+        if isinstance(self.sampler, StreamedScenes):
+            surplus = self.sampler.unfinished_round(self._loader.num_workers)
         try:
-            for scenes, refused in self._loader:
+            for scenes, refused in islice(self._loader, surplus, surplus + len(self) - self._batches):
                 self._batches += 1
                 self._account(refused, scenes is None)
                 if self._batches == len(self):
@@ -125,6 +124,8 @@ class SceneLoader:
                     self._report()
                 if scenes is not None:
                     yield scenes
+            if self._batches < len(self):
+                raise DataError("no sequences for this process: there are more processes than sequences")
         except GeneratorExit:  # The rest of the epoch is not wanted.
             if self._batches < len(self):
                 self._report()

@@ -20,6 +20,7 @@ from completesplat.data.prepared.manifest import is_prepared, read_manifest, set
 from completesplat.data.prepared.source import PreparedSource
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.streaming import StreamedScenes
 from completesplat.data.typical_camera import TypicalCamera, typical_camera
 from completesplat.errors import CompleteSplatError, DataError
 
@@ -48,6 +49,7 @@ class SceneDataModule(LightningDataModule):
         mirroring: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none.
         cache: keep decoded pictures in memory.
+        streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         most_bad: skipping more than this share of an epoch's items is an error.
     """
@@ -66,6 +68,7 @@ class SceneDataModule(LightningDataModule):
         mirroring: bool = False,
         workers: int = 0,
         cache: bool = False,
+        streaming: bool = False,
         on_bad: str = "skip",
         most_bad: float = 0.1,
         seed: int = 0,
@@ -88,6 +91,7 @@ class SceneDataModule(LightningDataModule):
         )
         self.workers = workers
         self.cache = cache
+        self.streaming = streaming
         self.policy = on_bad, most_bad
         self.seed = seed
         self._sources: dict[str, SequenceSource] = {}
@@ -177,9 +181,17 @@ class SceneDataModule(LightningDataModule):
         scenes = TrainingScenes(
             self.store("train"), self.training_views, self.augment, self.references_per_sequence, self.seed
         )
-        return SceneLoader(
-            scenes, self.batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy
-        )
+        if self.streaming:
+            streamed = self._streamed(scenes)
+            return SceneLoader(streamed, self.batch_size, streamed, self.workers, *self.policy)
+        sampler = EpochSampler(scenes.groups(), self.seed)
+        return SceneLoader(scenes, self.batch_size, sampler, self.workers, *self.policy)
+
+    def _streamed(self, scenes: TrainingScenes) -> StreamedScenes:
+        source = self.source("train")
+        if not isinstance(source, PreparedSource):
+            raise CompleteSplatError("data.streaming=true needs prepared data: completesplat data prepare")
+        return StreamedScenes(scenes, source, self.batch_size)
 
     def val_dataloader(self) -> SceneLoader:
         """The validation sequences."""
@@ -204,8 +216,14 @@ class SceneDataModule(LightningDataModule):
             logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
 
     def typical_camera(self) -> TypicalCamera:
-        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences."""
-        chosen = [(sequence, frames) for sequence, frames in self._excerpts()]
+        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences.
+
+        Raises:
+            DataError: none of them can be read.
+        """
+        chosen = list(self._excerpts())
+        if not chosen:
+            raise DataError("no training sequence can be read", str(self.root))
         return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -55,9 +55,12 @@ class SceneStore:
         """
         views = [reference, *targets]
         pictures = [self._picture(sequence, view) for view in views]
-        images = torch.stack([picture.image for picture in pictures]).float().div(255)
-        masks = torch.stack([self._mask(picture) for picture in pictures])
-        cameras = sequence.cameras.relative_to(sequence.cameras[reference])[views].to(torch.float32)
+        images = _shares([picture.image for picture in pictures])
+        everywhere = torch.full_like(pictures[0].image[:1], 255)
+        masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
+        if self.mask_threshold is not None:
+            masks = (masks >= self.mask_threshold).float()
+        cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
         seen = Views(images, cameras, masks)
         visible = torch.ones_like(masks[0])
         return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, sequence.name)
@@ -78,11 +81,10 @@ class SceneStore:
             self._pictures[key] = sequence.read(view)
         return self._pictures[key]
 
-    def _mask(self, picture: Picture) -> Tensor:
-        if picture.mask is None:
-            return torch.ones_like(picture.image[:1], dtype=torch.float32)
-        probability = picture.mask.float().div(255)
-        return probability if self.mask_threshold is None else (probability >= self.mask_threshold).float()
+
+def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
+    # By NumPy: torch would wake its threads for so little, and they would wait on cores that others need.
+    return torch.from_numpy(np.stack([picture.numpy() for picture in pictures]).astype(np.float32) / 255)
 
 
 class TrainingScenes(Dataset[Loaded]):
@@ -121,12 +123,20 @@ class TrainingScenes(Dataset[Loaded]):
         for _ in range(ATTEMPTS):
             try:
                 sequence = self.store.source.read(self.store.names[index // self.references])
-                scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
-                return Loaded(self.augment(scene, rng), tuple(refused))
+                return Loaded(self.make(sequence, rng), tuple(refused))
             except DataError as error:
                 refused.append(error)
                 index = int(rng.integers(len(self)))
         return Loaded(None, tuple(refused))
+
+    def make(self, sequence: PosedSequence, rng: np.random.Generator) -> SceneBatch:
+        """A scene of random views of a sequence.
+
+        Raises:
+            DataError: a picture that cannot be read.
+        """
+        scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
+        return self.augment(scene, rng)
 
     def groups(self) -> list[list[int]]:
         """Items that are best loaded one after the other."""

@@ -15,6 +15,8 @@ def stream(
 ) -> Iterator[PosedSequence]:
     """The sequences of a split that fall to one of `world_size` processes: disjoint, and complete together.
 
+    In a worker process of torch's `DataLoader`, those of its shards.
+
     Nothing but the shards is read: no network, no cache in the home folder.
 
     Args:

@@ -1,0 +1,120 @@
+"""Prepared data through the data modules: the same batches as from the files that they were made from."""
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+from realestate10k_trees import FORMS, make_clip
+
+from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.module import SceneDataModule
+from completesplat.data.prepared.writing import prepare
+from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.errors import DataError
+from completesplat.scene import SceneBatch
+
+SPLITS = ("train", "val", "test")
+
+
+def objects(root: Path, **settings) -> CO3DDataModule:
+    return CO3DDataModule(str(root), "toy_objects", **{"image_size": 16, "batch_size": 2, "targets": 2} | settings)
+
+
+def clips(root: Path, **settings) -> RE10KDataModule:
+    return RE10KDataModule(str(root), **{"image_size": 8, "batch_size": 2, "targets": 2, "val_fraction": 0.3} | settings)
+
+
+def prepared(data: SceneDataModule, out: Path, **settings) -> Path:
+    sources = {split: data.source(split) for split in SPLITS}
+    return prepare(sources, data.prepared_settings(), out, workers=1, progress=False, **settings)
+
+
+def equal(one: SceneBatch, other: SceneBatch) -> bool:
+    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
+        views = batch.all_views()
+        cameras = views.cameras.world_to_camera, views.cameras.intrinsics
+        return [views.images, views.masks, *cameras, batch.depth_range, batch.visible]
+
+    return one.names == other.names and all(map(torch.equal, tensors(one), tensors(other)))
+
+
+def assert_same_batches(raw: SceneDataModule, packed: SceneDataModule) -> None:
+    for loader in ("train_dataloader", "val_dataloader", "test_dataloader"):
+        one, other = list(getattr(raw, loader)()), list(getattr(packed, loader)())
+        assert len(one) == len(other) > 0
+        assert all(map(equal, one, other))
+
+
+@pytest.fixture(scope="module")
+def packed_objects(toy_root, tmp_path_factory) -> Path:
+    return prepared(objects(toy_root), tmp_path_factory.mktemp("objects") / "store")
+
+
+@pytest.fixture(scope="module")
+def tours(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("tours")
+    for split in ("train", "test"):
+        FORMS["text"](root / split, [make_clip(f"{split}{number}", seed=number) for number in range(5)])
+    return root
+
+
+def test_objects_give_the_same_batches(toy_root, packed_objects):
+    augmented = {
+        "color_jitter": {"brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.05},
+        "mirroring": True,
+        "box_masks": {"probability": 0.5},
+        "references_per_sequence": 3,
+    }
+    assert_same_batches(objects(toy_root), objects(packed_objects))
+    assert_same_batches(objects(toy_root, **augmented), objects(packed_objects, **augmented))
+    assert objects(toy_root).typical_camera() == objects(packed_objects).typical_camera()
+    assert torch.equal(objects(toy_root).mean_image(), objects(packed_objects).mean_image())
+
+
+def test_tours_give_the_same_batches(tours, tmp_path):
+    store = prepared(clips(tours), tmp_path / "store")
+    assert_same_batches(clips(tours), clips(store))
+    index = {"test0": {"context": [4, 0], "target": [1, 5]}, "test3": {"context": [0, 5], "target": [3]}, "test4": None}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    chosen = {"evaluation_index": str(tmp_path / "index.json")}
+    assert_same_batches(clips(tours, **chosen), clips(store, **chosen))
+
+
+def test_an_evaluation_index_means_frames_also_where_some_were_left_out(tours, tmp_path):
+    """Frame 2 is broken: it is missing in the prepared clip, and the frames behind it keep their numbers."""
+    root = tmp_path / "broken"
+    for split in ("train", "test"):
+        FORMS["text"](root / split, [make_clip(f"{split}{number}", seed=number) for number in range(5)])
+    sorted((root / "test/test0").glob("*.jpg"), key=lambda path: int(path.stem))[2].write_bytes(b"")
+    store = prepared(clips(root), tmp_path / "store", most_bad=0.5)
+    (tmp_path / "index.json").write_text(json.dumps({"test0": {"context": [0, 5], "target": [1, 3, 4]}}))
+    chosen = {"evaluation_index": str(tmp_path / "index.json")}
+    (intact,), (packed,) = (list(clips(place, **chosen).test_dataloader()) for place in (tours, store))
+    assert equal(intact, packed)
+    (tmp_path / "index.json").write_text(json.dumps({"test0": {"context": [0, 5], "target": [2]}}))
+    with pytest.raises(DataError, match="test0, frame 2"):
+        list(clips(store, on_bad="raise", **chosen).test_dataloader())
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("image_size", 8), ("depth_after", 3.0), ("subset", None), ("min_frames", 3), ("split_seed", 1)]
+)
+def test_data_prepared_with_other_settings_are_refused(packed_objects, name, value):
+    with pytest.raises(DataError, match=name):
+        objects(packed_objects, **{name: value}).setup("fit")
+
+
+def test_settings_that_change_nothing_of_what_was_prepared_are_free(packed_objects):
+    objects(packed_objects, targets=1, seed=3, mask_threshold=0.5, evaluation_targets=1).setup("fit")
+
+
+def test_resuming_on_other_data_is_told_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):
+    state = objects(toy_root).state_dict()
+    with caplog.at_level(logging.WARNING):
+        objects(packed_objects).load_state_dict(state)
+        assert caplog.messages == []
+        clips(tours).load_state_dict(state)
+    assert len(caplog.messages) == 1
+    assert "not those that the resumed run" in caplog.messages[0]
