@@ -95,12 +95,13 @@ def test_a_bad_depth_map_is_not_looked_at_where_there_is_a_point_cloud(category,
     assert set(seen) == {(name, number) for name in "ab" for number in (0, 1)}
 
 
-def test_evaluation_goes_on_without_the_bad_sequence_and_counts_it_once(category, intact):
+def test_evaluation_of_nothing_but_a_bad_sequence_is_no_evaluation(category, intact):
     (category / "c/images/frame000002.png").write_text("picture")
     with pytest.raises(BadPicture):
         list(module(category.parent, "raise").val_dataloader())
     loader = module(category.parent, "skip").val_dataloader()
-    assert list(loader) == []
+    with pytest.raises(DataError, match="1 of 1 items cannot be read"):
+        list(loader)
     assert [(error.sequence, error.frame) for error in loader.refused] == [("c", 1)]
 
 

@@ -23,7 +23,8 @@ def objects(root: Path, **settings) -> CO3DDataModule:
 
 
 def clips(root: Path, **settings) -> RE10KDataModule:
-    return RE10KDataModule(str(root), **{"image_size": 8, "batch_size": 2, "targets": 2, "val_fraction": 0.3} | settings)
+    small = {"image_size": 8, "batch_size": 2, "targets": 2, "val_fraction": 0.3}
+    return RE10KDataModule(str(root), **small | settings)
 
 
 def prepared(data: SceneDataModule, out: Path, **settings) -> Path:
