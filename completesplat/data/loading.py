@@ -131,6 +131,16 @@ class SceneLoader:
                 self._report()
             raise
 
+    # Where Lightning looks for the worker processes when it is done, to end them. Left to the garbage collector, each
+    # would go on waiting for 5 seconds, and the training process with it.
+    @property
+    def _iterator(self) -> Any:
+        return self._loader._iterator
+
+    @_iterator.setter
+    def _iterator(self, iterator: Any) -> None:
+        self._loader._iterator = iterator
+
     @property
     def _items(self) -> int:
         """Of this process in an epoch."""

@@ -1,5 +1,6 @@
 """A run of Lightning that is stopped and resumed sees what an uninterrupted one sees."""
 
+import multiprocessing
 from pathlib import Path
 
 import pytest
@@ -59,3 +60,9 @@ def test_a_resumed_run_sees_the_rest(root, tmp_path, workers, options):
     for done in (1, 3, 4, 6) if workers == 0 else (1, 4):
         resumed = train(root, tmp_path / f"{done}", 10, workers, tmp_path / f"whole/step={done}.ckpt", **options)
         assert resumed == whole[done:]
+
+
+def test_worker_processes_end_with_the_run(root, tmp_path):
+    before = set(multiprocessing.active_children())
+    train(root, tmp_path, 3, workers=2)
+    assert set(multiprocessing.active_children()) <= before
