@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils.data import default_collate
 
 T = TypeVar("T", bound="TensorDataclass")
 
@@ -70,7 +71,8 @@ def stack(items: Sequence[T]) -> T:
 def _merge(values: list[Any]) -> Any:
     first = values[0]
     if isinstance(first, Tensor):
-        return torch.stack(values)
+        # Like `torch.stack`, but in a loading process straight into the memory that it shares with training.
+        return default_collate(values)
     if isinstance(first, TensorDataclass):
         return stack(values)
     if isinstance(first, str):

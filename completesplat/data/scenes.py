@@ -84,7 +84,7 @@ class SceneStore:
 
 def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
     # By NumPy: torch would wake its threads for so little, and they would wait on cores that others need.
-    return torch.from_numpy(np.stack([picture.numpy() for picture in pictures]).astype(np.float32) / 255)
+    return torch.from_numpy(np.divide([picture.numpy() for picture in pictures], 255, dtype=np.float32))
 
 
 class TrainingScenes(Dataset[Loaded]):

@@ -55,7 +55,7 @@ def test_everything_is_measured_written_and_shown(quick):
     results = benchmark.results
     assert set(results) == {"machine", "not_measured", "rows", "opening", "clips", "chunks"}
     assert results["not_measured"] == {}
-    prepared = ["prepared png", "prepared jpeg"]
+    prepared = ["prepared bmp", "prepared png", "prepared jpeg"]
     for rows, forms in [(results["rows"], ["raw", *prepared]), (results["clips"], ["chunks", "text", *prepared])]:
         assert [(row["workers"], row["form"]) for row in rows] == [(n, form) for n in (0, 2) for form in forms]
         for row in rows:
@@ -107,7 +107,7 @@ def test_help_lists_the_settings(command):
         ("workers=[]", "workers=[]: must be a list, such as workers=[0]"),
         ("workers=[0,-1]", "workers=[0, -1]: must not be negative"),
         ("codecs=png", "codecs=png: must be a list, such as codecs=[png]"),
-        ("codecs=[png,webp]", "codecs=['png', 'webp']: choose from png, jpeg"),
+        ("codecs=[png,webp]", "codecs=['png', 'webp']: choose from png, jpeg, bmp"),
         ("opening.sequences=1", "opening.sequences=1: must be at least 2"),
         ("opening.epochs=0", "opening.epochs=0: must be at least 1"),
     ],

@@ -64,9 +64,10 @@ def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 
         assert mask is None or torch.equal(mask, expected_mask)
 
 
+@pytest.mark.parametrize("codec", ["png", "bmp"])
 @pytest.mark.parametrize("masked", [True, False])
-def test_png_gives_back_every_bit(masked: bool, tmp_path: Path) -> None:
-    source: SequenceSource = PreparedSource(make(tmp_path / "store", masked), "train")
+def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Path) -> None:
+    source: SequenceSource = PreparedSource(make(tmp_path / "store", masked, codec=codec), "train")
     assert isinstance(source, SequenceSource)
     assert source.names == NAMES
     assert (source.refused, source.left_out, source.fingerprint()) == ([], {}, "a")

@@ -57,7 +57,7 @@ class EncodedPicture:
 
 
 def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPicture:
-    """A frame's picture as files; the mask is PNG whatever the codec.
+    """A frame's picture as files; the mask is without loss whatever the codec.
 
     Raises:
         DataError: it cannot be read, or has another size than its camera.
@@ -66,7 +66,8 @@ def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPi
     for part in (image, mask):
         if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
             raise BadPicture(f"has {part.shape[1]} x {part.shape[2]} pixels, its camera {sequence.cameras.image_size}")
-    return EncodedPicture(encode(image, codec), None if mask is None else encode(mask, "png"))
+    without_loss = "png" if codec == "jpeg" else codec
+    return EncodedPicture(encode(image, codec), None if mask is None else encode(mask, without_loss))
 
 
 def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[EncodedPicture]) -> pa.Table:

@@ -37,7 +37,7 @@ def test_their_groups_hold_every_one_once() -> None:
 def test_what_an_array_takes_is_memory_of_the_process_itself() -> None:
     before = resident_megabytes()
     # Fresh pages from the system: an allocator may give out memory that the process has already.
-    kept = np.frombuffer(mmap.mmap(-1, 60 * 2**20), np.uint8)
+    kept = np.frombuffer(mmap.mmap(-1, 60 * 2**20, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.uint8)
     kept[:] = 1
     after = resident_megabytes()
     assert before is not None
