@@ -42,8 +42,9 @@ demo: $(READY) ## Make toy scenes, train both stages, evaluate, complete two pic
 	@echo "  weights/      for completesplat predict image=FILE weights=$(DEMO)/weights"
 	@echo "  data/ var/ diffusion/   the toy scenes and the two training runs"
 
+# Threads that wait at full speed, as GNU OpenMP's do by default, would keep the other test process off the cores.
 test: check ## Lint, types and the tests (CPU, under 8 minutes)
-	$(BIN)/python -m pytest -q
+	GOMP_SPINCOUNT=3000 $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
@@ -53,8 +54,9 @@ check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: $(READY) ## Time the rasterizer backends side by side
+bench: $(READY) ## Time the rasterizer backends, and data loading, side by side
 	$(BIN)/completesplat bench rasterizers
+	$(BIN)/completesplat bench data
 
 notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb
