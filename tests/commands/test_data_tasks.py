@@ -1,0 +1,102 @@
+"""`completesplat data stats`, `show`, `prepare` and `import`: what they write, say and refuse."""
+
+import json
+from pathlib import Path
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from support import strict_json
+
+from completesplat.data.toy import write_rooms
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("rooms")
+    write_rooms(root, scenes=6, frames=4, size=16, seed=0, workers=1, progress=False)
+    return root
+
+
+@pytest.fixture
+def sets(toy_root: Path, rooms: Path) -> dict[str, list[str]]:
+    return {
+        "objects": ["data=toy_objects", f"data.root={toy_root}", "data.image_size=16"],
+        "rooms": ["data=toy_rooms", f"data.root={rooms}", "data.image_size=16", "data.form=chunks"],
+    }
+
+
+@pytest.mark.parametrize("kind", ["objects", "rooms"])
+def test_statistics_are_written_drawn_and_shown(command, sets, kind, tmp_path):
+    finished = command("data", "stats", *sets[kind], f"out={tmp_path / 'out'}")
+    assert finished.status == 0
+    splits = strict_json(tmp_path / "out/stats.json")["splits"]
+    assert {split: (n["sequences"], n["frames"]) for split, n in splits.items()} == {
+        "objects": {"train": (2, 8), "val": (1, 4), "test": (1, 4)},
+        "rooms": {"train": (4, 16), "val": (1, 4), "test": (1, 4)},
+    }[kind]
+    assert imageio.imread(tmp_path / "out/stats.png").shape[2] >= 3
+    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+
+
+@pytest.mark.parametrize("kind", ["objects", "rooms"])
+def test_the_sheet_shows_as_many_scenes_as_asked(command, sets, kind, tmp_path):
+    heights = []
+    for scenes in (1, 2):
+        assert command("data", "show", *sets[kind], f"scenes={scenes}", f"out={tmp_path / str(scenes)}").status == 0
+        heights.append(imageio.imread(tmp_path / str(scenes) / "show.png").shape[0])
+    assert heights[0] < heights[1]
+    refused = command("data", "show", *sets[kind], "scenes=9", f"out={tmp_path / '9'}")
+    assert (refused.status, len(refused.err.splitlines())) == (2, 1)
+
+
+@pytest.mark.parametrize("kind", ["objects", "rooms"])
+def test_prepared_data_pass_the_check_and_are_not_prepared_again(command, sets, kind, tmp_path):
+    store, settings = tmp_path / "store", [s for s in sets[kind] if not s.startswith("data.root")]
+    assert command("data", "prepare", *sets[kind], "workers=1", f"out={store}").status == 0
+    made = {path.name: path.stat().st_mtime_ns for path in store.glob("*.arrow")}
+    again = command("data", "prepare", *sets[kind], "workers=1", f"out={store}")
+    assert again.status == 0
+    assert {path.name: path.stat().st_mtime_ns for path in store.glob("*.arrow")} == made
+    checked = command("data", "check", *settings, f"data.root={store}", "workers=1", f"out={tmp_path / 'check'}")
+    assert checked.status == 0
+    assert strict_json(tmp_path / "check/check.json")["refused"] == []
+    refused = command("data", "prepare", *settings, f"data.root={store}", f"out={tmp_path / 'twice'}")
+    assert refused.status == 2
+    assert "prepared already" in refused.err
+
+
+def test_a_flipped_bit_in_a_shard_is_found(command, sets, tmp_path):
+    store = tmp_path / "store"
+    assert command("data", "prepare", *sets["objects"], "workers=1", f"out={store}").status == 0
+    shard = next(store.glob("train-*.arrow"))
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 1
+    shard.write_bytes(content)
+    settings = ["data=toy_objects", "data.image_size=16", f"data.root={store}", "workers=1"]
+    assert command("data", "check", *settings, f"out={tmp_path / 'check'}").status == 0
+    found = strict_json(tmp_path / "check/check.json")
+    assert any(entry["file"] == str(shard) for entry in found["refused"])
+    assert "changed file" in found["counts"]
+
+
+def test_an_imported_capture_can_be_shown(command, tmp_path):
+    capture = tmp_path / "capture"
+    (capture / "images").mkdir(parents=True)
+    frames = []
+    for number in range(8):
+        angle = 2 * np.pi * number / 8
+        pose = np.eye(4)  # OpenGL's axes: the camera looks along -z, at the origin from a circle
+        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        pose[:3, 3] = 3 * pose[:3, 2]
+        imageio.imwrite(capture / f"images/{number}.png", np.full((12, 16, 3), 30 * number, np.uint8))
+        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
+    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    imported = command(
+        "data", "import", f"transforms={capture / 'transforms.json'}", f"out={tmp_path / 'out'}", "category=thing"
+    )
+    assert imported.status == 0
+    assert (tmp_path / "out/thing/frame_annotations.jgz").is_file()
+    settings = ["data=co3d_category", f"data.root={tmp_path / 'out'}", "data.category=thing", "data.subset=imported"]
+    assert command("data", "show", *settings, "data.image_size=12", f"out={tmp_path / 'show'}").status == 0
+    assert (tmp_path / "show/show.png").is_file()
