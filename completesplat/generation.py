@@ -57,8 +57,11 @@ class CompleteSplat(nn.Module):
         image_size: int,
     ) -> None:
         super().__init__()
+        autoreconstructor = dict(autoreconstructor)
+        if "pretrained" in autoreconstructor:  # its weights are a trained stage's: Stable Diffusion's are not needed
+            autoreconstructor["pretrained"] = None
         self.architecture = {
-            "autoreconstructor": dict(autoreconstructor),
+            "autoreconstructor": autoreconstructor,
             "conditioning": dict(conditioning),
             "denoiser": dict(denoiser),
             "sampler": dict(sampler),

@@ -35,7 +35,8 @@ def test_nothing_in_the_tree_is_forgotten_here():
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
-    needed += ["data.root=x"] if option.startswith(("co3d_", "realestate10k")) and not needed else []
+    needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
+    needed += ["model.checkpoint=x"] if option.endswith("_var_stage2") else []
     needed += NEEDED if option in ("latent_diffusion", "toy_diffusion") else []
     config = compose_config("fit", f"{group}={option}", *needed)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -58,6 +59,8 @@ def test_every_part_instantiates_from_its_config(group, option):
         pytest.skip("needs a CUDA device")
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
     needed += ["data.root=x"] if option == "realestate10k" else []
+    # Its weights are not in the repository.
+    needed += ["loss.terms.lpips=null"] if (group, option) == ("loss", "stage2") else []
     config = compose_config("fit", f"{group}={option}", *needed)
     with torch.device("meta" if option == "stable_diffusion" else "cpu"):
         part = instantiate(config[group], _convert_="all")
@@ -93,8 +96,25 @@ def test_the_papers_numbers():
     assert compose_config("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
 
 
-@pytest.mark.parametrize("experiment", options("experiment"))
-def test_every_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
+@pytest.mark.parametrize("data", ["co3d", "re10k"])
+def test_the_papers_stages(data):
+    one, two = (
+        compose_config("fit", f"experiment={data}_var_stage{n}", "data.root=x", "model.checkpoint=x") for n in (1, 2)
+    )
+    assert [(c.trainer.max_epochs, c.trainer.max_steps, c.optimizer.lr) for c in (one, two)] == [
+        (6000, -1, 5e-5),
+        (8000, -1, 5e-6),
+    ]
+    weights = [{name: term.weight for name, term in c.loss.terms.items()} for c in (one, two)]
+    assert weights[0] == {"mse": 0.8, "ssim": 0.2, "kl": 1e-6}
+    assert weights[1] == weights[0] | {"lpips": 0.01}
+    assert (one.data.batch_size, one.data.image_size) == (two.data.batch_size, two.data.image_size) == (32, 128)
+    assert one.data.color_jitter == two.data.color_jitter
+    assert one.data.color_jitter is not None
+
+
+@pytest.mark.parametrize("experiment", [option for option in options("experiment") if option.startswith("toy_")])
+def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
     if "diffusion" in experiment:

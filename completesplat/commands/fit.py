@@ -13,6 +13,10 @@ def run(config: Any, out: Path) -> None:
     from completesplat.commands import quieten
 
     quieten()
+    if config.resume is not None:  # the weights come from there
+        config.autoreconstructor.pretrained = None
+        if "checkpoint" in config.model:
+            config.model.checkpoint = None
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     module = instantiate(config.model, _convert_="all")

@@ -6,6 +6,14 @@ from typing import Any
 
 from completesplat.errors import WeightsError
 
+# What training needed of weights from elsewhere, before its first step and for its loss.
+ONLY_FOR_TRAINING = (
+    "model.autoreconstructor_checkpoint",
+    "model.checkpoint",
+    "model.model.pretrained",
+    "model.loss.terms.lpips",
+)
+
 
 def run(config: Any, out: Path) -> None:
     """Write `metrics.json` and print the table."""
@@ -20,9 +28,7 @@ def run(config: Any, out: Path) -> None:
     quieten()
     seed_everything(config.seed, verbose=False)
     data = instantiate(run_config.data, _convert_="all")
-    # The weights come from this checkpoint, whatever the run started from.
-    initial = {"autoreconstructor_checkpoint": None} if "autoreconstructor_checkpoint" in run_config.model else {}
-    module = instantiate(run_config.model, _convert_="all", **initial)
+    module = instantiate(run_config.model, _convert_="all")
     load_part(module, config.ckpt, prefix="")
     trainer = instantiate(config.trainer, logger=False, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)
@@ -44,4 +50,9 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    return OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(overrides))
+    config = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(overrides))
+    # The weights come from this checkpoint.
+    for key in ONLY_FOR_TRAINING:
+        if OmegaConf.select(config, key) is not None:
+            OmegaConf.update(config, key, None)
+    return config

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.errors import CompleteSplatError
 from completesplat.scene import Views
 from completesplat.tensors import TensorDataclass
 
@@ -28,24 +29,37 @@ class LossTerm(Protocol):
 
 
 class Weighted(NamedTuple):
-    """A term with its weight in the sum."""
+    """A term with its weight in the sum, and the optimizer step from which it takes part."""
 
     weight: float
     term: LossTerm
+    start_step: int = 0
 
 
 class WeightedSum:
     """Sum of weighted terms, by name.
 
     Args:
-        terms: name -> {weight, term}; an entry that is None is left out (that is how an ablation drops one).
+        terms: name -> {weight, term, start_step (default 0)}; an entry that is None is left out (that is how an
+            ablation drops one).
+
+    Raises:
+        CompleteSplatError: there is nothing to train on at step 0.
     """
 
     def __init__(self, terms: Mapping[str, Mapping | None]) -> None:
         self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry is not None}
+        if all(entry.start_step > 0 for entry in self.terms.values()):
+            raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
 
-    def __call__(self, prediction: Prediction, truth: Views) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-        """The weighted sum, and the unweighted value of each term for logging."""
-        values = {name: entry.term(prediction, truth) for name, entry in self.terms.items()}
+    def __call__(
+        self, prediction: Prediction, truth: Views, step: int = 0
+    ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+        """The weighted sum at an optimizer step, and the unweighted value of each of its terms for logging.
+
+        A term is not computed before its `start_step`.
+        """
+        active = {name: entry for name, entry in self.terms.items() if step >= entry.start_step}
+        values = {name: entry.term(prediction, truth) for name, entry in active.items()}
         total = torch.stack([self.terms[name].weight * value for name, value in values.items()]).sum()
         return total, {name: value.detach() for name, value in values.items()}

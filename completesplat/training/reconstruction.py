@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch
+from completesplat.training.checkpoints import load_part
 from completesplat.training.scene_module import SceneModule
 
 
@@ -18,20 +19,25 @@ class ReconstructionModule(SceneModule):
     Args:
         model: images -> `Reconstruction`: the Variational AutoReconstructor or a baseline.
         loss: weighted terms by name.
+        checkpoint: of an earlier stage, whose weights this one starts from.
         **rendering_and_optimization: see `SceneModule`.
     """
 
-    def __init__(self, model: nn.Module, loss: WeightedSum, **rendering_and_optimization: Any) -> None:
+    def __init__(
+        self, model: nn.Module, loss: WeightedSum, checkpoint: str | None = None, **rendering_and_optimization: Any
+    ) -> None:
         super().__init__(**rendering_and_optimization)
         self.model = model
         self.loss = loss
+        if checkpoint is not None:
+            load_part(model, checkpoint, prefix="model.")
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         reconstruction = self.model(scenes.reference.images)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             prediction = Prediction(self.render(gaussians, scenes), reconstruction)
-            total, values = self.loss(prediction, scenes.all_views())
+            total, values = self.loss(prediction, scenes.all_views(), self.global_step)
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
         return total

@@ -1,4 +1,7 @@
+import shutil
+
 import pytest
+from omegaconf import OmegaConf
 from support import strict_json
 
 
@@ -27,3 +30,15 @@ def test_the_runs_configuration_can_be_changed(command, pipeline, tmp_path):
     assert command("test", f"ckpt={checkpoint}", change, f"out={tmp_path / 'one'}").status == 0
     model = strict_json(tmp_path / "one" / "metrics.json")["model"]
     assert model["views"] == model["scenes"]
+
+
+def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path):
+    shutil.copytree(pipeline.var, tmp_path / "run")
+    config = OmegaConf.load(tmp_path / "run/config.yaml")
+    lpips = "completesplat.losses.lpips.LearnedPerceptualSimilarity"
+    term = {"weight": 0.01, "term": {"_target_": lpips, "vgg_weights": "gone.pth"}}
+    OmegaConf.update(config, "model.loss.terms.lpips", term, force_add=True)
+    config.model.model.pretrained, config.model.checkpoint = "gone", "gone.ckpt"
+    OmegaConf.save(config, tmp_path / "run/config.yaml")
+    checkpoint = tmp_path / "run/checkpoints/last.ckpt"
+    assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}").status == 0

@@ -1,0 +1,167 @@
+"""Starting from Stable Diffusion's VAE: a checkpoint in diffusers' layout, from a folder or the Hugging Face hub."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.errors import WeightsError
+
+CONFIG_FILE = "config.json"
+WEIGHTS_FILES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
+SUBFOLDERS = ("", "vae")  # a VAE by itself, or within a whole pipeline
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
+HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
+# The names of older diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
+OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
+# Keys of config.json and our settings of the same meaning.
+SETTINGS = {
+    "block_out_channels": "channels",
+    "layers_per_block": "layers_per_block",
+    "latent_channels": "latent_channels",
+    "norm_num_groups": "norm_groups",
+}
+
+
+def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str) -> None:
+    """Load a VAE into both halves, except for the last convolution, whose channels are a Splatter Image's.
+
+    The reconstructor's skips have no counterpart in the checkpoint and stay as they are.
+
+    Args:
+        source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), one with these in a
+            subfolder `vae`, or a hub id of either.
+
+    Raises:
+        WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
+    """
+    folder = _vae_folder(source)
+    config = _read_config(folder / CONFIG_FILE)
+    weights = {_current_name(name): value for name, value in _read_weights(folder).items()}
+    # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
+    vae = nn.ModuleDict(
+        {
+            "encoder": encoder.network,
+            "quant_conv": encoder.quant_conv,
+            "post_quant_conv": reconstructor.post_quant_conv,
+            "decoder": reconstructor.network,
+        }
+    )
+    groups: Any = encoder.network.conv_norm_out
+    mismatch = _mismatch(weights, vae.state_dict(), config.get("norm_num_groups", 32), groups.num_groups)
+    if mismatch:
+        raise WeightsError(f"{folder}: {mismatch}; {_needed_settings(config)}")
+    vae.load_state_dict({name: value for name, value in weights.items() if name not in HEAD}, strict=False)
+
+
+def _mismatch(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], groups: int, own_groups: int) -> str | None:
+    """The first thing about a checkpoint that does not fit, if any."""
+    own = {name: value for name, value in own.items() if name not in HEAD}
+    for name, value in own.items():
+        if name in weights and weights[name].shape != value.shape:
+            return f"{name} is {list(weights[name].shape)} there and {list(value.shape)} here"
+    for name in own:
+        if name not in weights:
+            return f"{name} is missing there"
+    for name in weights:
+        if name not in own and name not in HEAD:
+            return f"{name} has no place here"
+    if groups != own_groups:  # no tensor's shape tells
+        return f"its group normalisation has {groups} groups and {own_groups} here"
+    return None
+
+
+def _needed_settings(config: Mapping[str, Any]) -> str:
+    given = [
+        f"autoreconstructor.encoder.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
+        for theirs, ours in SETTINGS.items()
+        if theirs in config
+    ]
+    return f"its config.json asks for {' '.join(given)}" if given else "its config.json gives no sizes"
+
+
+def _vae_folder(source: str) -> Path:
+    """The folder of the VAE's files, fetched from the hub if `source` is no folder."""
+    local = Path(source).expanduser()
+    if local.exists():
+        hint = "give a folder from `hf download stabilityai/sd-vae-ft-mse --local-dir DIR`"
+        folder = _find(local)
+    elif HUB_ID.fullmatch(source):
+        hint = _fetch_hint(source)
+        folder = _find(_download(source, WEIGHTS_FILES[0])) or _find(_download(source, WEIGHTS_FILES[1]))
+    else:
+        raise WeightsError(f"{source}: no such folder; {_fetch_hint('stabilityai/sd-vae-ft-mse')}")
+    if folder is None:
+        files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
+        raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {hint}")
+    return folder
+
+
+def _find(folder: Path) -> Path | None:
+    for candidate in (folder / subfolder for subfolder in SUBFOLDERS):
+        if (candidate / CONFIG_FILE).is_file() and any((candidate / name).is_file() for name in WEIGHTS_FILES):
+            return candidate
+    return None
+
+
+def _download(hub_id: str, weights_file: str) -> Path:
+    from huggingface_hub import snapshot_download
+
+    wanted = [f"{subfolder}/{name}".lstrip("/") for subfolder in SUBFOLDERS for name in (CONFIG_FILE, weights_file)]
+    try:
+        return Path(snapshot_download(hub_id, allow_patterns=wanted))
+    except Exception as error:  # of the hub, of its HTTP library and of the file system
+        reason = _first_line(error).split(". ")[0]
+        raise WeightsError(
+            f"{hub_id}: no folder here, and not to be had from the hub ({reason}); {_fetch_hint(hub_id)}"
+        ) from error
+
+
+def _fetch_hint(hub_id: str) -> str:
+    return (
+        f"where there is a network, `hf download {hub_id} --local-dir DIR` fetches it (of a whole pipeline, "
+        "`--include 'vae/*'` is enough); then give autoreconstructor.pretrained=DIR"
+    )
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    try:
+        config = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise WeightsError(f"{path}: cannot be read: {_first_line(error)}") from error
+    kind = config.get("_class_name") if isinstance(config, dict) else None
+    if kind != "AutoencoderKL":
+        raise WeightsError(f"{path}: describes {kind or 'no model'}; give the folder of an AutoencoderKL")
+    if config.get("act_fn", "silu") != "silu":
+        raise WeightsError(f"{path}: activation {config['act_fn']}, but Stable Diffusion's VAE has silu")
+    return config
+
+
+def _read_weights(folder: Path) -> dict[str, Tensor]:
+    path = next(folder / name for name in WEIGHTS_FILES if (folder / name).is_file())
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch and safetensors have many for a damaged file
+        raise WeightsError(f"{path}: damaged or no weights ({_first_line(error)}); fetch it again") from error
+    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+        raise WeightsError(f"{path}: not a mapping of names to tensors; give diffusers' own file")
+    return weights
+
+
+def _current_name(name: str) -> str:
+    path, _, rest = name.partition(".attentions.0.")
+    layer, _, kind = rest.partition(".")
+    return f"{path}.attentions.0.{OLD_ATTENTION[layer]}.{kind}" if layer in OLD_ATTENTION else name
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)

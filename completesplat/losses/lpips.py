@@ -1,0 +1,84 @@
+"""Learned perceptual similarity (LPIPS)."""
+
+from importlib.resources import as_file, files
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.losses.vgg import VGG16Features, load_vgg16
+from completesplat.losses.weighted_sum import Prediction
+from completesplat.scene import Views
+
+# Mean and deviation of ImageNet's colours on [-1, 1], as rounded by Zhang et al. (`lpips/lpips.py`, ScalingLayer).
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+SMALLEST_NORM = 1e-10
+
+
+class PerceptualDistance(nn.Module):
+    """LPIPS, version 0.1, VGG (Zhang et al. 2018, Eq. 1; their repository `PerceptualSimilarity`), frozen.
+
+    Args:
+        features: network that gives the activations to compare.
+        heads: non-negative weight of each channel of each activation.
+    """
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(self, features: VGG16Features, heads: list[Float[Tensor, "1 _ 1 1"]]) -> None:
+        super().__init__()
+        self.features = features
+        self.heads = nn.ParameterList(heads)
+        self.register_buffer("shift", torch.tensor(SHIFT).view(3, 1, 1))
+        self.register_buffer("scale", torch.tensor(SCALE).view(3, 1, 1))
+        self.requires_grad_(False)
+
+    def forward(
+        self, first: Float[Tensor, "image 3 height width"], second: Float[Tensor, "image 3 height width"]
+    ) -> Float[Tensor, " image"]:
+        """Distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
+        layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)
+        maps = [nn.functional.conv2d((one - other).square(), head) for head, one, other in layers]
+        return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
+
+    def directions(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
+        """The activations of each layer, of unit length over the channels; zero where no channel is active."""
+        activations = self.features((2 * images - 1 - self.shift) / self.scale)
+        # Unlike a square root of a sum, this norm has a finite gradient (zero) where all channels are zero.
+        norms = [torch.linalg.vector_norm(layer, dim=1, keepdim=True) for layer in activations]
+        return [layer / (norm + SMALLEST_NORM) for layer, norm in zip(activations, norms, strict=True)]
+
+
+def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
+    """The weights of version 0.1 for VGG, as torchmetrics ships them."""
+    resource = files("torchmetrics.functional.image") / "lpips_models" / "vgg.pth"
+    with as_file(resource) as path:
+        weights = torch.load(path, map_location="cpu", weights_only=True)
+    return [weights[f"lin{layer}.model.1.weight"] for layer in range(5)]
+
+
+class LearnedPerceptualSimilarity:
+    """LPIPS with VGG16, averaged over the views (paper, Eq. 1, third term); always in float32.
+
+    The network is no part of the trained module, so no checkpoint holds it; it follows the images to their device.
+
+    Args:
+        vgg_weights: torchvision's `vgg16` state dict: a file, or a URL that is downloaded into torch's hub cache once.
+        vgg_sha256: SHA-256 of that file, or its first digits; None takes any file of the right layout.
+
+    Raises:
+        WeightsError: the weights are missing, cannot be downloaded, are another file, or have another layout.
+    """
+
+    def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:
+        self.distance = PerceptualDistance(load_vgg16(vgg_weights, vgg_sha256), load_heads())
+
+    def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
+        device = prediction.images.device
+        # Weights that moved in inference mode (a validation before the first step) could not take part in training.
+        with torch.inference_mode(False):
+            self.distance.to(device)
+        with torch.autocast(device.type, enabled=False):
+            return self.distance(prediction.images.flatten(0, 1).float(), truth.images.flatten(0, 1).float()).mean()

@@ -1,0 +1,147 @@
+import shutil
+
+import huggingface_hub
+import pytest
+import torch
+from hydra.utils import instantiate
+from pretrained_vaes import BIN, SAFETENSORS, build, random_vae, rewrite, stable_diffusion_vae
+from safetensors.torch import load_file
+from support import compose_config, tiny_generator
+
+from completesplat.generation import CompleteSplat
+
+HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
+
+
+@pytest.fixture(scope="module")
+def vae():
+    return random_vae()
+
+
+@pytest.fixture
+def folder(vae, tmp_path):
+    vae.save_pretrained(tmp_path / "vae_only")
+    return tmp_path / "vae_only"
+
+
+def shared_weights(model) -> dict[str, torch.Tensor]:
+    """The model's tensors that a VAE has too, under the VAE's names."""
+    parts = {
+        "encoder": model.encoder.network,
+        "quant_conv": model.encoder.quant_conv,
+        "post_quant_conv": model.reconstructor.post_quant_conv,
+        "decoder": model.reconstructor.network,
+    }
+    names = {f"{part}.{name}": value for part, module in parts.items() for name, value in module.state_dict().items()}
+    return {name: value for name, value in names.items() if name not in HEAD}
+
+
+def assert_loaded(model, vae):
+    expected = {name: value for name, value in vae.state_dict().items() if name not in HEAD}
+    loaded = shared_weights(model)
+    assert loaded.keys() == expected.keys()
+    assert all(torch.equal(loaded[name], expected[name]) for name in expected)
+
+
+def features_before_the_last_convolution(network, run):
+    seen = []
+    hook = network.conv_out.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    run()
+    hook.remove()
+    return seen[0]
+
+
+@torch.no_grad()
+def test_latents_and_decoder_features_are_the_vaes(vae, folder):
+    model = build(str(folder))
+    images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(2))
+    posterior, features = model.encoder(images)
+    expected = vae.encode(images * 2 - 1).latent_dist
+    torch.testing.assert_close(posterior.mean, expected.mean)
+    torch.testing.assert_close(posterior.log_variance, expected.logvar)
+    latent = expected.mean
+    ours = features_before_the_last_convolution(
+        model.reconstructor.network, lambda: model.reconstructor(latent, features)
+    )
+    theirs = features_before_the_last_convolution(vae.decoder, lambda: vae.decode(latent))
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_head_and_skips_stay_as_initialised(folder):
+    loaded, random = build(str(folder)), build()
+    heads = [model.reconstructor.network.conv_out for model in (loaded, random)]
+    assert torch.equal(heads[0].weight, heads[1].weight)
+    assert torch.equal(heads[0].bias, heads[1].bias)
+    assert all(not parameter.any() for parameter in loaded.reconstructor.skips.parameters())
+
+
+def test_all_else_is_the_vaes_bit_for_bit(vae, folder):
+    assert_loaded(build(str(folder)), vae)
+
+
+def test_a_pipelines_vae_is_found(vae, tmp_path):
+    (tmp_path / "model_index.json").write_text("{}")
+    vae.save_pretrained(tmp_path / "vae")
+    assert_loaded(build(str(tmp_path)), vae)
+
+
+def test_a_bin_file_is_loaded(vae, folder):
+    torch.save(vae.state_dict(), folder / BIN)
+    (folder / SAFETENSORS).unlink()
+    assert_loaded(build(str(folder)), vae)
+
+
+def test_older_names_of_the_attention_are_known(vae, folder):
+    def age(weights):
+        for new, old in {"to_q": "query", "to_k": "key", "to_v": "value", "to_out.0": "proj_attn"}.items():
+            for name in [name for name in weights if f".{new}." in name]:
+                weights[name.replace(f".{new}.", f".{old}.")] = weights.pop(name)
+
+    rewrite(folder, age)
+    assert any("proj_attn" in name for name in load_file(folder / SAFETENSORS))
+    assert_loaded(build(str(folder)), vae)
+
+
+def test_of_a_hub_pipeline_only_the_vae_is_fetched(vae, tmp_path, monkeypatch):
+    hub, cache = tmp_path / "hub", tmp_path / "cache"
+    for part in ("vae", "unet"):
+        vae.save_pretrained(hub / part, safe_serialization=False)
+
+    def snapshot_download(hub_id, allow_patterns):
+        assert hub_id == "some/pipeline"
+        for name in allow_patterns:
+            if (hub / name).is_file():
+                (cache / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(hub / name, cache / name)
+        return str(cache)
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
+    assert_loaded(build("some/pipeline"), vae)
+    assert sorted(path.name for path in cache.rglob("*") if path.is_file()) == ["config.json", BIN]
+
+
+def parameters(*modules) -> int:
+    return sum(parameter.numel() for module in modules for parameter in module.parameters())
+
+
+def test_stable_diffusions_size_is_the_published_one():
+    config = compose_config("fit", "autoreconstructor=stable_diffusion")
+    with torch.device("meta"):
+        model = instantiate(config.autoreconstructor, _convert_="all")
+        theirs = stable_diffusion_vae((128, 256, 512, 512), layers_per_block=2, norm_groups=32)
+    shapes = {name: value.shape for name, value in theirs.state_dict().items() if name not in HEAD}
+    assert {name: value.shape for name, value in shared_weights(model).items()} == shapes
+    assert round(parameters(model.encoder.network) / 1e6, 2) == 34.16
+    assert parameters(model.encoder.quant_conv) == 8 * 8 + 8
+    # The decoder's 49.49 M, its 128-channel 3x3 head widened from 3 to 30 channels.
+    decoder = parameters(theirs.decoder, theirs.post_quant_conv)
+    assert round(decoder / 1e6, 2) == 49.49
+    assert parameters(model.reconstructor) == decoder + 27 * (128 * 9 + 1) + parameters(model.reconstructor.skips)
+    assert parameters(model.reconstructor.skips) == 128 * 256 + 256
+
+
+def test_a_generator_neither_needs_nor_records_what_its_autoreconstructor_started_from(tmp_path):
+    parts = dict(tiny_generator().architecture)
+    parts["autoreconstructor"] |= {"pretrained": str(tmp_path / "absent")}
+    CompleteSplat(**parts).save_pretrained(tmp_path / "weights")
+    assert CompleteSplat.from_pretrained(tmp_path / "weights").architecture["autoreconstructor"]["pretrained"] is None

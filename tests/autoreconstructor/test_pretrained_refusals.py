@@ -1,0 +1,98 @@
+"""Every checkpoint that cannot be started from is refused in one line that says what to do."""
+
+import huggingface_hub
+import pytest
+import torch
+from pretrained_vaes import BIN, SAFETENSORS, build, random_vae, rewrite
+
+from completesplat.errors import WeightsError
+
+
+@pytest.fixture(scope="module")
+def vae():
+    return random_vae()
+
+
+@pytest.fixture
+def folder(vae, tmp_path):
+    vae.save_pretrained(tmp_path / "vae_only")
+    return tmp_path / "vae_only"
+
+
+def refusal(source, **changes) -> str:
+    with pytest.raises(WeightsError) as caught:
+        build(str(source), **changes)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    message = refusal("stabilityai/sd-vae-ft-mse")
+    assert "`hf download stabilityai/sd-vae-ft-mse --local-dir DIR`" in message
+    assert "autoreconstructor.pretrained=DIR" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference", "setting"),
+    [
+        (
+            {"channels": (16, 16, 16, 16)},
+            "encoder.conv_in.weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here",
+            "channels=[8,8,16,16]",
+        ),
+        ({"layers_per_block": 2}, "resnets.1.norm1.weight is missing there", "layers_per_block=1"),
+        ({"norm_groups": 8}, "4 groups and 8 here", "norm_groups=4"),  # every shape fits
+    ],
+)
+def test_another_size_names_the_difference_and_the_setting(folder, changes, difference, setting):
+    message = refusal(folder, **changes)
+    assert difference in message
+    assert f"autoreconstructor.encoder.{setting}" in message
+
+
+def test_tensors_missing_or_too_many_are_named(folder):
+    rewrite(folder, lambda weights: weights.update({"decoder.extra": torch.zeros(1)}))
+    assert "decoder.extra has no place here" in refusal(folder)
+    rewrite(folder, lambda weights: weights.pop("decoder.mid_block.resnets.1.conv2.bias"))
+    assert "decoder.mid_block.resnets.1.conv2.bias is missing there" in refusal(folder)
+
+
+@pytest.mark.parametrize("kept", [0, 4, 1000, -1])
+def test_a_truncated_file_is_damaged(folder, kept):
+    path = folder / SAFETENSORS
+    path.write_bytes(path.read_bytes()[:kept])
+    assert f"{path}: damaged" in refusal(folder)
+
+
+def test_a_bin_file_that_is_no_mapping_of_tensors_is_refused(vae, folder):
+    (folder / SAFETENSORS).unlink()
+    torch.save({"state_dict": vae.state_dict()}, folder / BIN)
+    assert "not a mapping of names to tensors" in refusal(folder)
+
+
+@pytest.mark.parametrize("name", ["config.json", SAFETENSORS])
+def test_a_folder_without_its_files_says_which_are_needed(folder, name):
+    (folder / name).unlink()
+    message = refusal(folder)
+    assert message.startswith(f"{folder}: no config.json and {SAFETENSORS}")
+    assert "hf download" in message
+
+
+def test_a_folder_that_is_not_there_is_no_hub_id(tmp_path):
+    assert f"{tmp_path / 'absent'}: no such folder" in refusal(tmp_path / "absent")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "cannot be read"),
+        ("[1]", "describes no model"),
+        ('{"_class_name": "UNet2DConditionModel"}', "describes UNet2DConditionModel"),
+        ('{"_class_name": "AutoencoderKL", "act_fn": "relu"}', "activation relu"),
+    ],
+)
+def test_a_configuration_of_anything_else_is_refused(folder, text, reason):
+    (folder / "config.json").write_text(text)
+    assert f"{folder / 'config.json'}: {reason}" in refusal(folder)

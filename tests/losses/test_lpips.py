@@ -1,0 +1,187 @@
+import copy
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import compose_config
+from torch import nn
+from torchmetrics.functional.image import lpips as torchmetrics_lpips
+from vgg_weights import CONVOLUTIONS, digest
+
+from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.geometry.cameras import Cameras
+from completesplat.losses import Prediction
+from completesplat.losses.lpips import LearnedPerceptualSimilarity, load_heads
+from completesplat.losses.vgg import URL, load_vgg16
+from completesplat.scene import Views
+from completesplat.splatter_image import Parameterization, SplatterImage
+
+POOLINGS = (4, 9, 16, 23, 30)
+SHAPE = (2, 3, 3, 32, 32)
+
+
+@pytest.fixture(scope="module")
+def term(vgg_file):
+    return LearnedPerceptualSimilarity(str(vgg_file))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    generator = torch.Generator().manual_seed(1)
+    return torch.rand(SHAPE, generator=generator), torch.rand(SHAPE, generator=generator)
+
+
+def views(images: torch.Tensor) -> Views:
+    batch = images.shape[:2]
+    cameras = Cameras(torch.eye(4).expand(*batch, 4, 4), torch.eye(3).expand(*batch, 3, 3), (32, 32))
+    return Views(images, cameras, torch.ones(*batch, 1, 32, 32))
+
+
+def prediction(images: torch.Tensor) -> Prediction:
+    splatter_image = SplatterImage(torch.zeros(len(images), 2, 15, 1, 1), Parameterization())
+    return Prediction(images, Reconstruction(splatter_image, None))
+
+
+def flat(pair: tuple[torch.Tensor, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+    return pair[0].flatten(0, 1), pair[1].flatten(0, 1)
+
+
+def published(weights: dict[str, torch.Tensor], one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """LPIPS 0.1 of two images [3 height width], written out in float64."""
+    activations = []
+    for image in (one, other):
+        x = image.double() * 2 - 1
+        shift, scale = torch.tensor([[-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]], dtype=torch.float64)
+        x = ((x - shift[:, None, None]) / scale[:, None, None])[None]
+        layers = []
+        for index in range(31):
+            if index in CONVOLUTIONS:
+                weight, bias = (weights[f"features.{index}.{name}"].double() for name in ("weight", "bias"))
+                x = nn.functional.conv2d(x, weight, bias, padding=1).clamp_min(0)
+            elif index in POOLINGS:
+                layers.append(x[0])
+                x = nn.functional.max_pool2d(x, 2)
+        activations.append([y / (y.square().sum(0).sqrt() + 1e-10) for y in layers])
+    total = torch.zeros((), dtype=torch.float64)
+    for head, y, z in zip(load_heads(), *activations, strict=True):
+        total += torch.einsum("c,chw->hw", head.double().flatten(), (y - z) ** 2).mean()
+    return total
+
+
+def test_lpips_is_the_published_formula(term, weights, pair):
+    expected = torch.stack([published(weights, *images) for images in zip(*flat(pair), strict=True)])
+    torch.testing.assert_close(term.distance(*flat(pair)), expected.float(), rtol=1e-4, atol=0)
+    value = term(prediction(pair[0]), views(pair[1]))
+    assert value.item() == pytest.approx(expected.mean().item(), rel=1e-4)
+    assert value.item() > 0.01
+
+
+def test_lpips_is_torchmetrics_value(term, weights, pair, monkeypatch):
+    def features(net: str, pretrained: bool = False) -> nn.Sequential:
+        layers = [
+            nn.Conv2d(*CONVOLUTIONS[i], 3, padding=1)
+            if i in CONVOLUTIONS
+            else nn.MaxPool2d(2)
+            if i in POOLINGS
+            else nn.ReLU()
+            for i in range(31)
+        ]
+        network = nn.Sequential(*layers)
+        network.load_state_dict({key.removeprefix("features."): value for key, value in weights.items()})
+        return network
+
+    monkeypatch.setattr(torchmetrics_lpips, "_get_tv_model_features", features)
+    one, other = flat(pair)
+    theirs = torchmetrics_lpips._NoTrainLpips(net="vgg")(one, other, normalize=True).flatten()
+    torch.testing.assert_close(term.distance(one, other), theirs, rtol=1e-4, atol=0)
+
+
+def test_equal_images_cost_nothing(term, pair):
+    assert term(prediction(pair[0]), views(pair[0])).item() == 0
+
+
+def test_views_do_not_influence_each_other(term, pair):
+    one, other = flat(pair)
+    alone = torch.cat([term.distance(a[None], b[None]) for a, b in zip(one, other, strict=True)])
+    torch.testing.assert_close(term.distance(one, other), alone, rtol=1e-5, atol=0)
+
+
+def test_the_gradient_is_finite_and_reaches_the_images_only(term, pair):
+    images = pair[0].clone().requires_grad_()
+    term(prediction(images), views(pair[1])).backward()
+    assert images.grad is not None
+    assert images.grad.isfinite().all()
+    assert (images.grad.flatten(2).norm(dim=2) > 0).all()
+    assert [
+        name for name, value in term.distance.named_parameters() if value.requires_grad or value.grad is not None
+    ] == []
+
+
+def test_the_gradient_is_the_slope_of_the_distance(term, pair):
+    """Along a random direction, against central differences in float64."""
+    distance = copy.deepcopy(term.distance).double()
+    one, other = (x.double() for x in flat(pair))
+    direction = torch.randn(one.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    images = one.clone().requires_grad_()
+    distance(images, other).sum().backward()
+    ahead, behind = (distance(one + sign * 1e-6 * direction, other).sum() for sign in (1, -1))
+    assert (images.grad * direction).sum().item() == pytest.approx((ahead - behind).item() / 2e-6, rel=1e-3)
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-30], ids=["silent", "faint"])
+def test_a_layer_without_activity_costs_nothing_and_leaves_the_gradient_finite(term, pair, factor):
+    """The squares of the faint one's activations underflow to zero, while the activations do not."""
+    distance = copy.deepcopy(term.distance)
+    last = distance.features.features[28]
+    last.weight.mul_(factor)
+    last.bias.mul_(factor)
+    images = pair[0].flatten(0, 1).requires_grad_()
+    value = distance(images, pair[1].flatten(0, 1))
+    value.sum().backward()
+    assert images.grad.isfinite().all()
+    distance.heads[4].zero_()
+    torch.testing.assert_close(distance(*flat(pair)), value.detach(), rtol=1e-5, atol=0)
+
+
+def test_autocast_and_half_precision_images_do_not_lower_the_precision(term, pair):
+    one, other = (x.bfloat16() for x in pair)
+    expected = term(prediction(one.float()), views(other.float()))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert term(prediction(one), views(other)) == expected
+
+
+def test_weights_in_half_precision_are_computed_with_in_float32(weights, tmp_path):
+    torch.save({key: value.half() for key, value in weights.items()}, tmp_path / "half.pth")
+    network = load_vgg16(str(tmp_path / "half.pth"))
+    (tmp_path / "half.pth").unlink()
+    assert {value.dtype for value in network.parameters()} == {torch.float32}
+
+
+def test_making_the_loss_draws_no_random_numbers(vgg_file):
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    LearnedPerceptualSimilarity(str(vgg_file))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_stage_two_adds_lpips_to_stage_one_and_nothing_to_the_checkpoint(vgg_file):
+    file = [f"loss.terms.lpips.term.vgg_weights={vgg_file}", "loss.terms.lpips.term.vgg_sha256=null"]
+    configs = [compose_config("fit", "loss=stage1"), compose_config("fit", "loss=stage2", *file)]
+    modules = [instantiate(config.model, _convert_="all") for config in configs]
+    weights = [{name: entry.weight for name, entry in module.loss.terms.items()} for module in modules]
+    assert weights[1] == weights[0] | {"lpips": 0.01}
+    assert weights[1]["mse"] == 0.8
+    assert weights[1]["ssim"] == 0.2
+    assert set(modules[1].state_dict()) == set(modules[0].state_dict())
+    assert len(list(modules[1].parameters())) == len(list(modules[0].parameters()))
+
+
+def test_stage_two_takes_the_published_file_only(vgg_file):
+    assert compose_config("fit", "loss=stage2").loss.terms.lpips.term.vgg_weights == URL
+    config = compose_config("fit", "loss=stage2", f"loss.terms.lpips.term.vgg_weights={vgg_file}")
+    # The file's name holds the first digits of its hash.
+    assert Path(URL).stem == f"vgg16-{config.loss.terms.lpips.term.vgg_sha256[:8]}"
+    with pytest.raises(Exception, match=re.escape(f"SHA-256 {digest(vgg_file)}")):
+        instantiate(config.loss, _convert_="all")

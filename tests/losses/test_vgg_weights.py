@@ -1,0 +1,123 @@
+"""VGG16's weights from files and URLs: the right ones, or a refusal that says how to get them."""
+
+import socket
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+import torch
+from vgg_weights import blank, digest, saved
+
+from completesplat.errors import WeightsError
+from completesplat.losses.lpips import LearnedPerceptualSimilarity
+from completesplat.losses.vgg import URL, load_vgg16
+
+
+def test_the_right_hash_or_its_first_digits_are_accepted(vgg_file, weights):
+    for sha256 in (digest(vgg_file), digest(vgg_file)[:8].upper()):
+        network = load_vgg16(str(vgg_file), sha256)
+        assert torch.equal(network.state_dict()["features.28.weight"], weights["features.28.weight"])
+
+
+def refusal(vgg_weights: object, sha256: str | None = None) -> str:
+    with pytest.raises(WeightsError) as caught:
+        LearnedPerceptualSimilarity(str(vgg_weights), sha256)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert f"curl -LO {URL}" in message
+    assert "loss.terms.lpips.term.vgg_weights=FILE" in message
+    return message
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    assert f"{tmp_path / 'none.pth'}: no such file" in refusal(tmp_path / "none.pth")
+
+
+def test_another_file_than_the_hash_says_is_refused(vgg_file):
+    message = refusal(vgg_file, "0" * 64)
+    assert digest(vgg_file) in message
+    assert "0" * 64 in message
+
+
+def test_a_file_that_is_no_state_dict_is_refused(tmp_path):
+    (tmp_path / "page.pth").write_text("<html>not found</html>")
+    assert "not a readable state dict" in refusal(tmp_path / "page.pth")
+    torch.save([1, 2], tmp_path / "list.pth")
+    assert "not a readable state dict" in refusal(tmp_path / "list.pth")
+
+
+class Malicious:
+    def __reduce__(self):
+        return (Path.touch, (Path("harm"),))
+
+
+def test_code_in_a_file_is_not_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"features.0.weight": Malicious()}, tmp_path / "bad.pth")
+    assert "not a readable state dict" in refusal("bad.pth")
+    assert not Path("harm").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("features.28.bias", None, 'Missing key(s) in state_dict: "features.28.bias"'),
+        ("features.0.weight", torch.zeros(64, 1, 3, 3), "size mismatch for features.0.weight"),
+        # vgg16_bn and vgg19 have more entries than vgg16.
+        ("features.34.weight", torch.zeros(512, 512, 3, 3), 'Unexpected key(s) in state_dict: "features.34.weight"'),
+    ],
+)
+def test_weights_of_another_layout_are_refused(key, value, said, tmp_path):
+    changed = blank()
+    load_vgg16(str(saved(changed, tmp_path / "right.pth")))
+    if value is None:
+        del changed[key]
+    else:
+        changed[key] = value[:1, :1].expand(value.shape)
+    assert said in refusal(saved(changed, tmp_path / "changed.pth"))
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "_hub_dir", None)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    return tmp_path / "torch" / "hub" / "checkpoints"
+
+
+def test_an_unreachable_url_is_refused(hub):
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}/vgg16.pth"
+        assert f"{url} cannot be downloaded" in refusal(url)
+    assert list(hub.iterdir()) == []
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A folder with weights, and its URL while `server.shutdown` has not been called."""
+    folder = tmp_path / "served"
+    folder.mkdir()
+    saved(blank(), folder / "vgg16.pth")
+    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_a_url_is_downloaded_once_into_torchs_cache(hub, served):
+    folder, url = served
+    load_vgg16(f"{url}/vgg16.pth", digest(folder / "vgg16.pth"))
+    assert [path.name for path in hub.iterdir()] == ["vgg16.pth"]
+    (folder / "vgg16.pth").unlink()
+    load_vgg16(f"{url}/vgg16.pth")
+
+
+def test_a_download_with_another_hash_or_without_a_file_is_refused_and_not_kept(hub, served):
+    _, url = served
+    assert "cannot be downloaded" in refusal(f"{url}/vgg16.pth", "0" * 64)
+    assert "404" in refusal(f"{url}/none.pth")
+    assert list(hub.iterdir()) == []

@@ -1,0 +1,97 @@
+"""Each ablation changes what it says, and nothing else."""
+
+from typing import Any
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from support import compose_config
+
+from completesplat.commands import conf_folder
+
+ABLATIONS = sorted(path.stem for path in (conf_folder() / "ablation").glob("*.yaml"))
+JITTER = "data.color_jitter={brightness: 0.2, contrast: 0.2, saturation: 0.2, hue: 0.05}"
+# What differs from the full model, in a run that has everything that can be taken away.
+CHANGES = {
+    "full": set(),
+    "no_skips": {"autoreconstructor.reconstructor.skip_levels"},
+    "skips_first_two": {"autoreconstructor.reconstructor.skip_levels"},
+    "m1": {"autoreconstructor.reconstructor.parameterization.layers"},
+    "no_variational": {"autoreconstructor.variational", "loss.terms.kl"},
+    "no_ssim": {"loss.terms.ssim"},
+    "no_lpips": {"loss.terms.lpips"},
+    "no_color_aug": {"data.color_jitter"},
+}
+
+
+def composed(ablation: str, experiment: str = "toy_var") -> Any:
+    """The ablation in a run with colour augmentation, which toy experiments have not."""
+    with_jitter = [] if ablation == "no_color_aug" else [JITTER]
+    return compose_config("fit", f"experiment={experiment}", f"ablation={ablation}", *with_jitter)
+
+
+def flat(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Lists and None as values; so is a whole term of the loss, which is there or not."""
+    if not isinstance(config, dict) or (prefix.count(".") == 2 and prefix.startswith("loss.terms")):
+        return {prefix: config}
+    if prefix == "data.color_jitter":
+        return {prefix: config}
+    return {k: v for key, value in config.items() for k, v in flat(value, f"{prefix}.{key}".lstrip(".")).items()}
+
+
+def parts(config: Any) -> dict[str, Any]:
+    """What a model is built from; `model` refers to it."""
+    resolved = OmegaConf.to_container(config, resolve=True)
+    return flat({name: resolved[name] for name in ("autoreconstructor", "loss", "data", "optimizer", "trainer")})
+
+
+def test_every_ablation_is_looked_at_here():
+    assert set(ABLATIONS) == set(CHANGES)
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_an_ablation_changes_its_own_settings_and_nothing_else(ablation):
+    full, ablated = parts(composed("full")), parts(composed(ablation))
+    if ablation == "no_lpips":
+        full["loss.terms.lpips"] = "there"
+    changed = {key for key in full.keys() | ablated.keys() if full.get(key) != ablated.get(key)}
+    assert changed == CHANGES[ablation]
+
+
+def test_without_skips_there_are_no_skip_modules():
+    count = {
+        name: len(instantiate(composed(name).autoreconstructor, _convert_="all").reconstructor.skips)
+        for name in ("no_skips", "full", "skips_first_two")
+    }
+    assert count == {"no_skips": 0, "full": 1, "skips_first_two": 2}
+
+
+def test_m1_has_one_gaussian_to_a_pixel():
+    images = torch.rand(1, 3, 32, 32, generator=torch.manual_seed(0))
+    for name, layers in (("full", 2), ("m1", 1)):
+        model = instantiate(composed(name).autoreconstructor, _convert_="all")
+        assert model.reconstructor.network.conv_out.out_channels == 15 * layers
+        assert model(images).splatter_image.raw.shape[1] == layers
+
+
+def test_without_variational_sampling_training_uses_the_mode_and_no_kl():
+    images = torch.rand(2, 3, 32, 32, generator=torch.manual_seed(0))
+    for name, repeats in (("no_variational", True), ("full", False)):
+        config = composed(name)
+        config.autoreconstructor.skip_dropout = 0.0
+        model = instantiate(config.autoreconstructor, _convert_="all").train()
+        one, other = (model(images).splatter_image.raw for _ in range(2))
+        assert torch.equal(one, other) == repeats
+        assert ("kl" in instantiate(config.loss, _convert_="all").terms) != repeats
+
+
+def test_a_loss_term_that_is_taken_away_is_not_built():
+    assert "ssim" not in instantiate(composed("no_ssim").loss, _convert_="all").terms
+    assert "lpips" not in instantiate(composed("no_lpips").loss, _convert_="all").terms
+    assert set(instantiate(composed("full").loss, _convert_="all").terms) == {"mse", "ssim", "kl"}
+
+
+def test_without_colour_augmentation_nothing_is_drawn():
+    assert instantiate(composed("full").data, _convert_="all").augment.keywords["color_jitter"] is not None
+    assert instantiate(composed("no_color_aug").data, _convert_="all").augment.keywords["color_jitter"] is None
