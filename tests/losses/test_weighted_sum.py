@@ -41,7 +41,9 @@ def test_a_term_takes_part_from_its_start_step(step, total, names):
 
 
 @pytest.mark.parametrize(
-    "terms", [{}, {"a": None}, {"a": {"weight": 1.0, "term": Constant(1.0), "start_step": 1}}], ids=str
+    "terms",
+    [{}, {"a": None}, {"a": {"weight": 1.0, "term": Constant(1.0), "start_step": 1}}],
+    ids=["no terms", "a term taken away", "a term that starts later"],
 )
 def test_a_sum_with_nothing_at_step_zero_is_refused(terms):
     with pytest.raises(CompleteSplatError, match="start_step=0"):
