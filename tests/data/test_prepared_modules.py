@@ -108,7 +108,10 @@ def test_data_prepared_with_other_settings_are_refused(packed_objects, name, val
 
 
 def test_settings_that_change_nothing_of_what_was_prepared_are_free(packed_objects):
-    objects(packed_objects, targets=1, seed=3, mask_threshold=0.5, evaluation_targets=1).setup("fit")
+    data = objects(packed_objects, targets=1, seed=3, mask_threshold=0.5, evaluation_targets=1)
+    batch = next(iter(data.train_dataloader()))
+    assert batch.targets.images.shape[1] == 1
+    assert set(batch.targets.masks.unique().tolist()) == {0.0, 1.0}
 
 
 def test_resuming_on_other_data_is_told_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):

@@ -51,8 +51,10 @@ def test_what_is_held_counts_with_the_one_that_is_being_made() -> None:
 
 @pytest.mark.parametrize("path", DECODERS)
 def test_the_decoders_are_there(path: str) -> None:
-    with replaced(path, lambda function: function):
-        pass
+    found = []
+    with replaced(path, lambda function: found.append(function) or function):
+        assert len(found) == 1
+    assert callable(found[0])
 
 
 def test_decoding_is_part_of_reading(toy_root) -> None:
