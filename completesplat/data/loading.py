@@ -53,6 +53,16 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return iter([(self.epoch, int(index)) for index in own[self.start :]])
 
 
+def check_policy(on_bad: str) -> None:
+    """Refuse what is neither "skip" nor "raise".
+
+    Raises:
+        CompleteSplatError: it is something else.
+    """
+    if on_bad not in ON_BAD:
+        raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of {', '.join(ON_BAD)}")
+
+
 class SceneLoader:
     """Iterates over batches of scenes, and keeps account of what could not be read.
 
@@ -74,8 +84,7 @@ class SceneLoader:
         on_bad: str = "skip",
         most_bad: float = 0.1,
     ) -> None:
-        if on_bad not in ON_BAD:
-            raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of {', '.join(ON_BAD)}")
+        check_policy(on_bad)
         self.dataset = scenes
         self.batch_size = batch_size
         self.sampler = sampler

@@ -15,7 +15,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from completesplat.data.augmentation import BoxMasks, ColorJitter, augment
-from completesplat.data.loading import EpochSampler, SceneLoader
+from completesplat.data.loading import EpochSampler, SceneLoader, check_policy
 from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.prepared.source import PreparedSource
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
@@ -74,6 +74,7 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
+        check_policy(on_bad)
         if mask_threshold is not None and not 0 < mask_threshold <= 1:
             raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
         self.root = Path(root)

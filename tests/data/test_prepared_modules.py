@@ -12,7 +12,7 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.module import SceneDataModule
 from completesplat.data.prepared.writing import prepare
 from completesplat.data.realestate10k import RE10KDataModule
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
 
 SPLITS = ("train", "val", "test")
@@ -112,6 +112,11 @@ def test_settings_that_change_nothing_of_what_was_prepared_are_free(packed_objec
     batch = next(iter(data.train_dataloader()))
     assert batch.targets.images.shape[1] == 1
     assert set(batch.targets.masks.unique().tolist()) == {0.0, 1.0}
+
+
+def test_an_unknown_policy_is_refused_before_anything_is_read():
+    with pytest.raises(CompleteSplatError, match="on_bad=perhaps"):
+        objects(Path("nowhere"), on_bad="perhaps")
 
 
 def test_resuming_on_other_data_is_told_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):
