@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras
@@ -26,12 +26,14 @@ class SceneBatch(TensorDataclass):
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
     `visible` is 1 where the conditioning may see the reference picture, 0 within the boxes of masked diffusion.
+    `names` are sequences, `reference_frame` the reference's place in its sequence.
     """
 
     reference: Views
     targets: Views
     depth_range: Float[Tensor, "*batch 2"]
     visible: Float[Tensor, "*batch 1 height width"]
+    reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
 
     def __getitem__(self, index: int | slice) -> "SceneBatch":

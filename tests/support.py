@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 
 from completesplat import cli
 from completesplat.commands import conf_folder, register_resolvers
+from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
 SMALL = [
@@ -64,3 +65,10 @@ def tiny_generator() -> CompleteSplat:
     for skip in model.autoreconstructor.reconstructor.skips.values():
         torch.nn.init.normal_(skip.weight, std=0.1)
     return model.eval()
+
+
+def some_gaussians(batch: int, scale: float = 0.1, opacity: float = 0.5) -> Gaussians:
+    """Two equal Gaussians in each set of a batch."""
+    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(batch, 2, 4)
+    scales, opacities = torch.full((batch, 2, 3), scale), torch.full((batch, 2), opacity)
+    return Gaussians(torch.zeros(batch, 2, 3), quaternions, scales, opacities, torch.zeros(batch, 2, 3))

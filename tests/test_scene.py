@@ -22,7 +22,8 @@ def make_views(*batch: int, start: float) -> Views:
 
 def make_scene(index: int, targets: int = 3) -> SceneBatch:
     reference, others = make_views(start=10.0 * index), make_views(targets, start=10.0 * index + 1)
-    return SceneBatch(reference, others, torch.tensor([0.5, 4.0]), torch.full((1, *SIZE), index / 10), f"scene{index}")
+    depth_range, visible = torch.tensor([0.5, 4.0]), torch.full((1, *SIZE), index / 10)
+    return SceneBatch(reference, others, depth_range, visible, torch.tensor(index), f"scene{index}")
 
 
 def test_a_scene_without_batch_axis_puts_the_reference_first() -> None:
@@ -59,7 +60,7 @@ def test_all_views_commutes_with_collation() -> None:
 def test_scenes_with_different_image_sizes_do_not_collate() -> None:
     scene = make_scene(0)
     small = Views(torch.zeros(3, 2, 2), Cameras(torch.eye(4), pinhole(60, 2), (2, 2)), masks=torch.zeros(1, 2, 2))
-    other = SceneBatch(small, scene.targets, scene.depth_range, torch.ones(1, 2, 2), "small")
+    other = SceneBatch(small, scene.targets, scene.depth_range, torch.ones(1, 2, 2), torch.tensor(0), "small")
     with pytest.raises((ValueError, RuntimeError)):
         stack([scene, other])
 

@@ -63,7 +63,8 @@ class SceneStore:
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
         seen = Views(images, cameras, masks)
         visible = torch.ones_like(masks[0])
-        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, sequence.name)
+        frame = torch.tensor(reference)
+        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
         """One picture.

@@ -14,5 +14,5 @@ class KullbackLeibler:
     """
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        posterior = prediction.reconstruction.posterior
+        posterior = prediction.posterior
         return posterior.kl().mean() if posterior is not None else prediction.images.new_zeros(())

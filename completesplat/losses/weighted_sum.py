@@ -8,18 +8,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
 from completesplat.scene import Views
 from completesplat.tensors import TensorDataclass
 
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), with the reconstruction they come from."""
+    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, the posterior if there is one."""
 
     images: Float[Tensor, "batch view 3 height width"]
-    reconstruction: Reconstruction
+    gaussians: Gaussians
+    posterior: Posterior | None
 
 
 class LossTerm(Protocol):
@@ -41,14 +43,14 @@ class WeightedSum:
 
     Args:
         terms: name -> {weight, term, start_step (default 0)}; an entry that is None is left out (that is how an
-            ablation drops one).
+            ablation drops one), and so is one of weight 0.
 
     Raises:
         CompleteSplatError: there is nothing to train on at step 0.
     """
 
     def __init__(self, terms: Mapping[str, Mapping | None]) -> None:
-        self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry is not None}
+        self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry and entry["weight"]}
         if all(entry.start_step > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")
 

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch
@@ -32,11 +33,15 @@ class ReconstructionModule(SceneModule):
         if checkpoint is not None:
             load_part(model, checkpoint, prefix="model.")
 
+    def forward(self, scenes: SceneBatch) -> Reconstruction:
+        """Splatter Images, and posteriors if the model has any, from the reference images alone."""
+        return self.model(scenes.reference.images)
+
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        reconstruction = self.model(scenes.reference.images)
+        reconstruction = self(scenes)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
-            prediction = Prediction(self.render(gaussians, scenes), reconstruction)
+            prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, scenes.all_views(), self.global_step)
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
@@ -44,5 +49,4 @@ class ReconstructionModule(SceneModule):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Gaussians from the posterior's mode: nothing is drawn, so the seed has no effect."""
-        splatter_image = self.model(scenes.reference.images).splatter_image
-        return splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+        return self(scenes).splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

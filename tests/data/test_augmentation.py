@@ -30,7 +30,8 @@ def scene() -> SceneBatch:
     intrinsics = pinhole(60, SIZE).repeat(4, 1, 1)
     intrinsics[:, 0, 2] += torch.tensor([0, 3.0, -2, 1])
     views = Views(pictures(4, 3, SIZE, SIZE), Cameras(poses, intrinsics, (SIZE, SIZE)), pictures(4, 1, SIZE, SIZE))
-    return SceneBatch(views[0], views[1:], torch.tensor([1.0, 5.0]), torch.ones(1, SIZE, SIZE), "one")
+    visible = torch.ones(1, SIZE, SIZE)
+    return SceneBatch(views[0], views[1:], torch.tensor([1.0, 5.0]), visible, torch.tensor(0), "one")
 
 
 def test_a_mirrored_scene_shows_mirrored_points_at_mirrored_pixels() -> None:

@@ -1,8 +1,8 @@
 import pytest
 import torch
+from support import some_gaussians
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
@@ -10,7 +10,6 @@ from completesplat.losses.kl import KullbackLeibler
 from completesplat.losses.mse import MeanSquaredError
 from completesplat.losses.ssim import StructuralDissimilarity
 from completesplat.scene import Views
-from completesplat.splatter_image import Parameterization, SplatterImage
 
 SHAPE = (2, 3, 3, 24, 24)
 
@@ -22,8 +21,7 @@ def views(images: torch.Tensor) -> Views:
 
 def prediction(images: torch.Tensor, with_posterior: bool = True) -> Prediction:
     posterior = Posterior(torch.ones(2, 4, 1, 1), torch.zeros(2, 4, 1, 1)) if with_posterior else None
-    splatter_image = SplatterImage(torch.zeros(2, 2, 15, 1, 1), Parameterization())
-    return Prediction(images, Reconstruction(splatter_image, posterior))
+    return Prediction(images, some_gaussians(len(images)), posterior)
 
 
 @pytest.fixture(scope="module")

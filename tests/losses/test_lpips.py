@@ -5,18 +5,16 @@ from pathlib import Path
 import pytest
 import torch
 from hydra.utils import instantiate
-from support import compose_config
+from support import compose_config, some_gaussians
 from torch import nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 from vgg_weights import CONVOLUTIONS, digest
 
-from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction
 from completesplat.losses.lpips import LearnedPerceptualSimilarity, load_heads
 from completesplat.losses.vgg import URL, load_vgg16
 from completesplat.scene import Views
-from completesplat.splatter_image import Parameterization, SplatterImage
 
 POOLINGS = (4, 9, 16, 23, 30)
 SHAPE = (2, 3, 3, 32, 32)
@@ -40,8 +38,7 @@ def views(images: torch.Tensor) -> Views:
 
 
 def prediction(images: torch.Tensor) -> Prediction:
-    splatter_image = SplatterImage(torch.zeros(len(images), 2, 15, 1, 1), Parameterization())
-    return Prediction(images, Reconstruction(splatter_image, None))
+    return Prediction(images, some_gaussians(len(images)), None)
 
 
 def flat(pair: tuple[torch.Tensor, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,18 +2,15 @@ import csv
 
 import pytest
 import torch
-from support import SMALL
+from support import SMALL, some_gaussians
 
-from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Views
-from completesplat.splatter_image import Parameterization, SplatterImage
 
 IMAGES = torch.zeros(1, 1, 3, 4, 4)
-SPLATTER_IMAGE = SplatterImage(torch.zeros(1, 2, 15, 1, 1), Parameterization())
-PREDICTION = Prediction(IMAGES, Reconstruction(SPLATTER_IMAGE, None))
+PREDICTION = Prediction(IMAGES, some_gaussians(1), None)
 CAMERAS = Cameras(torch.eye(4).expand(1, 1, 4, 4), torch.eye(3).expand(1, 1, 3, 3), (4, 4))
 TRUTH = Views(IMAGES, CAMERAS, torch.ones(1, 1, 1, 4, 4))
 
@@ -42,8 +39,13 @@ def test_a_term_takes_part_from_its_start_step(step, total, names):
 
 @pytest.mark.parametrize(
     "terms",
-    [{}, {"a": None}, {"a": {"weight": 1.0, "term": Constant(1.0), "start_step": 1}}],
-    ids=["no terms", "a term taken away", "a term that starts later"],
+    [
+        {},
+        {"a": None},
+        {"a": {"weight": 0.0, "term": Constant(1.0)}},
+        {"a": {"weight": 1.0, "term": Constant(1.0), "start_step": 1}},
+    ],
+    ids=["no terms", "a term taken away", "a term without weight", "a term that starts later"],
 )
 def test_a_sum_with_nothing_at_step_zero_is_refused(terms):
     with pytest.raises(CompleteSplatError, match="start_step=0"):

@@ -17,7 +17,8 @@ def scenes(batch: int, targets: int) -> SceneBatch:
 
     names = tuple(f"scene {i}" for i in range(batch))
     depth_range, visible = torch.tensor([[1.0, 2.0]]).expand(batch, 2), torch.ones(batch, 1, 16, 16)
-    return SceneBatch(views(batch), views(batch, targets), depth_range, visible, names)
+    frames = torch.zeros(batch, dtype=torch.int64)
+    return SceneBatch(views(batch), views(batch, targets), depth_range, visible, frames, names)
 
 
 def test_views_are_averaged_within_scenes_before_scenes_are():

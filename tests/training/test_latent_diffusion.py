@@ -17,7 +17,9 @@ def scenes(visible: torch.Tensor) -> SceneBatch:
     images = torch.rand(BATCH, 2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     views = Views(images, cameras, torch.ones(BATCH, 2, 1, SIZE, SIZE))
     depth_range = torch.tensor([[0.5, 4.0]]).repeat(BATCH, 1)
-    return SceneBatch(views[:, 0], views[:, 1:], depth_range, visible, ("a", "b"))
+    return SceneBatch(
+        views[:, 0], views[:, 1:], depth_range, visible, torch.zeros(BATCH, dtype=torch.int64), ("a", "b")
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

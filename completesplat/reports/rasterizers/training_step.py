@@ -135,4 +135,5 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     views = Views(images, cameras, torch.ones_like(images[:, :, :1]))
     depth_range = torch.tensor([0.5 * DISTANCE, 2 * DISTANCE]).expand(batch, 2)
     names = tuple("synthetic" for _ in range(batch))
-    return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], names)
+    frames = torch.zeros(batch, dtype=torch.int64)
+    return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], frames, names)
