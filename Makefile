@@ -22,9 +22,9 @@ $(READY): pyproject.toml
 demo: $(READY) ## Make toy scenes, train both stages, evaluate, complete two pictures (CPU, under 15 minutes)
 	rm -rf $(DEMO)
 	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) out=$(DEMO)/data
-	$(BIN)/completesplat fit experiment=toy_var data.root=$(DEMO)/data trainer.max_steps=2200 out=$(DEMO)/var
+	$(BIN)/completesplat fit experiment=toy_var data.root=$(DEMO)/data trainer.max_steps=2200 data.color_jitter=null test=false out=$(DEMO)/var
 	$(BIN)/completesplat fit experiment=toy_diffusion data.root=$(DEMO)/data trainer.max_steps=700 \
-	  model.autoreconstructor_checkpoint=$(DEMO)/var/checkpoints/last.ckpt out=$(DEMO)/diffusion
+	  model.autoreconstructor_checkpoint=$(DEMO)/var/checkpoints/last.ckpt test=false out=$(DEMO)/diffusion
 	$(BIN)/completesplat test ckpt=$(DEMO)/var/checkpoints/last.ckpt out=$(DEMO)/test_var
 	$(BIN)/completesplat test ckpt=$(DEMO)/diffusion/checkpoints/last.ckpt out=$(DEMO)/test
 	cp -r $(DEMO)/diffusion/weights $(DEMO)/weights

@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
 from completesplat import cli
-from completesplat.commands import conf_folder, register_resolvers
+from completesplat.commands import conf_folder
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
@@ -46,7 +46,6 @@ def strict_json(path: Path):
 
 def compose_config(verb: str, *overrides: str):
     """The configuration of a verb, as the command line would compose it."""
-    register_resolvers()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(verb, overrides=list(overrides))
 

@@ -11,7 +11,6 @@ from support import compose_config
 from completesplat.commands import conf_folder
 
 ABLATIONS = sorted(path.stem for path in (conf_folder() / "ablation").glob("*.yaml"))
-JITTER = "data.color_jitter={brightness: 0.2, contrast: 0.2, saturation: 0.2, hue: 0.05}"
 # What differs from the full model, in a run that has everything that can be taken away.
 CHANGES = {
     "full": set(),
@@ -26,9 +25,7 @@ CHANGES = {
 
 
 def composed(ablation: str, experiment: str = "toy_var") -> Any:
-    """The ablation in a run with colour augmentation, which toy experiments have not."""
-    with_jitter = [] if ablation == "no_color_aug" else [JITTER]
-    return compose_config("fit", f"experiment={experiment}", f"ablation={ablation}", *with_jitter)
+    return compose_config("fit", f"experiment={experiment}", f"ablation={ablation}")
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:

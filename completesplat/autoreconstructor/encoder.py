@@ -3,17 +3,27 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from completesplat.autoreconstructor.posterior import Posterior, from_moments
+
+
+def recompute(block: nn.Module, *inputs: Any) -> Any:
+    """A block's output, in training without its activations: the backward pass computes them a second time."""
+    if block.training and torch.is_grad_enabled():
+        return checkpoint(block, *inputs, use_reentrant=False)
+    return block(*inputs)
 
 
 class Encoder(nn.Module):
     """Image -> posterior over latents at 1 / 2^(levels - 1) of the resolution, and one feature map per level.
 
-    The defaults are Stable Diffusion's (`AutoencoderKL`, 34.2 M parameters).
+    The defaults are Stable Diffusion's (`AutoencoderKL`, 34.2 M parameters). With `gradient_checkpointing` set, blocks
+    `recompute` their activations.
 
     Args:
         channels: width of each level, from full resolution down.
@@ -40,6 +50,7 @@ class Encoder(nn.Module):
             double_z=True,
         )
         self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        self.gradient_checkpointing = False
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]
@@ -50,13 +61,14 @@ class Encoder(nn.Module):
             The posterior, and each level's features before its downsampling (level 0 at full resolution).
         """
         network: Any = self.network
+        run = recompute if self.gradient_checkpointing else nn.Module.__call__
         hidden = network.conv_in(images * 2 - 1)
         features = []
         for block in network.down_blocks:
             for resnet in block.resnets:
-                hidden = resnet(hidden, temb=None)
+                hidden = run(resnet, hidden, None)
             features.append(hidden)
             for downsampler in block.downsamplers or ():
-                hidden = downsampler(hidden)
-        hidden = network.conv_act(network.conv_norm_out(network.mid_block(hidden)))
+                hidden = run(downsampler, hidden)
+        hidden = network.conv_act(network.conv_norm_out(run(network.mid_block, hidden)))
         return from_moments(self.quant_conv(network.conv_out(hidden))), features

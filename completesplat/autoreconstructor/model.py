@@ -32,6 +32,8 @@ class VariationalAutoReconstructor(nn.Module):
     Args:
         variational: draw latents in training; False uses the posterior's mode there too (ablation "no variational
             sampling", which also drops the KL from the loss).
+        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
+            more forward pass.
         pretrained: folder or hub id of a VAE in diffusers' layout to start from (`load_pretrained`); random if None.
 
     Raises:
@@ -45,12 +47,14 @@ class VariationalAutoReconstructor(nn.Module):
         skip_dropout: float = 0.5,
         variational: bool = True,
         pretrained: str | None = None,
+        gradient_checkpointing: bool = False,
     ) -> None:
         super().__init__()
         self.encoder = encoder
         self.reconstructor = reconstructor
         self.skip_dropout = skip_dropout
         self.variational = variational
+        encoder.gradient_checkpointing = reconstructor.gradient_checkpointing = gradient_checkpointing
         if pretrained is not None:
             load_pretrained(encoder, reconstructor, pretrained)
 

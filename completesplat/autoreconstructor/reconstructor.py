@@ -7,6 +7,7 @@ from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.encoder import recompute
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
 
 
@@ -15,7 +16,8 @@ class Reconstructor(nn.Module):
 
     A skip takes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
     convolution and adds them to the input of the up block of the same resolution. The merge operator is not stated
-    in the paper; zero initialisation leaves pretrained decoder weights intact at step 0.
+    in the paper; zero initialisation leaves pretrained decoder weights intact at step 0. With `gradient_checkpointing`
+    set, blocks `recompute` their activations.
 
     Args:
         parameterization: layers and activations of the Splatter Image.
@@ -50,6 +52,7 @@ class Reconstructor(nn.Module):
         # The up block that works at level l's resolution takes in the channels of the next coarser level.
         inputs = {level: channels[min(level + 1, len(channels) - 1)] for level in skip_levels}
         self.skips = nn.ModuleDict({str(level): _zero_conv(channels[level], inputs[level]) for level in skip_levels})
+        self.gradient_checkpointing = False
 
     def forward(
         self,
@@ -59,12 +62,13 @@ class Reconstructor(nn.Module):
     ) -> SplatterImage:
         """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one, or one per sample)."""
         network = self.network
+        run = recompute if self.gradient_checkpointing else nn.Module.__call__
         weight = torch.as_tensor(skip_weight, dtype=latent.dtype, device=latent.device).view(-1, 1, 1, 1)
-        hidden = network.mid_block(network.conv_in(self.post_quant_conv(latent)))
+        hidden = run(network.mid_block, network.conv_in(self.post_quant_conv(latent)))
         for level, block in zip(reversed(range(len(network.up_blocks))), network.up_blocks, strict=True):
             if str(level) in self.skips:
                 hidden = hidden + weight * self.skips[str(level)](features[level])
-            hidden = block(hidden)
+            hidden = run(block, hidden)
         output = network.conv_out(network.conv_act(network.conv_norm_out(hidden)))
         return from_channels(output.float(), self.parameterization)
 

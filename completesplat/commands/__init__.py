@@ -1,18 +1,16 @@
 """The verbs of the command line, one thin file each, and how hydra starts them."""
 
-import json
 import logging
 import os
 import secrets
-import subprocess
 import sys
 import time
 import warnings
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from completesplat import __version__
+from completesplat.commands.jobs import PROCESS_OF_JOB, run_job, run_process_of_job
+from completesplat.commands.sweeps import is_sweep, job_name, sweep_arguments
 from completesplat.errors import CompleteSplatError
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
@@ -35,18 +33,22 @@ def launch(verb: str, arguments: list[str]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    register_resolvers()
+    if arguments and arguments[0].startswith(PROCESS_OF_JOB):
+        return run_process_of_job(verb, Path(arguments[0].partition("=")[2]))
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
+    if is_sweep(arguments):
+        arguments = [*arguments, *sweep_arguments(verb, arguments, RUN_NAME)]
+    program = sys.argv[0]
     sys.argv = [f"completesplat {verb}", *arguments]
 
     failures: list[Exception] = []
 
     def job(config: Any) -> None:
         try:
-            run_job(verb, config)
+            run_job(verb, config, program)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end
@@ -69,6 +71,7 @@ def register_resolvers() -> None:
 
     OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
     OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
+    OmegaConf.register_new_resolver("job_name", job_name, replace=True)
 
 
 def best_precision() -> str:
@@ -80,27 +83,6 @@ def best_precision() -> str:
     return "bf16-mixed" if torch.cpu._is_avx512_bf16_supported() else "32-true"
 
 
-def run_job(verb: str, config: Any) -> None:
-    """Run one job in its own directory, leaving there what is needed to know what was run."""
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf
-
-    out = Path(HydraConfig.get().runtime.output_dir)
-    OmegaConf.set_struct(config, False)
-    config.out = str(out)
-    OmegaConf.save(config, out / "config.yaml", resolve=True)
-    record = {
-        "version": __version__,
-        "commit": git_commit(),
-        "command": sys.argv,
-        "overrides": list(HydraConfig.get().overrides.task),
-        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-    }
-    (out / "run.json").write_text(json.dumps(record, indent=2) + "\n")
-    import_module(f"completesplat.commands.{verb}").run(config, out)
-    print(out)
-
-
 def quieten() -> None:
     """Keep Lightning's hints about its products and settings out of the output; its errors and progress stay.
 
@@ -110,21 +92,6 @@ def quieten() -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     for message in UNHELPFUL_WARNINGS:
         warnings.filterwarnings("ignore", message=message)
-
-
-def git_commit() -> str | None:
-    """The commit of the source, marked when there are changes on top; None where there is no repository."""
-    folder = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout
-
-    try:
-        if not git("ls-files", "."):  # an installed package inside somebody else's repository
-            return None
-        return git("rev-parse", "HEAD").strip() + ("-dirty" if git("status", "--porcelain") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def refusal(error: BaseException) -> str | None:
@@ -142,3 +109,6 @@ def refusal(error: BaseException) -> str | None:
     if isinstance(error, HydraException | OmegaConfBaseException) and not isinstance(error, InstantiationException):
         return " ".join(str(error).split())
     return None
+
+
+register_resolvers()  # here, because jobs that a cluster starts elsewhere import this module and do no more

@@ -1,40 +1,88 @@
-"""`completesplat fit`: train one stage."""
+"""`completesplat fit`: train one stage, then score it."""
 
 import json
 from pathlib import Path
 from typing import Any
 
+from completesplat.errors import WeightsError
+
 
 def run(config: Any, out: Path) -> None:
-    """Train, leaving `metrics.csv`, `metrics.json` and checkpoints in the run directory."""
+    """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     from hydra.utils import instantiate
     from lightning import seed_everything
 
     from completesplat.commands import quieten
+    from completesplat.reports.evaluation_table import evaluation_table, show
+    from completesplat.reports.parameters import parameter_table
 
     quieten()
-    if config.resume is not None:  # the weights come from there
-        config.autoreconstructor.pretrained = None
-        if "checkpoint" in config.model:
-            config.model.checkpoint = None
+    checkpoint = checkpoint_to_continue(config, out)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     module = instantiate(config.model, _convert_="all")
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    if trainer.is_global_zero:
+        show(parameter_table(module))
     try:
-        trainer.fit(module, datamodule=data, ckpt_path=config.resume, weights_only=True)
-        if trainer.interrupted:
-            raise KeyboardInterrupt
-        metrics = {name: value.item() for name, value in trainer.callback_metrics.items()}
+        metrics = _train_and_test(trainer, module, data, checkpoint, config.test)
         for logger in loggers:  # a run shorter than the logging interval leaves its figures too
             logger.log_metrics(metrics, step=trainer.global_step)
             logger.save()
     finally:
         _finish(loggers)
-    summary = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
-    (out / "metrics.json").write_text(json.dumps(summary, indent=2) + "\n")
+    if not trainer.is_global_zero:
+        return
+    if config.test:
+        show(evaluation_table(module.evaluation.results()))
+    _write(out / "metrics.json", trainer, metrics, module.evaluation.results() if config.test else None)
+
+
+def checkpoint_to_continue(config: Any, out: Path) -> str | None:
+    """The checkpoint that the run starts from, if any; the other weights that the configuration names are not needed.
+
+    Raises:
+        WeightsError: it does not exist.
+    """
+    path = str(out / "checkpoints" / "last.ckpt") if config.ckpt_path == "last" else config.ckpt_path
+    if path is None or (config.ckpt_path == "last" and not Path(path).is_file()):
+        return None
+    if not Path(path).is_file():
+        raise WeightsError(f"{path}: no such checkpoint")
+    config.autoreconstructor.pretrained = None
+    if "checkpoint" in config.model:
+        config.model.checkpoint = None
+    return path
+
+
+def _train_and_test(trainer: Any, module: Any, data: Any, checkpoint: str | None, test: bool) -> dict[str, float]:
+    """Everything that was logged, in the end; a model that has nothing to learn beforehand is scored at once."""
+    metrics: dict[str, Any] = {}
+    if any(parameter.requires_grad for parameter in module.parameters()):
+        try:
+            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+        except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
+            raise KeyboardInterrupt from stop
+        metrics |= trainer.callback_metrics
+    steps = trainer.global_step
+    if test:
+        trainer.test(module, datamodule=data, verbose=False)
+        metrics |= trainer.callback_metrics
+    assert trainer.global_step == steps
+    return {name: value.item() for name, value in metrics.items()}
+
+
+def _write(path: Path, trainer: Any, metrics: dict[str, float], scores: dict[str, Any] | None) -> None:
+    """The results, which also tell that the job is done."""
+    from completesplat.export.atomic import atomic_path
+
+    results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
+    if scores is not None:
+        results["test"] = scores
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(results, indent=2) + "\n")
 
 
 def _finish(loggers: list[Any]) -> None:

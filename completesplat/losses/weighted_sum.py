@@ -17,7 +17,7 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, the posterior if there is one."""
+    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, the posterior if any."""
 
     images: Float[Tensor, "batch view 3 height width"]
     gaussians: Gaussians

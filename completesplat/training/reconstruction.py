@@ -11,7 +11,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch
 from completesplat.training.checkpoints import load_part
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.scene_module import SceneModule, prepare_network
 
 
 class ReconstructionModule(SceneModule):
@@ -21,21 +21,30 @@ class ReconstructionModule(SceneModule):
         model: images -> `Reconstruction`: the Variational AutoReconstructor or a baseline.
         loss: weighted terms by name.
         checkpoint: of an earlier stage, whose weights this one starts from.
+        channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `SceneModule`.
     """
 
     def __init__(
-        self, model: nn.Module, loss: WeightedSum, checkpoint: str | None = None, **rendering_and_optimization: Any
+        self,
+        model: nn.Module,
+        loss: WeightedSum,
+        checkpoint: str | None = None,
+        channels_last: bool = False,
+        compile: bool = False,
+        **rendering_and_optimization: Any,
     ) -> None:
         super().__init__(**rendering_and_optimization)
         self.model = model
         self.loss = loss
         if checkpoint is not None:
             load_part(model, checkpoint, prefix="model.")
+        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        prepare_network(model, channels_last, compile)
 
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Splatter Images, and posteriors if the model has any, from the reference images alone."""
-        return self.model(scenes.reference.images)
+        return self.model(scenes.reference.images.contiguous(memory_format=self.memory_format))
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         reconstruction = self(scenes)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from lightning import LightningModule
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -17,6 +17,19 @@ from completesplat.metrics.evaluation import Evaluation
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import SceneBatch
+
+
+def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> None:
+    """Settings of speed, in place; the state dict's keys stay as they are.
+
+    Args:
+        channels_last: order weights for convolutions in NHWC; its images should be too.
+        compile: `torch.compile` the network on its first call.
+    """
+    if channels_last:
+        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if compile:
+        network.compile()
 
 
 class SceneModule(LightningModule):

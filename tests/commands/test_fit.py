@@ -42,7 +42,7 @@ def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
 
 
 def test_a_run_is_continued_from_its_checkpoint(command, pipeline, tmp_path):
-    resume = f"resume={pipeline.var / 'checkpoints/last.ckpt'}"
+    resume = f"ckpt_path={pipeline.var / 'checkpoints/last.ckpt'}"
     settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=3", "experiment=toy_var"]
     assert command("fit", *settings, resume, f"out={tmp_path / 'more'}").status == 0
     assert strict_json(tmp_path / "more" / "metrics.json")["steps"] == 3

@@ -1,0 +1,98 @@
+"""A reconstructor without an encoder: every picture has a latent code that is optimised (Park et al. 2019, "DeepSDF").
+
+The supplement's "Reconstructor-only without the Encoder", which the paper reports as failed.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.errors import CompleteSplatError
+from completesplat.splatter_image import SplatterImage
+
+INITIAL_STD = 0.01
+"""Of new codes, as in DeepSDF (Section 4.3)."""
+
+
+class AutoDecoder(nn.Module):
+    """Latent codes of the training pictures, and the reconstructor that they share.
+
+    There is no prior on the codes. A code stands for one picture with its camera, so colour augmentation and mirroring
+    should be off. The table takes `rows * latent_channels * (image_size / 8)^2` numbers, thrice with Adam's moments.
+
+    Args:
+        reconstructor: without skips, as there are no features.
+        image_size: side of the pictures.
+        rows: pictures that the table has room for.
+
+    Raises:
+        CompleteSplatError: a reconstructor with skips, or an image size that its levels do not divide.
+    """
+
+    def __init__(self, reconstructor: Reconstructor, image_size: int, rows: int) -> None:
+        super().__init__()
+        factor = 2 ** (len(reconstructor.network.up_blocks) - 1)
+        if len(reconstructor.skips) > 0:
+            raise CompleteSplatError("a reconstructor without an encoder has no skips: set its skip_levels=[]")
+        if image_size % factor:
+            raise CompleteSplatError(f"image_size={image_size}: must be a multiple of {factor}")
+        self.reconstructor = reconstructor
+        self.shape = (reconstructor.post_quant_conv.in_channels, image_size // factor, image_size // factor)
+        self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape))
+        self._rows: dict[tuple[str, int], int] = {}
+
+    def forward(self, codes: Float[Tensor, "batch channel latent_height latent_width"]) -> SplatterImage:
+        """Reconstruct from codes."""
+        return self.reconstructor(codes, ())
+
+    def codes_of(
+        self, names: Sequence[str], frames: Int64[Tensor, " batch"]
+    ) -> Float[Tensor, "batch channel latent_height latent_width"]:
+        """The codes of pictures, each given by its sequence and its place therein; new ones get the next free rows.
+
+        Raises:
+            CompleteSplatError: the table is full.
+        """
+        return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
+
+    def new_codes(self, count: int, seed: int) -> Float[Tensor, "batch channel latent_height latent_width"]:
+        """Random codes, of no picture yet."""
+        generator = torch.Generator().manual_seed(seed)
+        return INITIAL_STD * torch.randn(count, *self.shape, generator=generator).to(self.codes.device)
+
+    def _row(self, name: str, frame: int) -> int:
+        if (name, frame) not in self._rows and len(self._rows) == len(self.codes):
+            raise CompleteSplatError(f"all {len(self.codes)} codes are taken: set model.model.rows to more")
+        return self._rows.setdefault((name, frame), len(self._rows))
+
+    def get_extra_state(self) -> list[list[str | int]]:
+        """Sequence and frame of each row that is taken, in order: plain containers for checkpoints."""
+        return [[name, frame] for name, frame in self._rows]
+
+    def set_extra_state(self, state: Any) -> None:
+        """Take over the rows of a checkpoint."""
+        self._rows = {(name, frame): row for row, (name, frame) in enumerate(state)}
+
+
+def optimize_codes(
+    codes: Float[Tensor, "batch channel latent_height latent_width"],
+    loss: Callable[[Tensor], Float[Tensor, ""]],
+    steps: int,
+    rate: float,
+) -> Float[Tensor, "batch channel latent_height latent_width"]:
+    """Minimise a loss of the codes alone by Adam, whose rate falls to a tenth halfway (DeepSDF's `reconstruct.py`).
+
+    Works also where autograd is off, as in `torch.inference_mode()`. No other gradients are computed or left behind.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        codes = codes.clone().requires_grad_()
+        optimizer = torch.optim.Adam([codes], lr=rate)
+        for step in range(steps):
+            optimizer.param_groups[0]["lr"] = rate if 2 * step < steps else 0.1 * rate
+            (codes.grad,) = torch.autograd.grad(loss(codes), codes)
+            optimizer.step()
+        return codes.detach()

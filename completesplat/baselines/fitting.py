@@ -1,0 +1,145 @@
+"""3D Gaussians optimised for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
+
+There is no densification and no pruning: the number of Gaussians stays what it was at the start. The start is not a
+structure-from-motion cloud either, which a data set need not have, but random pixels at random depths.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
+from completesplat.losses import Prediction, WeightedSum
+from completesplat.scene import Views
+from completesplat.splatter_image import SH_C0
+
+Render = Callable[[Gaussians, Cameras], Tensor]
+"""Gaussians [batch] and cameras [batch view] to images [batch view 3 height width]."""
+
+POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
+RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
+"""3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): that of the positions
+is relative to the scene's extent and decays exponentially to its hundredth."""
+
+
+@dataclass(frozen=True)
+class FittingSettings:
+    """How Gaussians are fitted.
+
+    Attributes:
+        count: Gaussians of a scene.
+        steps: steps of Adam; the positions' rate decays over as many.
+        views: random views of a step, the same for all scenes of a batch.
+        opacity: of all Gaussians at the start (0.1 in 3DGS).
+        position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
+    """
+
+    count: int = 4000
+    steps: int = 300
+    views: int = 2
+    opacity: float = 0.1
+    position_rate: float = 30.0
+    other_rates: float = 4.0
+
+
+@dataclass(frozen=True)
+class RawGaussians:
+    """What is optimised: Gaussians before their activations; colours as coefficients of the zeroth harmonic."""
+
+    means: Float[Tensor, "batch gaussian 3"]
+    log_scales: Float[Tensor, "batch gaussian 3"]
+    quaternions: Float[Tensor, "batch gaussian 4"]
+    logits: Float[Tensor, "batch gaussian"]
+    harmonics: Float[Tensor, "batch gaussian 3"]
+
+    def gaussians(self) -> Gaussians:
+        """Activated as in 3DGS; the quaternions may have any length."""
+        colors = (0.5 + SH_C0 * self.harmonics).clamp(min=0)
+        return Gaussians(self.means, self.quaternions, self.log_scales.exp(), self.logits.sigmoid(), colors)
+
+
+def initial_gaussians(
+    views: Views, depth_range: Float[Tensor, "batch 2"], count: int, opacity: float, generator: torch.Generator
+) -> RawGaussians:
+    """Round Gaussians on the rays of random pixels, with the pixels' colours and the size of one pixel there.
+
+    Args:
+        views: [batch view], of which all pixels are equally likely.
+        depth_range: near and far, between which depths along each view's optical axis are uniform, in scene units.
+        generator: on the CPU, whatever the device of the views.
+    """
+    batch, number = views.images.shape[:2]
+    height, width = views.cameras.image_size
+    device = views.images.device
+    scene = torch.arange(batch, device=device)[:, None]
+    view = torch.randint(number, (batch, count), generator=generator).to(device)
+    pixel = torch.randint(height * width, (batch, count), generator=generator).to(device)
+    share = torch.rand(batch, count, generator=generator).to(device)
+    depth = depth_range[:, :1] + (depth_range[:, 1:] - depth_range[:, :1]) * share
+    cameras = views.cameras[scene, view]  # one for each Gaussian
+    centers = pixel_centers(height, width, device).flatten(0, 1)[pixel]
+    footprint = depth / cameras.intrinsics[..., 0, 0]
+    return RawGaussians(
+        means=unproject(cameras, centers[:, :, None], depth[..., None]).squeeze(-2),
+        log_scales=footprint.log()[..., None].repeat(1, 1, 3),
+        quaternions=torch.tensor([1.0, 0, 0, 0], device=device).repeat(batch, count, 1),
+        logits=torch.full_like(depth, opacity).logit(),
+        harmonics=(views.images.flatten(-2)[scene, view, :, pixel] - 0.5) / SH_C0,
+    )
+
+
+def scene_extent(depth_range: Float[Tensor, "batch 2"]) -> float:
+    """Half of the mean depth range, in scene units: the spread of the initial Gaussians.
+
+    3DGS takes the spread of the cameras instead, around which its points lie; here they lie in the depth range, however
+    little the cameras move.
+    """
+    return (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
+
+
+def fit_gaussians(
+    views: Views,
+    depth_range: Float[Tensor, "batch 2"],
+    render: Render,
+    loss: WeightedSum,
+    settings: FittingSettings,
+    generator: torch.Generator,
+) -> Gaussians:
+    """Optimise a set of Gaussians for each scene of a batch, all at once, until its renderings look like the views.
+
+    Works also where autograd is off, as in `torch.inference_mode()`.
+
+    Args:
+        views: [batch view], in the world of the Gaussians that are returned.
+        depth_range: see `initial_gaussians`.
+        render: differentiable in the Gaussians.
+        loss: compares some rendered views with the true ones; its step is that of the fit.
+        generator: on the CPU; decides the start and the views of each step.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
+        optimizer = _optimizer(raw, settings, scene_extent(depth_range))
+        positions = optimizer.param_groups[0]
+        decay = POSITION_DECAY ** (1 / max(settings.steps, 1))
+        for step in range(settings.steps):
+            chosen = torch.randperm(views.images.shape[1], generator=generator)[: settings.views]
+            # Also where the views were made in inference mode, autograd may use what is picked of them: it is a copy.
+            truth, gaussians = views[:, chosen.to(views.images.device)], raw.gaussians()
+            total, _ = loss(Prediction(render(gaussians, truth.cameras), gaussians, None), truth, step)
+            optimizer.zero_grad()
+            total.backward()
+            optimizer.step()
+            positions["lr"] *= decay
+        return raw.gaussians().detach()
+
+
+def _optimizer(raw: RawGaussians, settings: FittingSettings, extent: float) -> torch.optim.Adam:
+    """Adam with 3DGS's epsilon (`gaussian_model.py`), beside which the gradients of single Gaussians are not small."""
+    rates = {name: settings.other_rates * rate for name, rate in RATES.items()}
+    rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}
+    groups = [{"params": [getattr(raw, name).requires_grad_()], "lr": rate} for name, rate in rates.items()]
+    return torch.optim.Adam(groups, eps=1e-15)

@@ -1,0 +1,74 @@
+"""The regression baseline "Splatter Image (full images)": one pass of a U-Net, nothing drawn, no latent."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from diffusers import UNet2DModel
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.autoreconstructor.encoder import recompute
+from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.splatter_image import Parameterization, from_channels, initialize_head
+
+
+class SplatterImageUNet(nn.Module):
+    """Image -> Splatter Image, after Szymanowicz et al., "Splatter Image" (CVPR 2024).
+
+    Upstream's network is EDM's SongUNet without noise level (`scene/gaussian_predictor.py`), whose sizes are the
+    defaults. This one is built of diffusers' blocks of the same kind: they resample within residual blocks, attend
+    with one head, and normalise in 32 groups. What differs from upstream:
+
+    - The blocks want a time embedding. They get that of a constant timestep 0, a learned bias.
+    - Residual sums are not scaled by sqrt(1/2), and weights start from PyTorch's defaults.
+    - Resampling blocks have no 1x1 convolution in their shortcut.
+    - On the way up, attention follows every block of its level instead of the last alone.
+    - The last 3x3 convolution is the head; upstream has a 1x1 convolution behind it.
+
+    Args:
+        parameterization: layers (one Gaussian a pixel upstream) and activations of the Splatter Image.
+        channels: width of each level, from full resolution down. The image's sides must be multiples of
+            2^(levels - 1).
+        attention_levels: levels with self-attention (upstream: at 16 pixels, level 3 of images of 128).
+        layers_per_block: residual blocks per level on the way down (the way up has one more).
+        dropout: probability of a zero before the second convolution of each residual block.
+        norm_groups: groups of the group normalisation.
+        gradient_checkpointing: recompute the residual blocks' activations in the backward pass.
+    """
+
+    def __init__(
+        self,
+        parameterization: Parameterization,
+        channels: Sequence[int] = (128, 256, 256, 256),
+        attention_levels: Sequence[int] = (3,),
+        layers_per_block: int = 4,
+        dropout: float = 0.1,
+        norm_groups: int = 32,
+        gradient_checkpointing: bool = False,
+    ) -> None:
+        super().__init__()
+        self.parameterization = parameterization
+        attends = [level in attention_levels for level in range(len(channels))]
+        network: Any = UNet2DModel(
+            in_channels=3,
+            out_channels=parameterization.channels,
+            block_out_channels=tuple(channels),
+            down_block_types=tuple("AttnDownBlock2D" if a else "ResnetDownsampleBlock2D" for a in attends),
+            up_block_types=tuple("AttnUpBlock2D" if a else "ResnetUpsampleBlock2D" for a in reversed(attends)),
+            downsample_type="resnet",
+            upsample_type="resnet",
+            layers_per_block=layers_per_block,
+            dropout=dropout,
+            attention_head_dim=None,
+            norm_num_groups=norm_groups,
+            norm_eps=1e-6,
+        )
+        initialize_head(network.conv_out, parameterization)
+        if gradient_checkpointing:
+            network.enable_gradient_checkpointing(recompute)
+        self.network = network
+
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
+        """Reconstruct from sRGB images in [0, 1]; there is no posterior."""
+        output = self.network(images * 2 - 1, timestep=0).sample
+        return Reconstruction(from_channels(output.float(), self.parameterization), posterior=None)

@@ -1,0 +1,137 @@
+"""One job: a directory, its configuration, and the processes that work on it."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from completesplat import __version__
+from completesplat.commands.source import git_commit
+from completesplat.errors import CompleteSplatError
+
+CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
+LAST = "checkpoints/last.ckpt"
+PROCESS_OF_JOB = "--process-of"
+VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
+
+
+def run_job(verb: str, config: Any, program: str) -> None:
+    """Run one job in its own directory, leaving there what is needed to know what was run.
+
+    A job with `ckpt_path=last` whose directory holds its results is not repeated.
+
+    Args:
+        program: path by which this program was started.
+
+    Raises:
+        CompleteSplatError: the directory holds other work.
+    """
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf
+
+    hydra_config = HydraConfig.get()
+    out = Path(hydra_config.runtime.output_dir)
+    OmegaConf.set_struct(config, False)
+    config.out = str(out)
+    resolved = OmegaConf.to_container(config, resolve=True)
+    if is_finished(out, resolved):
+        print(f"{out}: finished before, not repeated")
+        return
+    OmegaConf.save(resolved, out / CONFIG)
+    _record(out / RECORD, list(hydra_config.overrides.task))
+    with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
+        import_module(f"completesplat.commands.{verb}").run(config, out)
+    print(out)
+
+
+def run_process_of_job(verb: str, out: Path) -> None:
+    """Work on a job whose first process is another one: Lightning starts one process for each device."""
+    from omegaconf import OmegaConf
+
+    import_module(f"completesplat.commands.{verb}").run(OmegaConf.load(out / CONFIG), out)
+
+
+def is_finished(out: Path, config: Any) -> bool:
+    """Whether a job's directory holds its results, for jobs that have something to continue (`ckpt_path`).
+
+    Raises:
+        CompleteSplatError: there is training in it that would be lost, or that had other settings.
+    """
+    from omegaconf import OmegaConf
+
+    begun = (out / LAST).is_file() or (out / METRICS).is_file()
+    if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():
+        return False
+    if config["ckpt_path"] != "last":
+        raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
+    different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
+    different.discard("ckpt_path")
+    if different:
+        first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
+        raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")
+    return (out / METRICS).is_file()
+
+
+def _differences(one: Any, other: Any, key: str = "") -> set[str]:
+    """Keys of the settings that are not the same in both."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return {
+            name
+            for part in one.keys() | other.keys()
+            for name in _differences(one.get(part), other.get(part), f"{key}.{part}".lstrip("."))
+        }
+    return set() if one == other else {key}
+
+
+def _record(path: Path, overrides: list[str]) -> None:
+    """What was started, and when it was continued."""
+    now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+    record: dict[str, Any] = {
+        "version": __version__,
+        "commit": git_commit(),
+        "command": sys.argv,
+        "overrides": overrides,
+        "started": now,
+    }
+    if path.is_file() and (path.parent / LAST).is_file():
+        earlier = json.loads(path.read_text())
+        record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
+    path.write_text(json.dumps(record, indent=2) + "\n")
+
+
+@contextmanager
+def _for_other_processes(arguments: list[str]) -> Iterator[None]:
+    """What Lightning starts for a second device is to work on this job.
+
+    It repeats the program's arguments, which in a sweep would be a second sweep; where it finds Hydra at work, it adds
+    settings of Hydra's. The next job of a sweep is to start its own processes: what Lightning leaves behind would make
+    it wait for those of this one.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    given, hydra_config = sys.argv, HydraConfig.instance().cfg
+    variables = {name: os.environ.get(name) for name in VARIABLES_OF_PROCESSES}
+    sys.argv, HydraConfig.instance().cfg = arguments, None
+    try:
+        yield
+    finally:
+        sys.argv, HydraConfig.instance().cfg = given, hydra_config
+        _leave_process_group()
+        for name, value in variables.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def _leave_process_group() -> None:
+    if "torch" in sys.modules:
+        from torch import distributed
+
+        if distributed.is_available() and distributed.is_initialized():
+            distributed.destroy_process_group()

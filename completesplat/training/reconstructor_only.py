@@ -1,0 +1,74 @@
+"""The supplement's "Reconstructor-only without the Encoder": codes of pictures are optimised, not predicted."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.baselines.autodecoder import AutoDecoder, optimize_codes
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.losses import Prediction, WeightedSum
+from completesplat.scene import SceneBatch, Views
+from completesplat.training.reconstruction import ReconstructionModule
+
+
+class ReconstructorOnly(ReconstructionModule):
+    """Codes and reconstructor are trained together; a picture of the test gets a new code, the reconstructor stays.
+
+    Args:
+        model: codes and reconstructor.
+        loss: weighted terms by name, in training of all views, in the test of the reference alone.
+        code_steps: steps of the optimisation of a new code (800 in DeepSDF).
+        code_rate: its learning rate (0.005 in DeepSDF).
+        **reconstruction: see `ReconstructionModule`.
+    """
+
+    model: AutoDecoder
+
+    def __init__(
+        self, model: AutoDecoder, loss: WeightedSum, code_steps: int, code_rate: float, **reconstruction: Any
+    ) -> None:
+        super().__init__(model, loss, **reconstruction)
+        self.code_steps = code_steps
+        self.code_rate = code_rate
+
+    def on_fit_start(self) -> None:
+        """Refuse several processes, each of which would give the rows of the codes to other pictures."""
+        super().on_fit_start()
+        if self.trainer.world_size > 1:
+            raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
+
+    def forward(self, scenes: SceneBatch) -> Reconstruction:
+        """Splatter Images of training pictures from their own codes; in evaluation, of any picture from new ones."""
+        if not self.training:
+            return Reconstruction(self.model(self.infer_codes(scenes, seed=0)), None)
+        return Reconstruction(self.model(self.model.codes_of(scenes.names, scenes.reference_frame)), None)
+
+    def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Gaussians from new codes that make the reference view look right; the seed decides where they start."""
+        return self.gaussians(self.infer_codes(scenes, seed), scenes)
+
+    def infer_codes(self, scenes: SceneBatch, seed: int) -> Float[Tensor, "batch channel height width"]:
+        """Codes optimised for the reference views alone, at fixed weights."""
+        with torch.inference_mode(False), torch.autocast(self.device.type, enabled=False):
+            # Tensors made in inference mode stay unusable for autograd; their copies do not.
+            scenes = scenes.map(torch.clone)
+            codes = self.model.new_codes(len(scenes.names), seed)
+            return optimize_codes(codes, lambda x: self.reference_loss(x, scenes), self.code_steps, self.code_rate)
+
+    def gaussians(self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch) -> Gaussians:
+        """Gaussians from codes."""
+        return self.model(codes).gaussians(scenes.reference.cameras, scenes.depth_range)
+
+    def reference_loss(
+        self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch
+    ) -> Float[Tensor, ""]:
+        """The loss of the reference views alone, at the step that training has come to."""
+        views: Views = scenes.reference.map(lambda tensor: tensor[:, None])
+        gaussians = self.gaussians(codes, scenes)
+        images = self.rasterizer(gaussians, views.cameras).over(self.background)
+        total, _ = self.loss(Prediction(images, gaussians, None), views, self.global_step)
+        return total

@@ -1,0 +1,118 @@
+"""How fast a run is, what it waits for, and what it needs."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.profilers import Profiler
+
+from completesplat.scene import SceneBatch
+
+FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
+STATUS = Path("/proc/self/status")
+KIBIBYTES_OF_GIBIBYTE = 1024**2
+
+
+class Throughput(Callback):
+    """Logs speed and memory with the trainer's interval.
+
+    `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
+    for data, are of the steps since the last row; `memory/process_gb` is what the training process has in memory now
+    (where the system tells), `memory/gpu_gb` the most that torch had allocated on the GPU (where there is one), in GiB.
+    The clock stands still during validation, and from a row to the next batch: while pictures are drawn and checkpoints
+    written, if their intervals are multiples of the trainer's, and this callback stands before those.
+    """
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self.clock = DataClock(trainer.profiler)  # type: ignore[attr-defined]
+        trainer.profiler = self.clock  # type: ignore[attr-defined]
+        self._forget()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        trainer.profiler = self.clock.profiler  # type: ignore[attr-defined]
+
+    def _forget(self) -> None:
+        self.clock.waited, self.clock.begin = 0.0, None
+        self.scenes, self.paused = 0, 0.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = trainer.global_step
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.pause = _now(pl_module)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.clock.begin is not None:
+            self.paused += _now(pl_module) - self.pause
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: SceneBatch, batch_idx: int
+    ) -> None:
+        self.scenes += len(batch.names)
+        stepped, self.step = trainer.global_step != self.step, trainer.global_step
+        interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not stepped or not interval or trainer.global_step % interval or self.clock.begin is None:
+            return
+        seconds = _now(pl_module) - self.clock.begin - self.paused
+        values = {
+            "speed/scenes_per_second": self.scenes * trainer.world_size / seconds,
+            "speed/data_wait": self.clock.waited / seconds,
+            **memory(pl_module.device),
+        }
+        pl_module.log_dict(values, batch_size=len(batch.names))
+        self._forget()
+
+
+class DataClock(Profiler):
+    """Measures what Lightning tells a profiler about fetching batches, and passes everything on to another profiler."""
+
+    def __init__(self, profiler: Profiler) -> None:
+        super().__init__()
+        self.profiler = profiler
+        self.begin: float | None = None
+        self.waited = 0.0
+
+    def start(self, action_name: str) -> None:
+        """Something begins."""
+        if action_name == FETCHING:
+            self.since = time.perf_counter()
+            self.begin = self.since if self.begin is None else self.begin
+        self.profiler.start(action_name)
+
+    def stop(self, action_name: str) -> None:
+        """It ends."""
+        self.profiler.stop(action_name)
+        if action_name == FETCHING:
+            self.waited += time.perf_counter() - self.since
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """Passed on."""
+        self.profiler.setup(*args, **kwargs)
+
+    def describe(self) -> None:
+        """Passed on."""
+        self.profiler.describe()
+
+    def teardown(self, stage: str | None) -> None:
+        """Passed on."""
+        self.profiler.teardown(stage)
+
+
+def memory(device: torch.device) -> dict[str, float]:
+    """`memory/process_gb` on Linux, `memory/gpu_gb` where the device is a GPU."""
+    values = {}
+    if STATUS.exists():
+        lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+        values["memory/process_gb"] = int(lines["VmRSS"].split()[0]) / KIBIBYTES_OF_GIBIBYTE
+    if device.type == "cuda":
+        values["memory/gpu_gb"] = torch.cuda.max_memory_allocated(device) / 2**30
+    return values
+
+
+def _now(module: LightningModule) -> float:
+    """Seconds, when the device has done all that it was told."""
+    if module.device.type == "cuda":
+        torch.cuda.synchronize(module.device)
+    return time.perf_counter()

@@ -1,0 +1,150 @@
+"""Options that change memory or speed, and nothing else: of the autoreconstructor and of the regression baseline."""
+
+import json
+from typing import Any
+
+import jaxtyping
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import compose_config, tiny_generator
+from torch import Tensor, nn
+
+from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.generation import CompleteSplat
+from completesplat.scene import SceneBatch
+from completesplat.training.reconstruction import ReconstructionModule
+
+MODELS = {"var": "autoreconstructor", "splatter_image": "regressor"}
+
+
+def module(model: str, *settings: str) -> ReconstructionModule:
+    torch.manual_seed(0)
+    config = compose_config("fit", f"model={model}", "rasterizer=reference", *settings)
+    made = instantiate(config.model, _convert_="all")
+    for name, parameter in made.named_parameters():
+        if ".skips." in name:  # zero at the start
+            nn.init.normal_(parameter, std=0.1)
+    return made
+
+
+def pair(model: str, setting: str) -> tuple[ReconstructionModule, ReconstructionModule]:
+    """A module without and with a setting, of the same weights under the same names."""
+    plain, other = module(model), module(model, setting)
+    other.load_state_dict(plain.state_dict())
+    return plain, other
+
+
+@pytest.fixture(scope="module")
+def scenes(toy_root) -> SceneBatch:
+    data = ToyObjectsDataModule(str(toy_root), image_size=32, batch_size=2)
+    data.setup("fit")
+    return next(iter(data.val_dataloader()))
+
+
+def loss(module: ReconstructionModule, scenes: SceneBatch) -> Tensor:
+    """Of every output, with the same posterior noise, skip dropout and dropout in each call."""
+    torch.manual_seed(1)
+    reconstruction = module(scenes)
+    kl = 0.0 if reconstruction.posterior is None else reconstruction.posterior.kl().mean()
+    return reconstruction.splatter_image.raw.square().mean() + 1e-3 * kl
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_gradient_checkpointing_leaves_loss_and_gradients_as_they_are(scenes, model):
+    modules = pair(model, f"{MODELS[model]}.gradient_checkpointing=true")
+    losses = [loss(module.train(), scenes) for module in modules]
+    for value in losses:
+        value.backward()
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-6, atol=0)
+    plain, other = (dict(module.named_parameters()) for module in modules)
+    for name, parameter in plain.items():
+        torch.testing.assert_close(other[name].grad, parameter.grad, rtol=1e-5, atol=1e-7)
+
+
+def saved_bytes(module: ReconstructionModule, scenes: SceneBatch) -> int:
+    """What the forward pass keeps for the backward pass, apart from the weights."""
+    weights = {parameter.untyped_storage().data_ptr() for parameter in module.parameters()}
+    kept: dict[int, Any] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in weights:
+            kept[storage.data_ptr()] = storage
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        result = loss(module, scenes)  # alive, so that no storage's address is given away a second time
+    assert result.requires_grad
+    return sum(storage.nbytes() for storage in kept.values())
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_gradient_checkpointing_keeps_less_for_the_backward_pass(scenes, model):
+    plain, other = pair(model, f"{MODELS[model]}.gradient_checkpointing=true")
+    assert saved_bytes(other.train(), scenes) < saved_bytes(plain.train(), scenes) / 2
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_blocks_run_twice_in_training_only(scenes, model):
+    checkpointed = module(model, f"{MODELS[model]}.gradient_checkpointing=true")
+    network = checkpointed.model.encoder.network if model == "var" else checkpointed.model.network
+    calls = []
+    network.down_blocks[0].resnets[0].conv1.register_forward_hook(lambda *_: calls.append(1))
+    loss(checkpointed.train(), scenes).backward()
+    assert len(calls) == 2
+    loss(checkpointed.eval(), scenes).backward()
+    assert len(calls) == 3
+    with torch.no_grad():
+        loss(checkpointed.train(), scenes)
+    assert len(calls) == 4
+
+
+def test_weights_saved_before_there_was_gradient_checkpointing_load(tmp_path):
+    tiny_generator().save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["autoreconstructor"].pop("gradient_checkpointing") is False
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    autoreconstructor = CompleteSplat.from_pretrained(tmp_path).autoreconstructor
+    assert autoreconstructor.encoder.gradient_checkpointing is False
+    assert autoreconstructor.reconstructor.gradient_checkpointing is False
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_channels_last_holds_for_weights_and_images_and_changes_no_output(scenes, model):
+    plain, other = pair(model, "model.channels_last=true")
+    seen: list[Tensor] = []
+    for module in (plain, other):
+        first = next(m for m in module.model.modules() if isinstance(m, nn.Conv2d) and m.in_channels == 3)
+        first.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    one, two = (module.eval()(scenes).splatter_image.raw for module in (plain, other))
+    torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3)
+    assert [tensor.is_contiguous(memory_format=torch.channels_last) for tensor in seen] == [False, True]
+    kernels = [p for p in other.parameters() if p.dim() == 4]
+    assert kernels
+    assert all(kernel.is_contiguous(memory_format=torch.channels_last) for kernel in kernels)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_compiled_model_has_the_same_keys_and_runs_what_the_compiler_returns(scenes, monkeypatch, model):
+    calls = []
+
+    def compiler(call, **options):
+        return lambda images: calls.append(images) or call(images)
+
+    monkeypatch.setattr(torch, "compile", compiler)
+    plain, compiled = pair(model, "model.compile=true")
+    one = loss(plain, scenes)
+    assert len(calls) == 0
+    torch.testing.assert_close(loss(compiled, scenes), one)
+    assert len(calls) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
+def test_inductors_code_gives_the_same_outputs(scenes, monkeypatch, model):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # beartype's checks cannot be traced
+    torch.compiler.reset()
+    plain, compiled = (module.eval() for module in pair(model, "model.compile=true"))
+    one, two = (module(scenes).splatter_image.raw for module in (plain, compiled))
+    torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4)

@@ -1,0 +1,83 @@
+"""One code for each picture, for good."""
+
+import io
+
+import pytest
+import torch
+
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.baselines.autodecoder import AutoDecoder, optimize_codes
+from completesplat.errors import CompleteSplatError
+from completesplat.splatter_image import Parameterization
+
+
+def decoder(rows: int = 4, skip_levels: tuple[int, ...] = ()) -> AutoDecoder:
+    torch.manual_seed(0)
+    reconstructor = Reconstructor(Parameterization(), [8, 8], 1, norm_groups=4, skip_levels=skip_levels)
+    return AutoDecoder(reconstructor, image_size=8, rows=rows)
+
+
+def codes_of(model: AutoDecoder, *keys: tuple[str, int]) -> torch.Tensor:
+    return model.codes_of(tuple(name for name, _ in keys), torch.tensor([frame for _, frame in keys]))
+
+
+def test_a_picture_keeps_its_code():
+    model = decoder()
+    first = codes_of(model, ("a", 0), ("b", 0), ("a", 1))
+    again = codes_of(model, ("a", 1), ("a", 0), ("c", 0), ("b", 0), ("a", 0))
+    assert torch.equal(again[[1, 3, 0, 4]], first[[0, 1, 2, 0]])
+    assert len({tuple(code.flatten().tolist()) for code in again}) == 4
+
+
+def test_a_full_table_is_an_error():
+    model = decoder(rows=2)
+    codes_of(model, ("a", 0), ("b", 0))
+    codes_of(model, ("b", 0))
+    with pytest.raises(CompleteSplatError, match="all 2 codes are taken"):
+        codes_of(model, ("c", 0))
+
+
+def test_a_checkpoint_knows_which_code_is_whose():
+    model, file = decoder(), io.BytesIO()
+    expected = codes_of(model, ("b", 3), ("a", 0), ("b", 1))
+    torch.save(model.state_dict(), file)
+    file.seek(0)
+    other = decoder()
+    torch.nn.init.zeros_(other.codes)
+    codes_of(other, ("z", 0))
+    other.load_state_dict(torch.load(file, weights_only=True))
+    assert torch.equal(codes_of(other, ("a", 0), ("b", 1), ("b", 3)), expected[[1, 2, 0]])
+    assert torch.equal(codes_of(other, ("new", 0))[0], other.codes[3])
+
+
+def test_only_the_codes_in_use_have_gradients():
+    model = decoder()
+    codes_of(model, ("a", 0), ("b", 0), ("c", 0))
+    model(codes_of(model, ("c", 0), ("a", 0))).raw.square().sum().backward()
+    assert model.codes.grad is not None
+    used = model.codes.grad.flatten(1).abs().sum(1) > 0
+    assert used.tolist() == [True, False, True, False]
+    assert all(p.grad is not None for p in model.reconstructor.parameters())
+
+
+def test_new_codes_are_small_and_decided_by_the_seed():
+    model = decoder()
+    one, again, other = (model.new_codes(64, seed) for seed in (0, 0, 1))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    assert one.std().item() == pytest.approx(0.01, rel=0.1)
+    assert model(one[:2]).raw.shape == (2, 2, 15, 8, 8)
+
+
+def test_codes_are_optimized_to_the_minimum_of_a_loss():
+    target = torch.linspace(-1, 1, 16).reshape(1, 4, 2, 2)
+    with torch.inference_mode():
+        found = optimize_codes(torch.zeros(1, 4, 2, 2), lambda x: (x - target.clone()).square().sum(), 200, 0.05)
+    torch.testing.assert_close(found, target, atol=0.01, rtol=0)
+
+
+def test_skips_and_sizes_that_do_not_fit_are_refused():
+    with pytest.raises(CompleteSplatError, match="skip_levels"):
+        decoder(skip_levels=(0,))
+    with pytest.raises(CompleteSplatError, match="multiple of 2"):
+        AutoDecoder(decoder().reconstructor, image_size=9, rows=1)

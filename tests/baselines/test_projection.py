@@ -1,0 +1,105 @@
+"""Splatter Images made of Gaussians give these Gaussians back."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from completesplat.baselines.projection import project_to_splatter_image
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.splatter_image import CHANNELS, Parameterization, SplatterImage
+
+HEIGHT, WIDTH, BATCH = 4, 4, 2
+DEPTH_RANGE = torch.tensor([[1.0, 3.0], [0.5, 6.0]])
+# The world is elsewhere: only the intrinsics matter.
+ELSEWHERE = torch.tensor([[0.0, 1, 0, 5], [-1, 0, 0, 1], [0, 0, 1, -9], [0, 0, 0, 1]])
+CAMERAS = Cameras(ELSEWHERE.expand(BATCH, 4, 4), pinhole(60.0, WIDTH).expand(BATCH, 3, 3), (HEIGHT, WIDTH))
+ONE = CAMERAS[:1]
+RANGE = DEPTH_RANGE[:1]
+
+
+def at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
+    """Gaussians of one scene, at (column, row, depth), with different looks."""
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.tensor(points)
+    focal = ONE.intrinsics[0, 0, 0]
+    means = torch.cat([(pixels[:, :2] - WIDTH / 2) / focal * pixels[:, 2:], pixels[:, 2:]], dim=1)
+    count = len(points)
+    return Gaussians(
+        means=means[None],
+        quaternions=torch.nn.functional.normalize(torch.randn(1, count, 4, generator=generator), dim=-1),
+        scales=0.01 + torch.rand(1, count, 3, generator=generator),
+        opacities=torch.tensor([opacities]),
+        colors=torch.rand(1, count, 3, generator=generator),
+    )
+
+
+def assert_equal(found: Gaussians, expected: Gaussians) -> None:
+    for field in fields(Gaussians):
+        torch.testing.assert_close(getattr(found, field.name), getattr(expected, field.name), atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("layer_depths", ["independent", "incremental"])
+def test_a_splatter_image_comes_back(layer_depths):
+    parameterization = Parameterization(layers=1, layer_depths=layer_depths)
+    raw = torch.randn(BATCH, 1, CHANNELS, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))
+    raw[:, :, 1:4] *= 0.01  # offsets that leave every Gaussian in its pixel
+    raw[:, :, 5:8] -= 3
+    gaussians = SplatterImage(raw, parameterization).gaussians(CAMERAS, DEPTH_RANGE)
+    # In another order, it is the place that counts.
+    shuffled = gaussians[:, torch.randperm(gaussians.count, generator=torch.Generator().manual_seed(1))]
+    image, empty = project_to_splatter_image(shuffled, CAMERAS, DEPTH_RANGE, parameterization)
+    assert not empty.any()
+    assert_equal(image.gaussians(CAMERAS, DEPTH_RANGE), gaussians)
+
+
+@pytest.mark.parametrize("layer_depths", ["independent", "incremental"])
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_of_several_in_a_pixel_the_most_opaque_stay(layers, layer_depths):
+    # The most opaque lies behind, the last beyond the depth range: the offset makes up for both.
+    gaussians = at([(1.2, 2.9, 1.1), (1.5, 2.5, 2.0), (1.7, 2.1, 2.5), (1.5, 2.2, 9.0)], [0.2, 0.3, 0.9, 0.6])
+    parameterization = Parameterization(layers=layers, layer_depths=layer_depths)
+    image, empty = project_to_splatter_image(gaussians, ONE, RANGE, parameterization)
+    found = image.gaussians(ONE, RANGE)
+    pixel = torch.arange(layers) * HEIGHT * WIDTH + 2 * WIDTH + 1
+    assert_equal(found[:, pixel], gaussians[:, torch.tensor([2, 3, 1])[:layers]])
+    assert (found.opacities > 1e-12).sum() == layers
+    assert empty.sum() == HEIGHT * WIDTH - 1
+    assert not empty[0, 2, 1]
+
+
+def test_what_the_camera_does_not_see_fills_no_pixel():
+    behind, left, below, invisible = (2.5, 2.5, -2.0), (-0.01, 1.0, 2.0), (1.0, HEIGHT + 0.01, 2.0), (0.5, 0.5, 2.0)
+    gaussians = at([behind, left, below, invisible], [0.9, 0.9, 0.9, 0.0039])
+    image, empty = project_to_splatter_image(gaussians, ONE, RANGE, Parameterization())
+    assert empty.all()
+    assert (image.gaussians(ONE, RANGE).opacities < 1e-12).all()
+    corner = replace(gaussians, opacities=torch.tensor([[0.9, 0.9, 0.9, 0.004]]))
+    assert not project_to_splatter_image(corner, ONE, RANGE, Parameterization()).empty[0, 0, 0]
+
+
+def test_the_empty_pixels_are_counted_exactly():
+    taken = [(0, 0), (3, 0), (1, 2), (1, 2)]
+    gaussians = at([(column + 0.5, row + 0.5, 2.0) for column, row in taken], [0.5] * 4)
+    empty = project_to_splatter_image(gaussians, ONE, RANGE, Parameterization()).empty
+    expected = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
+    for column, row in taken:
+        expected[0, row, column] = False
+    assert torch.equal(empty, expected)
+
+
+def test_scenes_of_a_batch_stay_apart():
+    one, other = at([(0.5, 0.5, 2.0)], [0.9]), at([(2.5, 1.5, 1.5)], [0.4])
+    both = Gaussians(*(torch.cat([getattr(one, f.name), getattr(other, f.name)]) for f in fields(Gaussians)))
+    image, empty = project_to_splatter_image(both, CAMERAS, DEPTH_RANGE, Parameterization(layers=1))
+    found = image.gaussians(CAMERAS, DEPTH_RANGE)
+    assert_equal(found[:1, :1], one)
+    assert_equal(found[1:, [WIDTH + 2]], other)
+    assert empty.sum(dim=(1, 2)).tolist() == [HEIGHT * WIDTH - 1] * 2
+
+
+def test_full_opacity_stays_finite():
+    image, _ = project_to_splatter_image(at([(0.5, 0.5, 2.0)], [1.0]), ONE, RANGE, Parameterization(layers=1))
+    assert image.raw.isfinite().all()
+    assert image.gaussians(ONE, RANGE).opacities[0, 0] > 0.99999

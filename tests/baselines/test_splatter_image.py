@@ -1,0 +1,177 @@
+"""The regression baseline: its sizes, its first prediction, and that it trains like any stage 1."""
+
+import math
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import SMALL, compose_config, strict_json
+
+from completesplat.baselines.splatter_image import SplatterImageUNet
+from completesplat.commands import conf_folder
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.splatter_image import Parameterization
+
+ABLATIONS = sorted(path.stem for path in (conf_folder() / "ablation").glob("*.yaml"))
+DEPTH_RANGE = torch.tensor([[1.0, 5.0], [2.0, 4.0]])
+
+
+def build(layers: int = 1, **settings) -> SplatterImageUNet:
+    torch.manual_seed(0)
+    shape = {"channels": (8, 16, 24), "attention_levels": (2,), "layers_per_block": 1, "norm_groups": 4}
+    return SplatterImageUNet(Parameterization(layers=layers), **shape | settings)
+
+
+def cameras(batch: int, size: int) -> Cameras:
+    return Cameras(torch.eye(4).expand(batch, 4, 4), pinhole(50.0, size).expand(batch, 3, 3), (size, size))
+
+
+@pytest.fixture(scope="module")
+def images():
+    return torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_there_is_one_gaussian_to_a_layer_and_pixel_and_no_posterior(images, layers):
+    reconstruction = build(layers)(images)
+    assert reconstruction.posterior is None
+    assert reconstruction.splatter_image.raw.shape == (2, layers, 15, 32, 32)
+    gaussians = reconstruction.splatter_image.gaussians(cameras(2, 32), DEPTH_RANGE)
+    assert gaussians.means.shape == (2, layers * 32 * 32, 3)
+
+
+def test_the_first_prediction_lies_about_the_heads_bias(images):
+    parts = [build_with_seed(seed)(images).splatter_image.split() for seed in range(8)]
+    opacity, depth = (torch.stack([part[name] for part in parts]).mean().item() for name in ("opacity", "depth"))
+    assert opacity == pytest.approx(-2.0, abs=0.5)
+    assert depth == pytest.approx(0.0, abs=0.5)
+
+
+def build_with_seed(seed: int) -> SplatterImageUNet:
+    torch.manual_seed(seed)
+    return SplatterImageUNet(Parameterization(layers=1), (8, 16), (1,), 1, norm_groups=4).eval()
+
+
+def test_without_features_the_first_prediction_is_faint_and_halfway_into_the_depth_range(images):
+    model = build().eval()
+    torch.nn.init.zeros_(model.network.conv_norm_out.weight)  # its bias is zero already, and silu(0) = 0
+    gaussians = model(images).splatter_image.gaussians(cameras(2, 32), DEPTH_RANGE)
+    torch.testing.assert_close(gaussians.opacities, torch.full((2, 1024), 1 / (1 + math.exp(2))))
+    torch.testing.assert_close(gaussians.means[..., 2], torch.full((2, 1024), 3.0))
+    torch.testing.assert_close(gaussians.scales, torch.full((2, 1024, 3), 0.02))
+
+
+def test_gradients_reach_every_parameter(images):
+    model = build()
+    model(images).splatter_image.raw.square().mean().backward()
+    without = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()}
+    # A constant added to all keys leaves the softmax as it is.
+    assert {name for name in without if not name.endswith("to_k.bias")} == set()
+
+
+def test_images_are_centred_on_grey(images):
+    model, seen = build().eval(), []
+    model.network.conv_in.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    model(images)
+    torch.testing.assert_close(seen[0], 2 * images - 1)
+
+
+def test_bfloat16_autocast_gives_finite_float32(images):
+    model, inner = build(), []
+    model.network.conv_out.register_forward_hook(lambda *call: inner.append(call[2].dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        raw = model(images).splatter_image.raw
+    raw.square().mean().backward()
+    assert inner == [torch.bfloat16]
+    assert raw.dtype == torch.float32
+    assert raw.isfinite().all()
+    assert all(p.grad.isfinite().all() for p in model.parameters())
+
+
+def upstream_count() -> int:
+    """Parameters of EDM's SongUNet as Splatter Image sets it up, counted block by block."""
+
+    def conv(inputs: int, outputs: int, kernel: int = 3) -> int:
+        return inputs * outputs * kernel**2 + outputs
+
+    def block(inputs: int, outputs: int, shortcut: bool = False) -> int:
+        through = 2 * inputs + conv(inputs, outputs) + 2 * outputs + conv(outputs, outputs)
+        return through + (conv(inputs, outputs, 1) if shortcut or inputs != outputs else 0)
+
+    count, width, skips = conv(3, 128), 128, [128]
+    for level, channels in enumerate((128, 256, 256, 256)):
+        if level > 0:
+            count += block(width, width, shortcut=True)
+            skips.append(width)
+        for _ in range(4):
+            count, width = count + block(width, channels), channels
+            skips.append(width)
+    count += 2 * block(width, width)
+    for level, channels in reversed(list(enumerate((128, 256, 256, 256)))):
+        if level < 3:
+            count += block(width, width, shortcut=True)
+        for _ in range(5):
+            count, width = count + block(width + skips.pop(), channels), channels
+    return count + 6 * attention(256) + 2 * width + conv(width, 15) + conv(15, 15, 1)
+
+
+def attention(width: int) -> int:
+    return 2 * width + 4 * (width**2 + width)
+
+
+def test_the_full_size_is_upstreams_but_for_the_differences_it_states():
+    config = compose_config("fit", "regressor=splatter_image")
+    with torch.device("meta"):
+        model = instantiate(config.regressor, _convert_="all")
+        defaults = SplatterImageUNet(Parameterization(layers=1))
+    count = sum(p.numel() for p in model.parameters())
+    assert count == sum(p.numel() for p in defaults.parameters())
+    time = sum(p.numel() for name, p in model.named_parameters() if "time_emb" in name)
+    shortcuts = sum(width * width + width for width in (128, 256, 256, 256, 256, 256))
+    second_convolution = 15 * 15 + 15
+    assert count == upstream_count() + time + 4 * attention(256) - shortcuts - second_convolution
+
+
+def test_the_tiny_one_is_as_large_as_the_tiny_autoreconstructor():
+    config = compose_config("fit")
+    with torch.device("meta"):
+        models = [instantiate(config[name], _convert_="all") for name in ("regressor", "autoreconstructor")]
+    one, other = (sum(p.numel() for p in model.parameters()) for model in models)
+    assert one == pytest.approx(other, rel=0.05)
+
+
+@pytest.mark.parametrize("size", [32, 64])
+def test_the_tiny_one_takes_toy_images(size):
+    model = instantiate(compose_config("fit").regressor, _convert_="all").eval()
+    with torch.no_grad():
+        assert model(torch.rand(1, 3, size, size)).splatter_image.raw.shape == (1, 1, 15, size, size)
+
+
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_it_composes_with_every_ablation(ablation):
+    settings = [f"ablation={ablation}"]
+    config = compose_config("fit", "experiment=toy_var", "model=splatter_image", "rasterizer=reference", *settings)
+    module = instantiate(config.model, _convert_="all")
+    assert isinstance(module.model, SplatterImageUNet)
+    assert module.model.parameterization.layers == 1
+
+
+@pytest.mark.parametrize("experiment", ["co3d_var_stage1", "co3d_var_stage2", "re10k_var_stage1", "re10k_var_stage2"])
+def test_experiments_on_real_data_take_the_full_size(experiment):
+    needed = ["data.root=x", "model.checkpoint=null"]
+    config = compose_config("fit", f"experiment={experiment}", "model=splatter_image", *needed)
+    assert config.model.model.channels == [128, 256, 256, 256]
+    assert [config.data.image_size >> level for level in config.model.model.attention_levels] == [16]
+
+
+def test_it_trains_and_its_checkpoint_is_scored(command, toy_root, tmp_path):
+    run, scores = tmp_path / "run", tmp_path / "scores"
+    fit = ["fit", "experiment=toy_var", "model=splatter_image", f"data.root={toy_root}", f"out={run}"]
+    assert command(*fit, *SMALL, "trainer.precision=bf16-mixed").status == 0
+    trained = strict_json(run / "metrics.json")
+    assert trained["steps"] == 2
+    assert math.isfinite(trained["train/loss"])
+    assert trained["train/kl"] == 0
+    checkpoint = run / "checkpoints/last.ckpt"
+    assert command("test", f"ckpt={checkpoint}", f"out={scores}", "trainer.accelerator=cpu").status == 0
+    assert strict_json(scores / "metrics.json")["model"]["scenes"] > 0

@@ -1,0 +1,203 @@
+"""Sweeps: one directory a job, named by what is swept; a sweep that is started again continues."""
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from support import SMALL, call, strict_json
+
+from completesplat.commands.sweeps import LONGEST_NAME, job_name, swept_keys
+from completesplat.training.reconstruction import ReconstructionModule
+
+STEPS = 3
+LAST = "checkpoints/last.ckpt"
+
+
+def root_with(*overrides: str):
+    return OmegaConf.create({"hydra": {"overrides": {"task": list(overrides)}}})
+
+
+def settings(root: Path, steps: int = STEPS) -> list[str]:
+    return [
+        "fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, f"trainer.max_steps={steps}",
+        "callbacks.checkpoint.every_n_train_steps=1", "trainer.log_every_n_steps=1",
+        "autoreconstructor.encoder.channels=[8,8,16,16]", "callbacks.pictures=null",
+    ]  # fmt: skip
+
+
+def weights(job: Path) -> dict[str, torch.Tensor]:
+    return torch.load(job / LAST, weights_only=True)["state_dict"]
+
+
+def logged_steps(job: Path) -> list[int]:
+    """Optimizer steps of which the loss was logged, in the order of the file."""
+    with open(job / "metrics.csv") as file:
+        rows = [row for row in csv.DictReader(file) if row["train/mse"]]
+    return [int(row["step"]) for row in rows if int(row["step"]) < STEPS]  # behind them the last figures again
+
+
+def test_a_job_is_named_by_what_is_swept():
+    root = root_with("experiment=toy_var", "ablation=no_skips", "seed=1", "data.root=/a/b")
+    assert job_name("ablation", "seed", _root_=root) == "ablation-no_skips+seed-1"
+    assert job_name("seed", _root_=root) == "seed-1"
+    assert job_name("optimizer.lr", _root_=root_with("+optimizer.lr=1e-3")) == "optimizer.lr-1e-3"
+
+
+def test_names_of_directories_are_plain_and_differ():
+    names = {job_name("data.root", _root_=root_with(f"data.root={path}")) for path in ("/a/b", "/a_b", "a/b", "ab")}
+    names |= {job_name("x", _root_=root_with(f"x={'y' * 300}{end}")) for end in "ab"}
+    assert len(names) == 6
+    assert all(not set(name) & set("/=,") and len(name) < LONGEST_NAME + 12 for name in names)
+
+
+def test_what_is_swept_is_seen_in_the_arguments():
+    given = [
+        "-m",
+        "experiment=toy_var",
+        "ablation=glob(*)",
+        "seed=0,1",
+        "levels=[0,1]",
+        "x=range(3)",
+        "y=choice(1)",
+    ]
+    assert swept_keys(given) == ["ablation", "seed", "x", "y"]
+
+
+@pytest.fixture(scope="module")
+def whole(toy_root, tmp_path_factory) -> Path:
+    """A sweep of two jobs that ran through."""
+    sweep = tmp_path_factory.mktemp("sweeps") / "whole"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert call(monkeypatch, *settings(toy_root), "seed=0,1", f"out={sweep}") == 0
+    return sweep
+
+
+def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole, tmp_path):
+    sweep = shutil.copytree(whole, tmp_path / "sweep")
+    jobs = [sweep / "seed-0", sweep / "seed-1"]
+    before = {job: (job / LAST).stat().st_mtime_ns for job in jobs}
+    for job in jobs:  # the directory was moved
+        (job / "config.yaml").write_text((job / "config.yaml").read_text().replace(str(whole), str(sweep)))
+    again = command(*settings(toy_root), "seed=0,1,2", f"out={sweep}")
+    assert again.status == 0
+    assert again.out.count("finished before, not repeated") == 2
+    assert {job: (job / LAST).stat().st_mtime_ns for job in jobs} == before
+    assert (sweep / "seed-2/metrics.json").is_file()
+
+
+def test_an_interrupted_job_goes_on_where_it_was_and_ends_as_if_nothing_had_happened(
+    command, monkeypatch, toy_root, whole, tmp_path
+):
+    broken = tmp_path / "broken"
+    step = ReconstructionModule.training_step
+
+    def failing_step(self, scenes, index):
+        if self.global_step == 2:
+            raise RuntimeError("the power went off")
+        return step(self, scenes, index)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", failing_step)
+    with pytest.raises(RuntimeError, match="power"):
+        command(*settings(toy_root), "seed=0,1", f"out={broken}")
+    assert not list(broken.glob("*/metrics.json"))
+    monkeypatch.setattr(ReconstructionModule, "training_step", step)
+    assert command(*settings(toy_root), "seed=0,1", f"out={broken}").status == 0
+
+    for name in ("seed-0", "seed-1"):
+        one, other = weights(whole / name), weights(broken / name)
+        assert all(torch.equal(one[key], other[key]) for key in one)
+        assert strict_json(whole / name / "metrics.json")["test"] == strict_json(broken / name / "metrics.json")["test"]
+        assert logged_steps(broken / name) == list(range(STEPS))
+        assert len(strict_json(broken / name / "run.json")["continued"]) == 1
+
+
+def test_a_job_that_fails_does_not_stop_the_others(command, toy_root, tmp_path):
+    sweep = tmp_path / "sweep"
+    with pytest.raises(ValueError, match="batch_size"):
+        command(*settings(toy_root, steps=1), "data.batch_size=0,2", f"out={sweep}")
+    assert not (sweep / "data.batch_size-0/metrics.json").exists()
+    assert (sweep / "data.batch_size-2/metrics.json").is_file()
+
+
+def test_a_directory_with_other_settings_is_refused(command, toy_root, whole):
+    other = command(*settings(toy_root), "optimizer.lr=1e-5", "seed=0,1", f"out={whole}")
+    assert other.status == 2
+    assert "another optimizer.lr" in other.err.splitlines()[-1]
+
+
+def test_a_run_is_not_overwritten_by_another(command, toy_root, whole):
+    single = [argument for argument in settings(toy_root) if argument != "-m"]
+    again = command(*single, "seed=0", f"out={whole / 'seed-0'}")
+    assert again.status == 2
+    assert "continue it with ckpt_path=last" in again.err.splitlines()[-1]
+    assert "finished before" in command(*single, "seed=0", f"out={whole / 'seed-0'}", "ckpt_path=last").out
+
+
+@pytest.mark.parametrize("variables", [{"LOCAL_RANK": "0"}, {"SLURM_STEP_NUM_TASKS": "2"}], ids=["torchrun", "srun"])
+def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, variables):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
+    assert refused.status == 2
+    assert "start it once" in refused.err.splitlines()[-1]
+
+
+def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:
+    """Run the command as a shell would, with the modules in a folder at hand."""
+    script = folder / "completesplat"
+    script.write_text("from completesplat.cli import main; main()")
+    environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, script, *arguments], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+NOTE = '''
+import os
+from pathlib import Path
+from lightning import Callback
+
+class Note(Callback):
+    """Each process says what it trains."""
+    def __init__(self, folder, seed):
+        self.folder, self.seed = Path(folder), seed
+
+    def on_fit_start(self, trainer, module):
+        self.folder.mkdir(parents=True, exist_ok=True)
+        total = sum(p.double().abs().sum().item() for p in module.parameters())
+        text = f"{self.seed} {trainer.world_size} {total:.10f}"
+        (self.folder / f"{os.getpid()}-{trainer.global_rank}").write_text(text)
+'''
+
+
+def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(toy_root, tmp_path):
+    (tmp_path / "process_notes.py").write_text(NOTE)
+    sweep = tmp_path / "sweep"
+    arguments = [
+        *settings(toy_root, steps=1), "seed=3,4", f"out={sweep}", "trainer.devices=2", "+trainer.strategy=ddp",
+        "rasterizer=reference", "test=false",
+        "+callbacks.note={_target_: process_notes.Note, folder: '${out}/notes', seed: '${seed}'}",
+    ]  # fmt: skip
+    in_a_process_of_its_own(arguments, tmp_path)
+
+    assert sorted(job.name for job in sweep.iterdir() if job.is_dir()) == ["seed-3", "seed-4"]
+    for seed in (3, 4):
+        notes = {path.name.split("-")[1]: path.read_text() for path in (sweep / f"seed-{seed}" / "notes").iterdir()}
+        assert set(notes) == {"0", "1"}
+        assert set(notes.values()) == {notes["0"]}
+        assert notes["0"].startswith(f"{seed} 2 ")
+        assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
+
+
+def test_submitit_runs_the_jobs_of_a_sweep_in_processes_of_their_own(toy_root, tmp_path):
+    sweep = tmp_path / "sweep"
+    arguments = [*settings(toy_root, steps=1), "seed=0,1", f"out={sweep}", "hydra/launcher=submitit_local"]
+    in_a_process_of_its_own(arguments, tmp_path)
+    for seed in (0, 1):
+        assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
+    assert list(sweep.glob(".submitit/**/*_log.out"))

@@ -1,0 +1,23 @@
+"""Scenes without files, for tests of what surrounds training."""
+
+import torch
+
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.scene import SceneBatch, Views
+
+SIZE = 16
+
+
+def scene_batch(batch: int = 2, targets: int = 2, seed: int = 0) -> SceneBatch:
+    """Random pictures, all from one camera at the origin."""
+    count = 1 + targets
+    cameras = Cameras(
+        torch.eye(4).repeat(batch, count, 1, 1), pinhole(60, SIZE).repeat(batch, count, 1, 1), (SIZE, SIZE)
+    )
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(batch, count, 3, SIZE, SIZE, generator=generator)
+    views = Views(images, cameras, torch.ones(batch, count, 1, SIZE, SIZE))
+    return SceneBatch(
+        views[:, 0], views[:, 1:], torch.tensor([[0.5, 4.0]]).repeat(batch, 1), torch.ones(batch, 1, SIZE, SIZE),
+        torch.zeros(batch, dtype=torch.int64), tuple(f"scene {seed} {i}" for i in range(batch)),
+    )  # fmt: skip

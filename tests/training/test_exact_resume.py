@@ -1,0 +1,105 @@
+"""A run that was interrupted and continued is the run that never was: the same bits, the same rows."""
+
+import pandas
+import pytest
+import torch
+from support import SMALL, call
+
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.reconstruction import ReconstructionModule
+
+STEPS = 6
+# Four batches an epoch; validation and checkpoints fall into their midst and on their ends.
+SETTINGS = [
+    *SMALL,
+    f"trainer.max_steps={STEPS}",
+    "trainer.log_every_n_steps=1",
+    "data.references_per_sequence=4",
+    "callbacks.pictures.every_n_steps=2",
+    "test=false",
+]
+PLACES_OF_WEIGHTS = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers")
+
+
+def settings(pipeline, stage: str) -> list[str]:
+    shared = ["fit", f"experiment=toy_{stage}", f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
+    if stage == "var":
+        return shared
+    stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
+    return [*shared, stage1, "sampler.steps=2", "data.targets=1"]
+
+
+@pytest.fixture(scope="module")
+def whole(pipeline, tmp_path_factory):
+    """Run directories of uninterrupted runs, by stage."""
+    runs = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(runs)
+        for stage in ("var", "diffusion"):
+            assert call(monkeypatch, *settings(pipeline, stage), f"out={runs / stage}") == 0
+    return runs
+
+
+def tensors(contents, name="") -> dict:
+    """All values of nested containers, by path."""
+    if isinstance(contents, dict | list):
+        pairs = contents.items() if isinstance(contents, dict) else enumerate(contents)
+        return {k: v for key, value in pairs for k, v in tensors(value, f"{name}/{key}").items()}
+    return {name: contents}
+
+
+def weights(run) -> dict:
+    checkpoint = torch.load(run / "checkpoints/last.ckpt", weights_only=True)
+    assert checkpoint["global_step"] == STEPS
+    return tensors({place: checkpoint[place] for place in PLACES_OF_WEIGHTS if place in checkpoint})
+
+
+def rows(run) -> pandas.DataFrame:
+    table = pandas.read_csv(run / "metrics.csv")
+    return table[[column for column in table if not column.startswith(("speed/", "memory/"))]]
+
+
+@pytest.mark.parametrize(
+    ("stage", "module", "saved"),
+    [("var", ReconstructionModule, 3), ("var", ReconstructionModule, 4), ("diffusion", LatentDiffusion, 3)],
+)
+def test_a_run_that_is_continued_is_bit_equal(pipeline, whole, tmp_path, monkeypatch, stage, module, saved):
+    monkeypatch.chdir(tmp_path)
+    arguments = [*settings(pipeline, stage), f"callbacks.checkpoint.every_n_train_steps={saved}", f"out={tmp_path}/run"]
+    step = module.training_step
+
+    def interrupted_step(self, *inputs):
+        if self.global_step == saved + 1:
+            raise KeyboardInterrupt
+        return step(self, *inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "training_step", interrupted_step)
+        assert call(monkeypatch, *arguments) != 0
+    assert rows(tmp_path / "run")["step"].max() == saved  # So it did more than it saved.
+    assert call(monkeypatch, *arguments, "ckpt_path=last") == 0
+
+    expected, found = weights(whole / stage), weights(tmp_path / "run")
+    assert expected.keys() == found.keys()
+    assert any("current_model_state" in name for name in expected) == (stage == "diffusion")
+    different = [
+        name
+        for name, value in expected.items()
+        if not (torch.equal(value, found[name]) if isinstance(value, torch.Tensor) else value == found[name])
+    ]
+    assert different == []
+    pandas.testing.assert_frame_equal(rows(whole / stage), rows(tmp_path / "run"), check_exact=True)
+
+
+def test_drawing_pictures_does_not_change_training(pipeline, whole, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for stage in ("var", "diffusion"):
+        without = [*settings(pipeline, stage), "~callbacks.pictures", f"out={tmp_path / stage}"]
+        without = [argument for argument in without if not argument.startswith("callbacks.pictures")]
+        assert call(monkeypatch, *without) == 0
+        assert not (tmp_path / stage / "pictures").exists()
+        expected, found = (weights(run) for run in (whole / stage, tmp_path / stage))
+        assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, torch.Tensor))
+        assert sorted(path.name for path in (whole / stage / "pictures").iterdir()) == [
+            f"step_00000{n}.png" for n in (2, 4, 6)
+        ]

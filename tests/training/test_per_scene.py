@@ -1,0 +1,47 @@
+"""Models without training: they see the test's views, and say so; what is left of them in a Splatter Image."""
+
+import lightning
+import pytest
+from hydra.utils import instantiate
+from support import SMALL, compose_config, strict_json
+
+FEW = ["model.fitting.count=300", "model.fitting.steps=60", "data.evaluation_targets=3"]
+
+
+def scored(model: str, root, *settings: str):
+    config = compose_config("fit", "experiment=toy_var", f"model={model}", f"data.root={root}", *SMALL, *FEW, *settings)
+    module = instantiate(config.model, _convert_="all")
+    data = instantiate(config.data, _convert_="all")
+    trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
+    trainer.test(module, datamodule=data, verbose=False)
+    return module, trainer
+
+
+def test_fitting_the_test_scenes_beats_not_fitting_them(toy_root):
+    module, _ = scored("per_scene", toy_root)
+    start, _ = scored("per_scene", toy_root, "model.fitting.steps=0")
+    assert not list(module.parameters())
+    fitted, unfitted = (m.evaluation.results()["model"]["full"]["novel"]["psnr"] for m in (module, start))
+    assert fitted > unfitted + 3
+
+
+def test_a_splatter_image_of_few_gaussians_is_mostly_empty(toy_root):
+    module, trainer = scored("preoptimized", toy_root)
+    # 300 Gaussians fill at most 300 of the 1024 pixels.
+    assert 1 - 300 / 1024 <= trainer.callback_metrics["test/empty_pixels"].item() < 1
+    assert module.evaluation.results()["model"]["scenes"] == 1
+
+
+def test_without_gaussians_all_pixels_are_empty(toy_root):
+    _, trainer = scored("preoptimized", toy_root, "model.fitting.opacity=0.001", "model.fitting.steps=0")
+    assert trainer.callback_metrics["test/empty_pixels"].item() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("model", ["per_scene", "preoptimized"])
+def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path, model):
+    settings = ["experiment=toy_var", f"model={model}", f"data.root={toy_root}", *SMALL, *FEW]
+    assert command("fit", *settings, "model.fitting.steps=3", f"out={tmp_path / 'run'}").status == 0
+    metrics = strict_json(tmp_path / "run/metrics.json")
+    assert metrics["steps"] == 0
+    assert 0 < metrics["test"]["model"]["full"]["novel"]["psnr"] < 100
+    assert ("test/empty_pixels" in metrics) == (model == "preoptimized")

@@ -1,0 +1,151 @@
+"""What is drawn and measured while a model trains."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas
+import pytest
+import torch
+from PIL import Image
+from scenes_for_training import SIZE, scene_batch
+
+from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import pixel_rays
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.scene import SceneBatch
+from completesplat.training.panels import scene_panels, sheet
+from completesplat.training.pictures import channel_kl, distributions, fixed_scenes, percentiles
+
+
+def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
+    """A Gaussian on the ray of each pixel, smaller than the pixel, so that the rasterizer's blur alone widens it."""
+    rays = pixel_rays(scenes.reference.cameras).flatten(1, 2)
+    batch, count, _ = rays.shape
+    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(batch, count, 4)
+    scales, opacities = torch.full((batch, count, 3), 1e-3), torch.full((batch, count), opacity)
+    return Gaussians(rays * depth, quaternions, scales, opacities, colors.flatten(2).mT.contiguous())
+
+
+def two_layers(scenes: SceneBatch) -> Gaussians:
+    colors = torch.zeros_like(scenes.reference.images)
+    red, blue = colors.clone(), colors.clone()
+    red[:, 0], blue[:, 2] = 1, 1
+    return concatenate([layer(scenes, 1.0, 0.9, red), layer(scenes, 3.0, 0.9, blue)])
+
+
+def panels(gaussians: Gaussians, scenes: SceneBatch, background: float = 0.5) -> dict[str, torch.Tensor]:
+    return scene_panels(ReferenceRasterizer(), gaussians, scenes, background)
+
+
+def test_input_and_target_are_those_of_the_scene():
+    scenes = scene_batch()
+    drawn = panels(two_layers(scenes), scenes)
+    assert torch.equal(drawn["input"], scenes.reference.images)
+    assert torch.equal(drawn["target"], scenes.targets.images[:, 0])
+
+
+def test_the_error_of_a_perfect_render_is_zero_and_of_another_the_difference():
+    scenes = scene_batch()
+    gaussians = two_layers(scenes)
+    rendered = panels(gaussians, scenes)["render"]
+    assert rendered.std() > 0
+    targets = replace(scenes.targets, images=torch.stack([rendered, rendered], 1))
+    assert (panels(gaussians, replace(scenes, targets=targets))["error x4"] == 0).all()
+    targets = replace(targets, images=targets.images - 0.1)
+    error = panels(gaussians, replace(scenes, targets=targets))["error x4"]
+    torch.testing.assert_close(error, torch.full_like(error, 0.4))
+
+
+def test_layers_are_told_apart_and_the_nearer_is_brighter_in_depth():
+    scenes = scene_batch()
+    gaussians = two_layers(scenes)
+    drawn = panels(gaussians, scenes, background=0.0)
+    assert list(drawn) == ["input", "target", "render", "error x4", "depth", "opacity", "layer 1", "layer 2"]
+    first, second = drawn["layer 1"], drawn["layer 2"]
+    assert (first[:, 0] > 0.5).all()
+    assert (first[:, 1:] == 0).all()
+    assert (second[:, 2] > 0.5).all()
+    assert (second[:, :2] == 0).all()
+    rendering = ReferenceRasterizer()(gaussians, scenes.targets.cameras[:, :1])[:, 0]
+    assert torch.equal(drawn["opacity"], rendering.alpha.clamp(0, 1).expand(-1, 3, -1, -1))
+
+
+def test_what_is_near_is_bright_and_what_is_not_seen_is_black():
+    scenes = scene_batch(batch=1)
+    gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
+    rows = torch.arange(SIZE).repeat_interleave(SIZE)
+    far = torch.where(rows < 5, 3.0, 1.0)[None, :, None]
+    gaussians = replace(gaussians, means=gaussians.means * far, opacities=gaussians.opacities * (rows < 10))
+    depth = panels(gaussians, scenes)["depth"]
+    assert (depth[..., 12:, :] == 0).all()
+    assert (depth[..., :4, :] > 0).all()
+    assert (depth[..., 6:9, :] > depth[..., :4, :].max()).all()
+
+
+def test_every_panel_lies_in_its_row_and_column():
+    images = {name: torch.rand(3, 3, 16, 24) for name in ("one", "two", "three", "four")}
+    picture = np.asarray(sheet(images)).astype(float)
+    factor = 5  # 24 pixels to about 128
+    assert picture.shape == (16 + 3 * (16 * factor + 4), 4 + 4 * (24 * factor + 4), 3)
+    for column, panel in enumerate(images.values()):
+        for row in range(3):
+            top, left = 16 + row * (16 * factor + 4), 4 + column * (24 * factor + 4)
+            cell = picture[top : top + 16 * factor : factor, left : left + 24 * factor : factor]
+            assert abs(cell - 255 * panel[row].permute(1, 2, 0).numpy()).max() <= 0.5 + 1e-4
+
+
+def test_distributions_are_of_all_values():
+    scenes = scene_batch()
+    values = distributions(two_layers(scenes))
+    count = 2 * 2 * SIZE * SIZE
+    assert {name: len(of) for name, of in values.items()} == {
+        "opacity": count, "log10_scale": 3 * count, "depth": count,
+    }  # fmt: skip
+    assert np.allclose(values["log10_scale"], -3)
+    assert np.unique(values["depth"].round(5)).tolist() == [1, 3]
+
+
+def test_percentiles():
+    """Of 0, 1, ..., 100, in any order, the n-th percentile is n."""
+    assert percentiles({"depth": np.random.default_rng(0).permutation(101).astype(float)}) == {
+        "depth_p10": 10, "depth_p50": 50, "depth_p90": 90,
+    }  # fmt: skip
+
+
+def test_the_divergence_of_the_channels_is_that_of_the_posterior():
+    posterior = Posterior(torch.randn(3, 4, 5, 6), torch.randn(3, 4, 5, 6))
+    assert len(channel_kl(posterior)) == 4
+    assert sum(channel_kl(posterior)) == pytest.approx(posterior.kl().mean().item(), rel=1e-5)
+    quiet = Posterior(posterior.mean * torch.tensor([0.0, 1, 1, 1])[:, None, None], torch.zeros(3, 4, 5, 6))
+    assert channel_kl(quiet)[0] == 0
+
+
+class Data:
+    def __init__(self, training: list[SceneBatch], validation: list[SceneBatch]) -> None:
+        self.train_dataloader, self.val_dataloader = (lambda: training), (lambda: validation)
+
+
+def test_scenes_are_the_first_of_validation_or_else_of_training():
+    several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
+    others = [scene_batch(2, seed=5)]
+    for data in (Data(others, several), Data(several, [])):
+        scenes = fixed_scenes(data, 4)
+        assert scenes.names == ("scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0")
+        assert torch.equal(scenes.targets.images[2, 0], several[1].targets.images[0, 0])
+    assert len(fixed_scenes(Data(others, several), 10).names) == 5
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_a_run_leaves_pictures_and_rows(pipeline, stage):
+    run = getattr(pipeline, stage)
+    (path,) = (run / "pictures").iterdir()
+    assert path.name == "step_000002.png"
+    # One validation scene of 32 px, enlarged four times, in eight panels.
+    assert Image.open(path).size == (4 + 8 * 132, 16 + 132)
+    table = pandas.read_csv(run / "metrics.csv")
+    (row,) = table[["step", *(c for c in table if c.startswith("gaussians/"))]].dropna().to_dict("records")
+    assert row["step"] == 1
+    assert 0 < row["gaussians/opacity_p10"] <= row["gaussians/opacity_p50"] <= row["gaussians/opacity_p90"] < 1
+    assert len(row) == 1 + 3 * 3
+    assert any(column.startswith("kl/channel_") for column in table) == (stage == "var")

@@ -1,0 +1,67 @@
+"""The model without an encoder: trained, continued, and scored with codes that it finds at test time."""
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import SMALL, compose_config, strict_json
+
+from completesplat.training.checkpoints import read_checkpoint
+
+SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4", "model.model.rows=20"]
+
+
+@pytest.fixture
+def run(command, toy_root, tmp_path):
+    assert command("fit", *SETTINGS, f"data.root={toy_root}", f"out={tmp_path / 'run'}").status == 0
+    return tmp_path / "run"
+
+
+def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path, run):
+    first = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
+    # Only training pictures: validation and test have taken none.
+    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
+    assert {name for name, _ in first["model._extra_state"]} <= set(data.store("train").names)
+    assert 2 <= len(first["model._extra_state"]) <= 4  # two steps of two pictures
+    resume = [f"ckpt_path={run / 'checkpoints/last.ckpt'}", "trainer.max_steps=4", f"out={tmp_path / 'more'}"]
+    assert command("fit", *SETTINGS, f"data.root={toy_root}", *resume).status == 0
+    more = read_checkpoint(tmp_path / "more/checkpoints/last.ckpt")["state_dict"]
+    assert more["model._extra_state"][: len(first["model._extra_state"])] == first["model._extra_state"]
+
+    checkpoint = tmp_path / "more/checkpoints/last.ckpt"
+    assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}", "trainer.accelerator=cpu").status == 0
+    assert 0 < strict_json(tmp_path / "scores/metrics.json")["model"]["full"]["novel"]["psnr"] < 100
+
+
+def test_a_full_table_ends_training_with_one_line(command, toy_root, tmp_path):
+    finished = command("fit", *SETTINGS, f"data.root={toy_root}", "model.model.rows=1", f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    assert "error: all 1 codes are taken" in finished.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("ablation", ["full", "skips_first_two"])
+def test_no_ablation_brings_skips(ablation):
+    config = compose_config("fit", *SETTINGS, f"ablation={ablation}")
+    assert len(instantiate(config.model, _convert_="all").model.reconstructor.skips) == 0
+
+
+def test_new_codes_lower_the_loss_of_the_reference_and_leave_the_weights(toy_root):
+    config = compose_config("fit", *SETTINGS, f"data.root={toy_root}", "model.code_steps=30", "model.code_rate=0.1")
+    torch.manual_seed(0)
+    module = instantiate(config.model, _convert_="all").eval()
+    data = instantiate(config.data, _convert_="all")
+    data.setup("test")
+    scenes = next(iter(data.test_dataloader()))
+    before = {name: p.clone() for name, p in module.named_parameters()}
+
+    def loss(gaussians) -> float:
+        view = scenes.reference
+        image = module.render(gaussians, scenes)[:, 0]
+        return torch.nn.functional.mse_loss(image, view.images).item()
+
+    start = module.gaussians(module.model.new_codes(len(scenes.names), seed=0), scenes)
+    with torch.inference_mode():
+        found = module.reconstruct(scenes.map(torch.clone), seed=0)
+        assert loss(found) < 0.9 * loss(start)
+    for name, parameter in module.named_parameters():
+        assert torch.equal(parameter, before[name])
+        assert parameter.grad is None

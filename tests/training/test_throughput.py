@@ -1,0 +1,106 @@
+"""Speed and memory of a run."""
+
+import time
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.loggers.logger import Logger
+from scenes_for_training import scene_batch
+
+from completesplat.training.throughput import Throughput
+
+NAP = 0.03
+
+
+class Memory(Logger):
+    """Keeps the rows."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[tuple[int, dict[str, float]]] = []
+
+    name, version = "memory", "0"
+
+    def log_hyperparams(self, *_, **__) -> None: ...
+
+    def log_metrics(self, metrics, step=None) -> None:
+        self.rows.append((step, metrics))
+
+
+class Sleeper(LightningModule):
+    def __init__(self, training: float = 0, validation: float = 0) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.naps = training, validation
+
+    def training_step(self, batch, index):
+        time.sleep(self.naps[0])
+        return self.weight**2
+
+    def validation_step(self, batch, index):
+        time.sleep(self.naps[1])
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+class SleepingLoader:
+    def __init__(self, nap: float = 0) -> None:
+        self.nap = nap
+
+    def __len__(self) -> int:
+        return 8
+
+    def __iter__(self):
+        for _ in range(8):
+            time.sleep(self.nap)
+            yield scene_batch()
+
+
+def speeds(module: Sleeper, loader: SleepingLoader, **options) -> list[dict[str, float]]:
+    memory = Memory()
+    trainer = Trainer(
+        max_epochs=1, accelerator="cpu", logger=memory, log_every_n_steps=2, callbacks=[Throughput()],
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
+        **options,
+    )  # fmt: skip
+    profiler = trainer.profiler
+    trainer.fit(module, loader, SleepingLoader() if "val_check_interval" in options else None)
+    assert trainer.profiler is profiler
+    return [row | {"step": step} for step, row in memory.rows if "speed/data_wait" in row]
+
+
+def test_who_is_waited_for():
+    slow_data, slow_model = speeds(Sleeper(), SleepingLoader(NAP)), speeds(Sleeper(NAP), SleepingLoader())
+    assert [row["step"] for row in slow_data] == [1, 3, 5, 7]
+    for data, model in zip(slow_data[1:], slow_model[1:], strict=True):
+        assert 0 < model["speed/data_wait"] < data["speed/data_wait"] < 1
+        # A batch has two scenes, and cannot take less than the nap.
+        assert 0 < data["speed/scenes_per_second"] < 2 / NAP
+        assert 0 < model["speed/scenes_per_second"] < 2 / NAP
+
+
+@pytest.mark.parametrize("interval", [1, 2])
+def test_validation_is_not_counted(interval):
+    """Ten times as long as training, and in the midst of an interval as well as between two."""
+    validated = speeds(Sleeper(NAP, validation=10 * NAP), SleepingLoader(), val_check_interval=interval)
+    for row in validated[1:]:
+        assert row["speed/scenes_per_second"] > 2 / (10 * NAP)
+
+
+def test_accumulated_batches_are_counted_and_logged_once():
+    rows = speeds(Sleeper(NAP), SleepingLoader(), accumulate_grad_batches=2)
+    assert [row["step"] for row in rows] == [1, 3]
+    for row in rows:  # Eight scenes take at least four naps.
+        assert row["speed/scenes_per_second"] < 2 / NAP
+
+
+def test_memory_is_that_of_a_process_with_torch():
+    before = speeds(Sleeper(), SleepingLoader())[-1]["memory/process_gb"]
+    assert 0.05 < before < 100
+    ballast = torch.ones(2**27)  # half a GiB
+    after = speeds(Sleeper(), SleepingLoader())[-1]["memory/process_gb"]
+    assert after - before == pytest.approx(0.5, abs=0.2)
+    assert "memory/gpu_gb" not in speeds(Sleeper(), SleepingLoader())[-1]
+    del ballast
