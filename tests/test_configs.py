@@ -77,7 +77,7 @@ def test_what_surrounds_a_model_instantiates_from_its_config(group):
             assert [name for name, value in made.items() if value is None] == off
         elif group in ("optimizer", "schedule"):
             optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
-            made(optimizer.param_groups[0]["params"]) if group == "optimizer" else made(optimizer)
+            made(optimizer.param_groups[0]["params"]) if group == "optimizer" else made(optimizer, 100)
         assert made is not None
 
 

@@ -21,6 +21,7 @@ UNHELPFUL_WARNINGS = (
     ".*LeafSpec.*",
     "Experiment logs directory .* exists.*",
     ".*logging interval.*",
+    "Checkpoint directory .* exists and is not empty.*",
 )
 
 
@@ -39,16 +40,16 @@ def launch(verb: str, arguments: list[str]) -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
+    program, given = sys.argv[0], arguments
     if is_sweep(arguments):
         arguments = [*arguments, *sweep_arguments(verb, arguments, RUN_NAME)]
-    program = sys.argv[0]
     sys.argv = [f"completesplat {verb}", *arguments]
 
     failures: list[Exception] = []
 
     def job(config: Any) -> None:
         try:
-            run_job(verb, config, program)
+            run_job(verb, config, program, given)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end

@@ -13,6 +13,7 @@ def run(config: Any, out: Path) -> None:
     from lightning import seed_everything
 
     from completesplat.commands import quieten
+    from completesplat.export.atomic import atomic_path
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
 
@@ -37,7 +38,11 @@ def run(config: Any, out: Path) -> None:
         return
     if config.test:
         show(evaluation_table(module.evaluation.results()))
-    _write(out / "metrics.json", trainer, metrics, module.evaluation.results() if config.test else None)
+    results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
+    if config.test:
+        results |= {"upper_bound": module.upper_bound, "test": module.evaluation.results()}
+    with atomic_path(out / "metrics.json") as temporary:  # which also tells that the job is done
+        temporary.write_text(json.dumps(results, indent=2) + "\n")
 
 
 def checkpoint_to_continue(config: Any, out: Path) -> str | None:
@@ -72,17 +77,6 @@ def _train_and_test(trainer: Any, module: Any, data: Any, checkpoint: str | None
         metrics |= trainer.callback_metrics
     assert trainer.global_step == steps
     return {name: value.item() for name, value in metrics.items()}
-
-
-def _write(path: Path, trainer: Any, metrics: dict[str, float], scores: dict[str, Any] | None) -> None:
-    """The results, which also tell that the job is done."""
-    from completesplat.export.atomic import atomic_path
-
-    results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
-    if scores is not None:
-        results["test"] = scores
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(results, indent=2) + "\n")
 
 
 def _finish(loggers: list[Any]) -> None:

@@ -20,13 +20,14 @@ PROCESS_OF_JOB = "--process-of"
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
-def run_job(verb: str, config: Any, program: str) -> None:
+def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     """Run one job in its own directory, leaving there what is needed to know what was run.
 
     A job with `ckpt_path=last` whose directory holds its results is not repeated.
 
     Args:
         program: path by which this program was started.
+        given: its arguments, behind the verb.
 
     Raises:
         CompleteSplatError: the directory holds other work.
@@ -43,7 +44,7 @@ def run_job(verb: str, config: Any, program: str) -> None:
         print(f"{out}: finished before, not repeated")
         return
     OmegaConf.save(resolved, out / CONFIG)
-    _record(out / RECORD, list(hydra_config.overrides.task))
+    _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
     with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
         import_module(f"completesplat.commands.{verb}").run(config, out)
     print(out)
@@ -88,13 +89,13 @@ def _differences(one: Any, other: Any, key: str = "") -> set[str]:
     return set() if one == other else {key}
 
 
-def _record(path: Path, overrides: list[str]) -> None:
+def _record(path: Path, command: list[str], overrides: list[str]) -> None:
     """What was started, and when it was continued."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {
         "version": __version__,
         "commit": git_commit(),
-        "command": sys.argv,
+        "command": command,
         "overrides": overrides,
         "started": now,
     }

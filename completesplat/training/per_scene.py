@@ -23,6 +23,8 @@ class PerScene(SceneModule):
         **rendering_and_optimization: see `SceneModule`.
     """
 
+    upper_bound = True
+
     def __init__(self, loss: WeightedSum, fitting: FittingSettings, **rendering_and_optimization: Any) -> None:
         super().__init__(**rendering_and_optimization)
         self.loss = loss

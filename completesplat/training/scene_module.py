@@ -38,15 +38,18 @@ class SceneModule(LightningModule):
     Args:
         rasterizer: renders the Gaussians.
         optimizer: parameters -> optimizer.
-        schedule: optimizer -> learning-rate schedule, stepped every optimizer step.
+        schedule: optimizer and steps of the run -> learning-rate schedule, stepped every optimizer step.
         background: grey value (0 to 1) seen where the Gaussians leave a pixel open.
     """
+
+    upper_bound = False
+    """Whether the model has seen the views that it is scored on."""
 
     def __init__(
         self,
         rasterizer: Rasterizer,
         optimizer: Callable[[Iterable[Tensor]], Optimizer],
-        schedule: Callable[[Optimizer], LRScheduler],
+        schedule: Callable[[Optimizer, float], LRScheduler],
         background: float = 0.5,
     ) -> None:
         super().__init__()
@@ -79,6 +82,7 @@ class SceneModule(LightningModule):
         self.evaluation.update("copy_reference", copy_reference(scenes), scenes)
 
     def configure_optimizers(self) -> Any:
+        """The schedule spans the run, whether its length is given in steps or epochs."""
         optimizer = self.optimizer([p for p in self.parameters() if p.requires_grad])
-        schedule = {"scheduler": self.schedule(optimizer), "interval": "step"}
-        return {"optimizer": optimizer, "lr_scheduler": schedule}
+        schedule = self.schedule(optimizer, self.trainer.estimated_stepping_batches)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -2,6 +2,9 @@ import math
 
 import pytest
 import torch
+from hydra.utils import instantiate
+from lightning import Callback
+from support import SMALL, compose_config
 
 from completesplat.training.schedules import constant, cosine, exponential
 
@@ -31,4 +34,29 @@ def test_cosine_ends_at_the_final_ratio():
 
 
 def test_constant():
-    assert set(factors(constant, 5)) == {1.0}
+    assert set(factors(constant, 5, total_steps=3)) == {1.0}
+
+
+class LearningRates(Callback):
+    """Notes the rate of every step."""
+
+    def __init__(self) -> None:
+        self.rates: list[float] = []
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
+        self.rates.append(trainer.optimizers[0].param_groups[0]["lr"])
+
+
+@pytest.mark.parametrize("length", [["trainer.max_steps=6"], ["trainer.max_steps=-1", "+trainer.max_epochs=6"]])
+def test_the_schedule_ends_with_the_run_whether_steps_or_epochs_are_given(length, toy_root, tmp_path):
+    settings = [*SMALL, *length, "schedule.warmup_steps=0", "optimizer.lr=1.0e-3", "data.references_per_sequence=1"]
+    config = compose_config(
+        "fit", "experiment=toy_var", f"data.root={toy_root}", *settings, "trainer.limit_val_batches=0",
+        "trainer.val_check_interval=null", f"out={tmp_path}",
+    )  # fmt: skip
+    noted = LearningRates()
+    trainer = instantiate(config.trainer, callbacks=[noted], logger=False, _convert_="all", enable_progress_bar=False)
+    data, module = (instantiate(part, _convert_="all") for part in (config.data, config.model))
+    trainer.fit(module, datamodule=data)
+    expected = [0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / 6)) for step in range(6)]
+    assert noted.rates == pytest.approx([1e-3 * factor for factor in expected])

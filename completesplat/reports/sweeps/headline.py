@@ -45,11 +45,12 @@ def marks(rows: Sequence[dict[str, Any]], column: str) -> list[str]:
     """For each row, whether its mean is the best, the second best, or unmarked.
 
     Means are compared as they are written, so that rows which look equal share a mark. Rows without seeds, the naive
-    predictors, do not compete.
+    predictors, and upper bounds do not compete.
     """
     name = column.rpartition("_")[2]
     sign = 1 if name in LOWER_IS_BETTER else -1
-    means = [row.get(f"{column}_mean") if row["seeds"] is not None else None for row in rows]
+    competing = [row["seeds"] is not None and not row["upper_bound"] for row in rows]
+    means = [row.get(f"{column}_mean") if competes else None for row, competes in zip(rows, competing, strict=True)]
     written = [None if mean is None else sign * float(format(mean, FORMATS[name])) for mean in means]
     ranked = sorted({value for value in written if value is not None and value == value})  # not-a-number is no rank
     given = dict(zip(ranked, (BEST, SECOND), strict=False))

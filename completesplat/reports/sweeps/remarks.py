@@ -39,7 +39,8 @@ def _described(job: Job, label: Callable[[Job], str]) -> str:
 
 def _incomparable(finished: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
     mixed = [row for row in rows if isinstance(row["scenes"], str) and row["seeds"] is not None]
-    said = [f"{row['ablation']}: its jobs were tested on different scenes ({row['scenes']})." for row in mixed]
+    said = [f"{row['ablation']} has seen the views that it is scored on." for row in rows if row["upper_bound"]]
+    said += [f"{row['ablation']}: its jobs were tested on different scenes ({row['scenes']})." for row in mixed]
     if len({row["scenes"] for row in rows if row["seeds"] is not None}) > 1:
         said.append("The rows were not tested on equally many scenes and do not compare.")
     for predictor in disagreeing(finished):

@@ -9,7 +9,9 @@ from completesplat.reports.sweeps.jobs import Job
 from completesplat.reports.sweeps.labels import order, setting
 
 MODEL = "model"
-IDENTITY = ["ablation", "seeds", "scenes", "steps"]
+UPPER_BOUND = "upper_bound"
+"""Marks jobs, and their rows, whose model has seen the views that it is scored on."""
+IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
 AGREEMENT = 1e-4
 """How far, relatively, a naive predictor's scores may lie apart in two jobs before it is said."""
 
@@ -57,6 +59,7 @@ def _flat(entry: dict[str, Any]) -> Iterator[tuple[str, float]]:
 def _row(label: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
     row: dict[str, Any] = {"ablation": label, "seeds": len(jobs), "scenes": _scenes(jobs, MODEL)}
     row["steps"] = _one_or_all(job.metrics["steps"] for job in jobs if job.metrics)
+    row[UPPER_BOUND] = any(job.metrics and job.metrics.get(UPPER_BOUND) for job in jobs)
     tables = [scores(job, MODEL) for job in jobs]
     for name in names:
         complete = all(name in table for table in tables)
@@ -69,6 +72,7 @@ def _row(label: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any
 
 def _naive(predictor: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
     row: dict[str, Any] = {"ablation": predictor, "seeds": None, "scenes": _scenes(jobs, predictor), "steps": None}
+    row[UPPER_BOUND] = False
     tables = [scores(job, predictor) for job in jobs]
     for name in names:
         values = [table[name] for table in tables if name in table]

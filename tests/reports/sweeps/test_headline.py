@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from completesplat.reports.sweeps.headline import ALWAYS, columns, figure, marks, metric
+from completesplat.reports.sweeps.headline import ALWAYS, BEST, SECOND, UNMARKED, columns, figure, marks, metric
 
 PSNR = "full_novel_psnr"
 
@@ -12,7 +12,10 @@ PSNR = "full_novel_psnr"
 def rows(means: list[Any], column: str = PSNR, naive: int = 0) -> list[dict[str, Any]]:
     """One row for each mean; the last `naive` of them without seeds."""
     competing = len(means) - naive
-    return [{"seeds": 2 if i < competing else None, f"{column}_mean": mean} for i, mean in enumerate(means)]
+    return [
+        {"seeds": 2 if i < competing else None, "upper_bound": False, f"{column}_mean": mean}
+        for i, mean in enumerate(means)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -59,3 +62,11 @@ def test_metrics_that_few_sweeps_measure_are_shown_where_they_were() -> None:
 )
 def test_a_figure_is_mean_and_deviation_equally_precise(mean, deviation, text) -> None:
     assert figure({f"{PSNR}_mean": mean, f"{PSNR}_deviation": deviation}, PSNR) == text
+
+
+def test_upper_bounds_do_not_compete():
+    rows = [
+        {"seeds": 1, "upper_bound": bound, "full_novel_psnr_mean": mean}
+        for bound, mean in ((True, 30.0), (False, 18.0), (False, 17.0))
+    ]
+    assert marks(rows, "full_novel_psnr") == [UNMARKED, BEST, SECOND]

@@ -32,8 +32,8 @@ def test_the_summary_agrees_with_the_files_of_the_jobs(ablations) -> None:
         assert len(values) == 3
         np.testing.assert_allclose(table.loc[ablation, f"{name}_mean"], sum(values) / 3, rtol=1e-12)
         np.testing.assert_allclose(table.loc[ablation, f"{name}_deviation"], np.std(values, ddof=1), atol=1e-12)
-    assert list(table.columns[:3]) == ["seeds", "scenes", "steps"]
-    assert set(table.columns[3:]) == {f"{name}_{kind}" for _, name in found for kind in ("mean", "deviation")}
+    assert list(table.columns[:4]) == ["seeds", "scenes", "steps", "upper_bound"]
+    assert set(table.columns[4:]) == {f"{name}_{kind}" for _, name in found for kind in ("mean", "deviation")}
     assert list(table.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
     assert list(table.loc["full"][:3]) == [3, 40, 9]
 

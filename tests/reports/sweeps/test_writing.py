@@ -10,6 +10,7 @@ import pytest
 
 from completesplat.reports.sweeps.latex import escape
 from completesplat.reports.sweeps.summary import summarize
+from completesplat.reports.sweeps.rows import IDENTITY
 from completesplat.reports.sweeps.writing import show_summary, write_summary
 
 FILES = ["summary.csv", "summary.md", "summary.png", "summary.tex"]
@@ -103,7 +104,7 @@ def test_a_sweep_without_finished_jobs_says_so(sweep, written, capsys) -> None:
     assert markdown.startswith("No job of this sweep has finished.")
     assert "0 of 1 jobs have finished." in markdown
     assert "No job of this sweep has finished." in (sweep.folder / "summary.tex").read_text()
-    assert list(pd.read_csv(sweep.folder / "summary.csv").columns) == ["ablation", "seeds", "scenes", "steps"]
+    assert list(pd.read_csv(sweep.folder / "summary.csv").columns) == IDENTITY
     assert len(np.unique(imageio.imread(sweep.folder / "summary.png"))) > 1
     assert not blue(sweep.folder).any()
     show_summary(summarize(sweep.folder))
