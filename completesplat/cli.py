@@ -8,6 +8,7 @@ VERBS = {
     "fit": "train a model, one stage at a time",
     "test": "score a checkpoint on held-out scenes",
     "predict": "draw complete scenes from one photograph",
+    "report": "compare samplers and controls of a trained model (report samplers, controls, masked)",
     "bench": "time rasterizers and data loading (bench rasterizers, bench data)",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(

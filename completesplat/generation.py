@@ -5,8 +5,9 @@ scenes = model("photo.jpg", samples=4, seed=0)
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.photograph import Photograph, read_photograph
+from completesplat.diffusion.sampling import with_forward_process
+from completesplat.diffusion.splitting import in_parts, joined
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -60,9 +64,10 @@ class CompleteSplat(nn.Module):
         autoreconstructor = dict(autoreconstructor)
         if "pretrained" in autoreconstructor:  # its weights are a trained stage's: Stable Diffusion's are not needed
             autoreconstructor["pretrained"] = None
-        self.architecture = {
+        self.architecture: dict[str, Any] = {
             "autoreconstructor": autoreconstructor,
-            "conditioning": dict(conditioning),
+            # Its weights are saved with the others: what training started from is not needed again.
+            "conditioning": dict(conditioning) | ({"pretrained": None} if "pretrained" in conditioning else {}),
             "denoiser": dict(denoiser),
             "sampler": dict(sampler),
             "image_size": image_size,
@@ -97,49 +102,67 @@ class CompleteSplat(nn.Module):
         cameras: Cameras,
         depth_range: Float[Tensor, "batch 2"],
         samples: int = 1,
-        skip_weight: float = 1.0,
+        skip_weight: float | None = None,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         seed: int = 0,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        batch: int | None = None,
+        on_step: Callable[[int, int, Gaussians], None] | None = None,
     ) -> Gaussians:
-        """Draw `samples` scenes for each image, all in one batch.
+        """Draw `samples` scenes for each image.
+
+        Noise is drawn for all samples first: it depends on the seed and their number. How many are then computed at a
+        time changes no more than the rounding of float32.
+
+        Args:
+            skip_weight: 1, the default, is most faithful (supplement, "Diverse Sampling"); 0 if something is hidden.
+            guidance_weight: share of the unconditional prediction; more gives more diverse samples.
+            steps: denoising steps; the sampler's own number by default.
+            visible: 0 where an image is hidden: what is there has no influence.
+            batch: at most so many latents at a time; all by default, or fewer if a GPU's memory does not suffice.
+            on_step: called after each denoiser call, for each batch, with its number, the timestep and the scenes that
+                the estimate of the clean latent stands for.
 
         Returns:
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
-            The draw depends on the seed, the batch size and the number of samples.
+
+        Raises:
+            CompleteSplatError: skips with something hidden, or a number of steps that the sampler cannot make.
         """
+        weight = allowed_skip_weight(skip_weight, visible)
+        images = images if visible is None else images * visible
         conditioning = self.conditioning(images)
         _, features = self.autoreconstructor.encoder(images)
-        latent_shape = (len(images) * samples, self.denoiser.latent_channels, *conditioning.shape[-2:])
-        noise = torch.randn(latent_shape, generator=torch.Generator().manual_seed(seed)).to(images.device)
-        repeated = conditioning.repeat_interleave(samples, dim=0)
-        latent = self.sampler(self.denoiser, noise, repeated, guidance_weight, steps) / self.latent_scale
-        features = [feature.repeat_interleave(samples, dim=0) for feature in features]
-        splatter_image = self.autoreconstructor.reconstructor(latent, features, skip_weight)
-        repeated_cameras = cameras.map(lambda tensor: tensor.repeat_interleave(samples, dim=0))
-        return splatter_image.gaussians(repeated_cameras, depth_range.repeat_interleave(samples, dim=0))
+        shape = (len(images) * samples, self.denoiser.latent_channels, *conditioning.shape[-2:])
+        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(images.device)
+        image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+
+        def draw(part: slice) -> Gaussians:
+            own = image_of[part]
+            skips = [feature[own] for feature in features], weight
+            decode = partial(self._decode, skips=skips, cameras=cameras[own], depth_range=depth_range[own])
+            shown = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent))
+            return decode(self.sampler(self.denoiser, noise[part], conditioning[own], guidance_weight, steps, shown))
+
+        return joined(in_parts(draw, len(noise), batch))
+
+    def _decode(self, latent: Tensor, skips: tuple, cameras: Cameras, depth_range: Tensor) -> Gaussians:
+        splatter_image = self.autoreconstructor.reconstructor(latent / self.latent_scale, *skips)
+        return splatter_image.gaussians(cameras, depth_range)
 
     def forward(
-        self,
-        image: Photograph | Path | str,
-        samples: int = 1,
-        skip_weight: float = 1.0,
-        guidance_weight: float = 0.0,
-        steps: int | None = None,
-        seed: int = 0,
+        self, image: Photograph | Path | str, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
     ) -> list[Gaussians]:
         """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
 
         Args:
             image: a file, or a photograph read with `completesplat.data.photograph.read_photograph`.
-            samples: how many scenes to draw.
-            skip_weight: 1 is most faithful to the photograph, 0 most free (supplement, "Diverse Sampling").
-            guidance_weight: share of the unconditional prediction; more gives more diverse samples.
-            steps: denoising steps; the sampler's own number by default.
-            seed: the same seed and number of samples give the same scenes.
+            visible: 0 where it is hidden; see `completesplat.data.masking`.
+            **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
-            ImageError: the file is not a readable image.
+            CompleteSplatError: not a readable image, or what `generate` refuses.
         """
         photograph = image if isinstance(image, Photograph) else self.read(image)
         device = self.latent_scale.device
@@ -147,13 +170,16 @@ class CompleteSplat(nn.Module):
             photograph.image[None].to(device),
             self.camera(photograph)[None],
             self.depth_range[None],
-            samples,
-            skip_weight,
-            guidance_weight,
-            steps,
-            seed,
+            visible=None if visible is None else visible[None].to(device),
+            **settings,
         )
-        return [scenes[i] for i in range(samples)]
+        return [scenes[i] for i in range(len(scenes.means))]
+
+    def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
+        """Draw with another sampler from now on; noise schedule and prediction type stay those of training."""
+        config = with_forward_process(sampler, self.architecture["sampler"])
+        self.sampler = _build(config)
+        self.architecture["sampler"] = config
 
     def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
         """Read a photograph at the model's size; an unknown field of view is taken to be the training set's."""

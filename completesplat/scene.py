@@ -1,4 +1,4 @@
-"""What a data module yields: images with their cameras, for a reference view and its targets."""
+"""What a data module yields: images with their cameras, for a reference view and its targets; or encoded ones."""
 
 from dataclasses import dataclass, replace
 
@@ -53,6 +53,26 @@ class SceneBatch(TensorDataclass):
             cameras,
             _prepend(reference.masks, targets.masks, axis=-4),
         )
+
+
+@dataclass(frozen=True)
+class EncodedScene(TensorDataclass):
+    """What stage 2 needs of scenes whose reference pictures were encoded beforehand.
+
+    `mean` and `log_variance` are those of the autoreconstructor's posterior, not scaled. `condition` is the reference
+    picture (sRGB, 0 to 1; 0 within the boxes of masked diffusion), or the features that a frozen conditioning makes of
+    it. `names` and `reference_frame` are as in `SceneBatch`.
+    """
+
+    mean: Float[Tensor, "*batch channel height width"]
+    log_variance: Float[Tensor, "*batch channel height width"]
+    condition: Float[Tensor, "*batch _ _ _"]
+    reference_frame: Int64[Tensor, "*batch"]
+    names: str | tuple[str, ...]
+
+    def __getitem__(self, index: int | slice) -> "EncodedScene":
+        """One scene of a batch, or some of them."""
+        return replace(super().__getitem__(index), names=self.names[index])
 
 
 def _prepend(one: Tensor, many: Tensor, axis: int) -> Tensor:

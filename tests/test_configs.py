@@ -12,7 +12,7 @@ from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
 
 CONF = conf_folder()
-VERBS = ["fit", "test", "predict", "data", "bench"]
+VERBS = ["fit", "test", "predict", "data", "bench", "report"]
 NEEDED = ["model.autoreconstructor_checkpoint=null"]
 
 
@@ -28,7 +28,7 @@ EVERY_OPTION = [(group, option) for group in TRAINING_GROUPS for option in optio
 def test_nothing_in_the_tree_is_forgotten_here():
     roots = {path.stem for path in CONF.glob("*.yaml")}
     assert roots == {*VERBS, "base"}
-    assert set(GROUPS) == {*TRAINING_GROUPS, "data_task", "bench_task"}
+    assert set(GROUPS) == {*TRAINING_GROUPS, "data_task", "bench_task", "report_task"}
     assert len(EVERY_OPTION) > 20
 
 
@@ -36,8 +36,9 @@ def test_nothing_in_the_tree_is_forgotten_here():
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
-    needed += ["model.checkpoint=x"] if option.endswith("_var_stage2") else []
-    needed += NEEDED if option in ("latent_diffusion", "toy_diffusion") else []
+    needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
+    stage2 = group == "experiment" and option.endswith("_diffusion")
+    needed += NEEDED if stage2 or option == "latent_diffusion" else []
     config = compose_config("fit", f"{group}={option}", *needed)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
@@ -62,7 +63,7 @@ def test_every_part_instantiates_from_its_config(group, option):
     # Its weights are not in the repository.
     needed += ["loss.terms.lpips=null"] if (group, option) == ("loss", "stage2") else []
     config = compose_config("fit", f"{group}={option}", *needed)
-    with torch.device("meta" if option == "stable_diffusion" else "cpu"):
+    with torch.device("meta" if option.startswith("stable_diffusion") else "cpu"):
         part = instantiate(config[group], _convert_="all")
     assert part is not None
 
@@ -114,13 +115,35 @@ def test_the_papers_stages(data):
     assert one.data.color_jitter is not None
 
 
+@pytest.mark.parametrize("data", ["co3d", "re10k"])
+def test_the_papers_diffusion(data):
+    main = compose_config("fit", f"experiment={data}_diffusion", "data.root=x", *NEEDED)
+    masked = compose_config("fit", f"experiment={data}_diffusion_masked", "data.root=x", "model.checkpoint=x")
+    assert [c.trainer.max_steps for c in (main, masked)] == [1_000_000, 100_000]
+    for config in (main, masked):
+        assert (config.optimizer.lr, config.data.batch_size, config.data.image_size) == (1e-4, 32, 128)
+        assert (config.optimizer._target_, config.callbacks.ema.decay) == ("torch.optim.Adam", 0.9999)
+        assert config.schedule._target_.endswith(".exponential")
+        assert (config.schedule.warmup_steps, config.model.unconditional_probability) == (100, 0.2)
+        names = [config[part]._target_.split(".")[-1] for part in ("conditioning", "denoiser")]
+        assert names == ["StableDiffusionConditioning", "TextlessStableDiffusion"]
+        assert config.autoreconstructor.encoder.channels == config.conditioning.channels == [128, 256, 512, 512]
+        assert config.denoiser.latent_channels == config.denoiser.conditioning_channels == 4
+    assert (main.data.box_masks, main.model.skip_weight) == (None, 1)
+    assert (masked.data.box_masks.probability, masked.model.skip_weight) == (0.5, 0)
+    assert masked.model.autoreconstructor_checkpoint is None
+
+
 @pytest.mark.parametrize("experiment", [option for option in options("experiment") if option.startswith("toy_")])
 def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     settings = [f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
-    if "diffusion" in experiment:
-        settings += [f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}", "sampler.steps=2"]
-    if experiment.endswith("stage2"):
-        settings += [f"model.checkpoint={pipeline.var / 'checkpoints/last.ckpt'}", "ablation=no_lpips"]
+    var, diffusion = (run / "checkpoints/last.ckpt" for run in (pipeline.var, pipeline.diffusion))
+    settings += {
+        "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
+        "toy_diffusion_masked": [f"model.checkpoint={diffusion}", "sampler.steps=2"],
+        "toy_var_stage2": [f"model.checkpoint={var}", "ablation=no_lpips"],
+        "toy_var_masked": [f"model.checkpoint={var}"],
+    }.get(experiment, [])
     assert call(monkeypatch, "fit", f"experiment={experiment}", *settings, f"out={tmp_path / 'run'}") == 0
     assert (tmp_path / "run/checkpoints/last.ckpt").is_file()

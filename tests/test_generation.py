@@ -1,12 +1,14 @@
+import copy
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from omegaconf import OmegaConf
 from safetensors.torch import load_file, save_file
-from support import tiny_generator
+from support import compose_config, tiny_generator
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import CONFIG_FILE, WEIGHTS_FILE, CompleteSplat
 
 
@@ -90,6 +92,86 @@ def test_training_mode_leaves_the_autoreconstructor_frozen(model):
     assert not model.autoreconstructor.training
     assert not any(p.requires_grad for p in model.autoreconstructor.parameters())
     assert all(p.requires_grad for p in model.denoiser.parameters())
+
+
+@pytest.fixture
+def half(model):
+    """The right half is hidden."""
+    visible = torch.ones(1, model.image_size, model.image_size)
+    visible[..., model.image_size // 2 :] = 0
+    return visible
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, 7])
+@pytest.mark.parametrize("guidance_weight", [0.0, 0.5])
+def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, picture, batch, guidance_weight):
+    sizes = []
+    hook = model.autoreconstructor.reconstructor.register_forward_pre_hook(
+        lambda _, inputs: sizes.append(len(inputs[0]))
+    )
+    settings = {"samples": 5, "seed": 1, "steps": 2, "guidance_weight": guidance_weight}
+    together, split = model(picture, **settings), model(picture, **settings, batch=batch)
+    hook.remove()
+    assert sizes == [5, *[batch] * (5 // batch), *[5 % batch] * (5 % batch > 0)] if batch < 5 else [5, 5]
+    for one, other in zip(together, split, strict=True):
+        for name in vars(one):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-4, rtol=1e-4)
+
+
+def test_without_guidance_a_step_is_one_denoiser_call_for_all_samples(model, picture):
+    sizes = []
+    hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    model(picture, samples=3, steps=5)
+    hook.remove()
+    assert sizes == [3] * 5
+
+
+def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
+    photograph = model.read(picture)
+    other = replace(photograph, image=torch.where(half > 0, photograph.image, 1 - photograph.image))
+    assert not torch.equal(other.image, photograph.image)
+    for first, second in zip(model(photograph, half, samples=2), model(other, half, samples=2), strict=True):
+        assert same(first, second)
+    assert not same(model(photograph)[0], model(other)[0])
+
+
+def test_what_is_visible_has_an_influence(model, picture, half):
+    photograph = model.read(picture)
+    other = replace(photograph, image=torch.where(half > 0, 1 - photograph.image, photograph.image))
+    assert not same(model(photograph, half)[0], model(other, half)[0])
+
+
+def test_skips_are_off_where_something_is_hidden_and_cannot_be_on(model, picture, half):
+    assert same(model(picture, half)[0], model(picture, half, skip_weight=0.0)[0])
+    with pytest.raises(CompleteSplatError, match=r"skip_weight=0\.5: must be 0"):
+        model(picture, half, skip_weight=0.5)
+    everything = torch.ones_like(half)
+    assert same(model(picture, everything, skip_weight=1.0)[0], model(picture)[0])
+
+
+def test_the_scenes_of_all_steps_are_shown(model, picture):
+    shown = []
+    scenes = model(picture, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))
+    assert [(step, level) for step, level, _ in shown] == 2 * [(0, 999), (1, 749), (2, 499), (3, 249)]
+    last = [scene for _, _, part in (shown[3], shown[7]) for scene in (part[i] for i in range(len(part.means)))]
+    for scene, estimate in zip(scenes, last, strict=True):
+        torch.testing.assert_close(scene.means, estimate.means, atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(shown[0][2].means, shown[3][2].means, atol=1e-3)
+
+
+def test_another_sampler_is_saved_with_the_weights(model, picture, tmp_path):
+    changed = copy.deepcopy(model)
+    changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=dpm20").sampler))
+    assert not same(changed(picture)[0], model(picture)[0])
+    changed.save_pretrained(tmp_path / "changed")
+    loaded = CompleteSplat.from_pretrained(tmp_path / "changed")
+    assert loaded.sampler.steps == 20
+    assert same(loaded(picture)[0], changed(picture)[0])
+
+
+def test_another_sampler_cannot_name_foreign_code(model):
+    with pytest.raises(WeightsError, match="no part of a model"):
+        model.replace_sampler({"_target_": "os.system", "scheduler": {}})
 
 
 @pytest.mark.parametrize("name", [CONFIG_FILE, WEIGHTS_FILE])

@@ -14,7 +14,7 @@ from completesplat.commands.sweeps import is_sweep, job_name, sweep_arguments
 from completesplat.errors import CompleteSplatError
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
-TASKS = ("data", "bench")
+TASKS = ("data", "bench", "report")
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -28,7 +28,7 @@ UNHELPFUL_WARNINGS = (
 def launch(verb: str, arguments: list[str]) -> None:
     """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
-    `data` and `bench` have several tasks: `data toy` is short for `data data_task=toy`.
+    `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`.
     """
     import hydra
     from hydra.core.hydra_config import HydraConfig

@@ -1,4 +1,4 @@
-"""`completesplat data`: make, check, look at and prepare data sets."""
+"""`completesplat data`: make, check, look at, prepare and encode data sets."""
 
 import json
 import logging
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import CompleteSplatError, DataError, WeightsError
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +74,28 @@ def prepare(data: Any, splits: Sequence[str], out: Path, **settings: Any) -> Non
     if is_prepared(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
     prepare_sources(_sources(data, splits), data.prepared_settings(), out, **settings)
+
+
+def latents(ckpt: str | Path, overrides: Sequence[str], conditioning: Any, out: Path, **settings: Any) -> None:
+    """Encode the training set of stage 1's run into `out`; see `completesplat.training.encoding`."""
+    import torch
+    from hydra.utils import instantiate
+
+    from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+    from completesplat.commands.test import config_of_run
+    from completesplat.training.checkpoints import load_part
+    from completesplat.training.encoding import encode_training_set
+
+    run_config = config_of_run(Path(ckpt), list(overrides))
+    autoreconstructor = instantiate(run_config.model.get("model"), _convert_="all")
+    if not isinstance(autoreconstructor, VariationalAutoReconstructor):
+        raise WeightsError(f"{ckpt}: not of stage 1, which trains an autoreconstructor (model=var)")
+    load_part(autoreconstructor, ckpt, prefix="model.")
+    data = instantiate(run_config.data, _convert_="all")
+    data.prepare_data()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    store = encode_training_set(autoreconstructor, data, out, conditioning=conditioning, device=device, **settings)
+    logger.info("scale of the latents: %.6g", store.scale)
 
 
 def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:

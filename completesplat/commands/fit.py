@@ -56,7 +56,9 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
         return None
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    config.autoreconstructor.pretrained = None
+    for part in (config.autoreconstructor, config.conditioning):
+        if "pretrained" in part:
+            part.pretrained = None
     if "checkpoint" in config.model:
         config.model.checkpoint = None
     return path

@@ -14,7 +14,6 @@ from completesplat.data.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.streaming import StreamedScenes
 from completesplat.data.view_selection import draws
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.scene import SceneBatch
 
 ON_BAD = ("skip", "raise")
 
@@ -111,8 +110,8 @@ class SceneLoader:
     def __len__(self) -> int:
         return len(self._loader)
 
-    def __iter__(self) -> Iterator[SceneBatch]:
-        """The batches of an epoch, or the rest of it after `load_state_dict`.
+    def __iter__(self) -> Iterator[Any]:
+        """The batches of an epoch (`SceneBatch`, or `EncodedScene`), or the rest of it after `load_state_dict`.
 
         Raises:
             DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.

@@ -1,32 +1,32 @@
-"""What the data modules of all data sets share: loaders, settings, and means over the training pictures."""
+"""What the data modules of all data sets share: loaders and settings."""
 
 import logging
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from functools import partial
+from collections.abc import Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
 from completesplat.data.augmentation import BoxMasks, ColorJitter, augment
+from completesplat.data.checks import at
+from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.encoded.training import EncodedTraining
 from completesplat.data.loading import EpochSampler, SceneLoader, check_policy
+from completesplat.data.means import mean_camera, mean_image
 from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.prepared.source import PreparedSource
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.streaming import StreamedScenes
-from completesplat.data.typical_camera import TypicalCamera, typical_camera
+from completesplat.data.typical_camera import TypicalCamera
 from completesplat.errors import CompleteSplatError, DataError
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
-# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
-SEQUENCES_OF_MEANS, PICTURES_OF_MEANS = 400, 8192
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +50,8 @@ class SceneDataModule(LightningDataModule):
         workers: processes that load data; 0: none.
         cache: keep decoded pictures in memory.
         streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
+        encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
+            validation and test read pictures.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         most_bad: skipping more than this share of an epoch's items is an error.
     """
@@ -69,6 +71,7 @@ class SceneDataModule(LightningDataModule):
         workers: int = 0,
         cache: bool = False,
         streaming: bool = False,
+        encoded: str | None = None,
         on_bad: str = "skip",
         most_bad: float = 0.1,
         seed: int = 0,
@@ -77,6 +80,9 @@ class SceneDataModule(LightningDataModule):
         check_policy(on_bad)
         if mask_threshold is not None and not 0 < mask_threshold <= 1:
             raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
+        if encoded is not None and (color_jitter is not None or mirroring or streaming):
+            asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
+            raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -84,15 +90,13 @@ class SceneDataModule(LightningDataModule):
         self.evaluation_batch_size = evaluation_batch_size
         self.references_per_sequence = references_per_sequence
         self.mask_threshold = mask_threshold
-        self.augment = partial(
-            augment,
-            color_jitter=None if color_jitter is None else ColorJitter(**color_jitter),
-            box_masks=None if box_masks is None else BoxMasks(**box_masks),
-            mirroring=mirroring,
-        )
+        jitter = None if color_jitter is None else ColorJitter(**color_jitter)
+        self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
+        self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
         self.workers = workers
         self.cache = cache
         self.streaming = streaming
+        self.encoded = None if encoded is None else Path(encoded)
         self.policy = on_bad, most_bad
         self.seed = seed
         self._sources: dict[str, SequenceSource] = {}
@@ -134,10 +138,12 @@ class SceneDataModule(LightningDataModule):
         """List the sequences (pictures are read later).
 
         Raises:
-            DataError: missing or malformed files, or no sequences for this stage.
+            DataError: missing or malformed files, no sequences for this stage, or encodings of other data.
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
+        if stage == "fit" and self.encoded is not None:
+            self._training_scenes()  # what is wrong with the encodings is told before training starts
 
     def source(self, split: str) -> SequenceSource:
         """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
@@ -156,12 +162,6 @@ class SceneDataModule(LightningDataModule):
             raise source.refused[0]
         return source
 
-    def _tell(self, split: str, source: SequenceSource) -> None:
-        left_out = "".join(f"; {len(names)} left out: {reason}" for reason, names in source.left_out.items())
-        logger.info("%s: %d sequences%s", split, len(source.names), left_out)
-        if source.refused:
-            logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-
     def store(self, split: str) -> SceneStore:
         """The scenes of a split.
 
@@ -173,20 +173,40 @@ class SceneDataModule(LightningDataModule):
             names = self.evaluated_names(split, source.names)
             if not names:
                 raise DataError(f"no {split} sequences that can be used", str(self.root))
-            self._tell(split, source)
+            left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
+            logger.info("%s: %d sequences%s", split, len(source.names), left_out)
+            if source.refused:
+                logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
             self._stores[split] = SceneStore(source, names, self.mask_threshold, self.cache)
         return self._stores[split]
 
+    @cached_property
+    def encoded_store(self) -> EncodedStore:
+        """The encoded pictures of `encoded`, which must be those of this training set.
+
+        Raises:
+            DataError: there are none, or they are damaged, or of other data or made with other settings.
+        """
+        assert self.encoded is not None
+        store = EncodedStore(self.encoded)
+        store.must_belong_to(self.source("train"), self.prepared_settings())
+        return store
+
     def train_dataloader(self) -> SceneLoader:
         """Random views of all training sequences, in random order."""
-        scenes = TrainingScenes(
-            self.store("train"), self.training_views, self.augment, self.references_per_sequence, self.seed
-        )
+        scenes = self._training_scenes()
         if self.streaming:
             streamed = self._streamed(scenes)
             return SceneLoader(streamed, self.batch_size, streamed, self.workers, *self.policy)
         sampler = EpochSampler(scenes.groups(), self.seed)
         return SceneLoader(scenes, self.batch_size, sampler, self.workers, *self.policy)
+
+    def _training_scenes(self) -> TrainingScenes:
+        drawing = self.store("train"), self.training_views
+        counting = self.references_per_sequence, self.seed
+        if self.encoded is not None:
+            return EncodedTraining(self.encoded_store, *drawing, self.box_masks, *counting)
+        return TrainingScenes(*drawing, self.augment, *counting)
 
     def _streamed(self, scenes: TrainingScenes) -> StreamedScenes:
         source = self.source("train")
@@ -222,29 +242,9 @@ class SceneDataModule(LightningDataModule):
         Raises:
             DataError: none of them can be read.
         """
-        chosen = list(self._excerpts())
-        if not chosen:
-            raise DataError("no training sequence can be read", str(self.root))
-        return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
+        with at(file=self.root):
+            return mean_camera(self.store("train"))
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
         """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
-        store = self.store("train")
-        total, count = torch.zeros(3, self.image_size, self.image_size, dtype=torch.float64), 0
-        for sequence, frames in self._excerpts():
-            for frame in frames:
-                with suppress(DataError):
-                    total += store.image(sequence, frame)
-                    count += 1
-        return (total / (255 * max(count, 1))).float()
-
-    def _excerpts(self) -> Iterator[tuple[PosedSequence, list[int]]]:
-        """The first sequences that can be read, each with evenly spaced frames."""
-        store = self.store("train")
-        names = store.names[:SEQUENCES_OF_MEANS]
-        most = PICTURES_OF_MEANS // len(names)
-        for name in names:
-            with suppress(DataError):
-                sequence = store.source.read(name)
-                count = len(sequence.frames)
-                yield sequence, sorted({i * count // most for i in range(most)})
+        return mean_image(self.store("train"), self.image_size)

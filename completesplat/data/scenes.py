@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.data.view_selection import draws
 from completesplat.errors import DataError
-from completesplat.scene import SceneBatch, Views
+from completesplat.scene import EncodedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
 # So many other items are tried in the place of one that cannot be read.
@@ -25,7 +25,7 @@ Choice = tuple[int, list[int]]  # reference, targets
 class Loaded(NamedTuple):
     """A scene, or a batch of them, and what could not be read on the way."""
 
-    scenes: SceneBatch | None
+    scenes: SceneBatch | EncodedScene | None
     refused: tuple[DataError, ...]
 
 
@@ -123,12 +123,19 @@ class TrainingScenes(Dataset[Loaded]):
         refused: list[DataError] = []
         for _ in range(ATTEMPTS):
             try:
-                sequence = self.store.source.read(self.store.names[index // self.references])
-                return Loaded(self.make(sequence, rng), tuple(refused))
+                return Loaded(self.draw(self.store.names[index // self.references], rng), tuple(refused))
             except DataError as error:
                 refused.append(error)
                 index = int(rng.integers(len(self)))
         return Loaded(None, tuple(refused))
+
+    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | EncodedScene:
+        """A scene of random views of the sequence of this name.
+
+        Raises:
+            DataError: the sequence or a picture cannot be read.
+        """
+        return self.make(self.store.source.read(name), rng)
 
     def make(self, sequence: PosedSequence, rng: np.random.Generator) -> SceneBatch:
         """A scene of random views of a sequence.

@@ -1,10 +1,37 @@
-"""Feature encoders F_feat of the reference image: phi_ref = F_feat(I_ref) (paper, Section 3.3)."""
+"""Feature encoders F_feat of the reference image: phi_ref = F_feat(I_ref) (paper, Section 3.3).
+
+`frozen` tells whether an encoder stays as it is in training, so that its features may be computed once and kept.
+"""
 
 from collections.abc import Sequence
+from typing import Any
 
+import torch
 from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.pretrained import (
+    CONFIG_FILE,
+    _current_name,
+    _mismatch,
+    _needed_settings,
+    _read_config,
+    _read_weights,
+    _vae_folder,
+)
+from completesplat.errors import WeightsError
+
+STABLE_DIFFUSION_SCALE = 0.18215
+"""Of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
+
+# What the reader of VAEs calls settings, and where they are set for a conditioning.
+SETTINGS = {
+    "autoreconstructor.encoder.latent_channels=": "conditioning.out_channels=",
+    "autoreconstructor.encoder.": "conditioning.",
+    "autoreconstructor.pretrained=": "conditioning.pretrained=",
+}
 
 
 class LearnedConditioning(nn.Module):
@@ -18,6 +45,8 @@ class LearnedConditioning(nn.Module):
         layers_per_block: residual blocks per level.
         norm_groups: groups of the group normalisation.
     """
+
+    frozen = False
 
     def __init__(
         self,
@@ -41,3 +70,71 @@ class LearnedConditioning(nn.Module):
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Features of sRGB images in [0, 1], at the latent's resolution."""
         return self.network(images * 2 - 1)
+
+
+class StableDiffusionConditioning(nn.Module):
+    """The encoder of Stable Diffusion's original VAE, frozen: the posterior's mean times 0.18215, as in Marigold.
+
+    This is not the autoreconstructor's encoder, which training has changed.
+
+    Args:
+        pretrained: folder or hub id of the VAE in diffusers' layout; None where a checkpoint supplies the weights.
+        out_channels: channels of phi_ref, which are the VAE's latent channels.
+        channels, layers_per_block, norm_groups: the VAE's sizes, see `Encoder`.
+
+    Raises:
+        WeightsError: the pretrained weights are missing, damaged or of another size.
+    """
+
+    frozen = True
+
+    def __init__(
+        self,
+        pretrained: str | None = None,
+        out_channels: int = 4,
+        channels: Sequence[int] = (128, 256, 512, 512),
+        layers_per_block: int = 2,
+        norm_groups: int = 32,
+    ) -> None:
+        super().__init__()
+        self.pretrained = pretrained
+        self.out_channels = out_channels
+        self.encoder = Encoder(channels, layers_per_block, out_channels, norm_groups)
+        if pretrained is not None:
+            _load_encoder(self.encoder, pretrained)
+        self.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> "StableDiffusionConditioning":
+        """Stay in evaluation mode."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
+        """Features of sRGB images in [0, 1], at an eighth of their resolution."""
+        posterior, _ = self.encoder(images)
+        return posterior.mean * STABLE_DIFFUSION_SCALE
+
+
+def _load_encoder(encoder: Encoder, source: str) -> None:
+    try:
+        _load_encoder_only(encoder, source)
+    except WeightsError as error:
+        message = str(error)
+        for theirs, ours in SETTINGS.items():
+            message = message.replace(theirs, ours)
+        raise WeightsError(message) from error
+
+
+def _load_encoder_only(encoder: Encoder, source: str) -> None:
+    """As `load_pretrained`, of the encoder's half."""
+    folder = _vae_folder(source)
+    config = _read_config(folder / CONFIG_FILE)
+    # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
+    own = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv})
+    every = {_current_name(name): value for name, value in _read_weights(folder).items()}
+    weights = {name: value for name, value in every.items() if name.startswith(tuple(f"{part}." for part in own))}
+    groups: Any = encoder.network.conv_norm_out
+    mismatch = _mismatch(weights, own.state_dict(), config.get("norm_num_groups", 32), groups.num_groups)
+    if mismatch:
+        raise WeightsError(f"{folder}: {mismatch}; {_needed_settings(config)}")
+    own.load_state_dict(weights)

@@ -1,16 +1,32 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from diffusers import DDIMScheduler
 from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.diffusion.guidance import Denoise, guided_noise
+from completesplat.errors import CompleteSplatError
+
+OnStep = Callable[[int, int, Tensor], None]
+"""(number of the denoiser call, timestep, estimate of the clean latent)."""
+
+# What a denoiser was trained with, whatever sampler draws from it.
+FORWARD_PROCESS = (
+    "num_train_timesteps",
+    "beta_start",
+    "beta_end",
+    "beta_schedule",
+    "trained_betas",
+    "prediction_type",
+)
 
 
 class Sampler:
-    """Reverse diffusion with one of diffusers' schedulers.
+    """Reverse diffusion with one of diffusers' schedulers that draw no noise of their own.
 
     Args:
         scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
@@ -29,25 +45,73 @@ class Sampler:
         conditioning: Float[Tensor, "batch features height width"],
         guidance_weight: float = 0.0,
         steps: int | None = None,
+        on_step: OnStep | None = None,
     ) -> Float[Tensor, "batch channel height width"]:
-        """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone."""
+        """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone.
+
+        A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
+        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them with what the
+        prediction says about the clean latent.
+
+        Raises:
+            CompleteSplatError: a number of steps that the scheduler cannot make.
+        """
         scheduler = self.scheduler
-        scheduler.set_timesteps(steps or self.steps, device=noise.device)
+        self._set_steps(self.steps if steps is None else steps, noise.device)
         latent = noise * scheduler.init_noise_sigma
-        for timestep in scheduler.timesteps:
-            batched = timestep.expand(len(noise))
+        for index, timestep in enumerate(scheduler.timesteps):
+            level = timestep.round().long()
             inputs = scheduler.scale_model_input(latent, timestep)
-            predicted = guided_noise(denoise, inputs, batched, conditioning, guidance_weight)
+            predicted = guided_noise(denoise, inputs, level.expand(len(noise)), conditioning, guidance_weight)
+            if on_step is not None:
+                on_step(index, int(level), self.estimate(inputs, predicted, level))
             latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
+
+    def _set_steps(self, steps: int, device: torch.device) -> None:
+        if not 1 <= steps <= self.training_timesteps:
+            raise CompleteSplatError(f"steps={steps}: must lie between 1 and {self.training_timesteps}")
+        if isinstance(self.scheduler, DDIMScheduler) and self.training_timesteps % steps:
+            # It goes down by whole timesteps, and would end each step at a noise level that the next does not start at.
+            raise CompleteSplatError(
+                f"steps={steps}: DDIM's must divide {self.training_timesteps} (10, 20, 25, 40, 50, ...); "
+                "sampler=dpm20 takes any number"
+            )
+        self.scheduler.set_timesteps(steps, device=device)
+
+    def estimate(
+        self, noisy_latent: Float[Tensor, "batch channel height width"], predicted: Tensor, timestep: Tensor
+    ) -> Float[Tensor, "batch channel height width"]:
+        """The clean latent h that a prediction stands for, with h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps.
+
+        Raises:
+            CompleteSplatError: an unknown prediction type.
+        """
+        alpha_bar = self.scheduler.alphas_cumprod.to(noisy_latent)[timestep]
+        signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+        kind = self.scheduler.config.prediction_type
+        if kind == "epsilon":
+            return (noisy_latent - noise * predicted) / signal
+        if kind == "v_prediction":
+            return signal * noisy_latent - noise * predicted
+        if kind == "sample":
+            return predicted
+        raise CompleteSplatError(f"sampler.scheduler.prediction_type={kind}: unknown")
 
     def add_noise(
         self, latent: Float[Tensor, "batch channel height width"], noise: Tensor, timestep: Tensor
     ) -> Float[Tensor, "batch channel height width"]:
         """The forward process h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps (paper, Eq. 2)."""
-        return self.scheduler.add_noise(latent, noise, timestep)
+        alpha_bar = self.scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
+        return alpha_bar.sqrt() * latent + (1 - alpha_bar).sqrt() * noise
 
     @property
     def training_timesteps(self) -> int:
         """T, the number of noise levels of the forward process."""
         return self.scheduler.config.num_train_timesteps
+
+
+def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
+    """A sampler's configuration with the noise schedule and the prediction type of the one trained with."""
+    kept = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
+    return {**sampler, "scheduler": {**sampler["scheduler"], **kept}}

@@ -3,80 +3,170 @@
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
-from completesplat.diffusion.latents import measure_scale
-from completesplat.errors import WeightsError
+from completesplat.diffusion.objective import target
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
-from completesplat.scene import SceneBatch
+from completesplat.scene import EncodedScene, SceneBatch
 from completesplat.training.checkpoints import load_part
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.encoding import check_cache, latent_draw
+from completesplat.training.scene_module import SceneModule, prepare_network
+
+LOSS_BUCKETS = 4
+"""Equal ranges of timesteps, for each of which the loss is logged."""
 
 
 class LatentDiffusion(SceneModule):
     """Train the denoiser and a learned conditioning to predict the noise in latents (paper, Eqs. 2 and 3).
 
+    Batches are scenes, or scenes that were encoded beforehand; both train the same.
+
     Args:
         completesplat: the whole generator, its autoreconstructor still without weights.
-        autoreconstructor_checkpoint: a checkpoint of stage 1, needed to train.
+        autoreconstructor_checkpoint: a checkpoint of stage 1 to start from.
+        checkpoint: of this stage, to start from instead (for masked diffusion): all weights, averaged ones if it has
+            them, and what was measured.
         unconditional_probability: how often phi_ref is zeroed, for guidance (0.2 in the paper).
         skip_weight, guidance_weight: settings of the samples drawn in validation and test.
         scale_batches: training batches on which the latents' scale is measured.
+        channels_last, compile: of the denoiser, see `prepare_network`.
         **rendering_and_optimization: see `SceneModule`.
+
+    Raises:
+        WeightsError: a checkpoint is unusable, or both are given.
     """
 
     def __init__(
         self,
         completesplat: CompleteSplat,
         autoreconstructor_checkpoint: str | None = None,
+        checkpoint: str | None = None,
         unconditional_probability: float = 0.2,
         skip_weight: float = 1.0,
         guidance_weight: float = 0.0,
         scale_batches: int = 50,
+        channels_last: bool = False,
+        compile: bool = False,
         **rendering_and_optimization: Any,
     ) -> None:
         super().__init__(**rendering_and_optimization)
         self.completesplat = completesplat
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
+        self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
         self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
+        if autoreconstructor_checkpoint is not None and checkpoint is not None:
+            raise WeightsError("model.checkpoint holds stage 1 as well: set model.autoreconstructor_checkpoint=null")
         if autoreconstructor_checkpoint is not None:
             load_part(completesplat.autoreconstructor, autoreconstructor_checkpoint, prefix="model.")
+        if checkpoint is not None:
+            load_part(completesplat, checkpoint, prefix="completesplat.")
+        self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        prepare_network(completesplat.denoiser, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Measure what the training set alone tells: the latents' scale, and the camera of a typical photograph."""
-        if self.autoreconstructor_checkpoint is None:
-            raise WeightsError("stage 2 needs stage 1: give model.autoreconstructor_checkpoint=FILE")
+        """Measure what the training set alone tells: the latents' scale, and the camera of a typical photograph.
+
+        Raises:
+            WeightsError: frozen parts have no weights.
+        """
+        if self.checkpoint is None and self.trainer.ckpt_path is None:
+            self._refuse_random_parts()
         parts = self.completesplat
-        if parts.latent_scale != 1:  # a resumed run keeps what it measured
-            return
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
-        loader = data.train_dataloader()
-        batches = (scenes.reference.images for _, scenes in zip(range(self.scale_batches), loader, strict=False))
-        scale = measure_scale(lambda images: parts.encode(images.to(self.device)).latent, batches)
-        parts.latent_scale.fill_(scale)
+        if data.encoded is not None:
+            check_cache(data.encoded_store, parts.autoreconstructor, data.source("train"), parts.conditioning)
+        if parts.latent_scale != 1:  # a continued run keeps what it measured
+            return
+        self._measure_latents(data.train_dataloader(), data.encoded_store.scale if data.encoded is not None else None)
         camera = data.typical_camera()
         parts.fov_degrees.fill_(camera.fov_degrees)
         parts.depth_range.copy_(torch.tensor(camera.depth_range))
         parts.up.copy_(torch.tensor(camera.up))
 
-    def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
+    def _refuse_random_parts(self) -> None:
+        """Without a checkpoint of this stage, each frozen part needs one of its own."""
+        if self.autoreconstructor_checkpoint is None:
+            raise WeightsError("stage 2 needs stage 1: give model.autoreconstructor_checkpoint=FILE")
+        conditioning = self.completesplat.conditioning
+        if conditioning.frozen and conditioning.pretrained is None:
+            raise WeightsError(
+                "the frozen conditioning needs weights: give conditioning.pretrained=DIR (of Stable Diffusion's VAE), "
+                "or train one with conditioning=learned"
+            )
+
+    @torch.no_grad()
+    def _measure_latents(self, loader: Any, scale: float | None) -> None:
+        """Set the factor that gives latents unit standard deviation over all elements, and log what they are like.
+
+        The paper does not say how its latents are scaled; the factor is measured and stored with the weights. A cache
+        knows its exact value, `scale`.
+        """
+        drawn = []
+        for _, batch in zip(range(self.scale_batches), loader, strict=False):
+            latent, condition = self.inputs(batch.to(self.device))
+            if latent.shape[-2:] != condition.shape[-2:]:
+                raise CompleteSplatError(
+                    f"latents are {_size(latent)} and the conditioning's features {_size(condition)} in size: "
+                    "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
+                )
+            drawn.append(latent.double().cpu())
+        latents = torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)
+        deviation = latents.std(correction=0).item()
+        if not deviation > 0:
+            raise CompleteSplatError("the latents do not vary: no training pictures, or an encoder that ignores them")
+        self.completesplat.latent_scale.fill_(scale or 1 / deviation)
+        values = {"latent_scale": scale or 1 / deviation, "latents/std": deviation}
+        values |= {f"latents/mean_{i}": mean for i, mean in enumerate(latents.mean((0, 2, 3)).tolist())}
+        values |= {f"latents/std_{i}": std for i, std in enumerate(latents.std((0, 2, 3), correction=0).tolist())}
+        for logger in self.trainer.loggers:
+            logger.log_metrics(values, step=self.trainer.global_step)
+
+    def inputs(
+        self, batch: SceneBatch | EncodedScene
+    ) -> tuple[Float[Tensor, "batch channel height width"], Float[Tensor, "batch features _ _"]]:
+        """A draw of the scaled latents, and phi_ref.
+
+        What was encoded beforehand has pictures for a conditioning that is trained, features of one that is frozen.
+        """
         parts = self.completesplat
-        images = scenes.reference.images
-        latent = parts.encode(images).latent
-        conditioning = parts.conditioning(images * scenes.visible)
-        kept = torch.rand(len(images), device=self.device) >= self.unconditional_probability
+        if isinstance(batch, SceneBatch):
+            latent = parts.encode(batch.reference.images).latent
+            return latent, parts.conditioning(batch.reference.images * batch.visible)
+        latent = latent_draw(batch, parts.latent_scale)
+        return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
+
+    def training_step(self, batch: SceneBatch | EncodedScene, index: int) -> Float[Tensor, ""]:
+        parts = self.completesplat
+        latent, conditioning = self.inputs(batch)
+        kept = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * kept[:, None, None, None]
-        noise = torch.randn_like(latent)
-        timestep = torch.randint(parts.sampler.training_timesteps, (len(images),), device=self.device)
-        predicted = parts.denoiser(parts.sampler.add_noise(latent, noise, timestep), timestep, conditioning)
-        loss = torch.nn.functional.mse_loss(predicted, noise)
-        self.log("train/loss", loss.detach(), batch_size=len(images))
-        return loss
+        noise = torch.randn(latent.shape, device=self.device)  # like the latent's, it would depend on its memory layout
+        timestep = torch.randint(parts.sampler.training_timesteps, (len(latent),), device=self.device)
+        noisy = parts.sampler.add_noise(latent, noise, timestep)
+        predicted = parts.denoiser(
+            noisy.contiguous(memory_format=self.memory_format),
+            timestep,
+            conditioning.contiguous(memory_format=self.memory_format),
+        )
+        errors = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
+        self.log_loss(errors.detach(), timestep)
+        return errors.mean()
+
+    def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
+        """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
+        self.log("train/loss", errors.mean(), batch_size=len(errors))
+        trainer: Any = self.trainer
+        if (self.global_step + 1) % trainer.log_every_n_steps == 0:
+            values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)
+            # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.
+            for logger in self.loggers:
+                logger.log_metrics(values, step=self.global_step)
 
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
         """One sample for each reference image."""
@@ -86,5 +176,18 @@ class LatentDiffusion(SceneModule):
             scenes.depth_range,
             skip_weight=self.skip_weight,
             guidance_weight=self.guidance_weight,
+            visible=scenes.visible,
             seed=seed,
         )
+
+
+def losses_by_timestep(
+    errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"], timesteps: int
+) -> dict[str, float]:
+    """Mean loss of the samples in each of four equal ranges of timesteps; ranges without samples are left out."""
+    buckets = timestep * LOSS_BUCKETS // timesteps
+    return {f"train/loss_t{i}": errors[buckets == i].mean().item() for i in sorted(set(buckets.tolist()))}
+
+
+def _size(images: Tensor) -> str:
+    return "x".join(map(str, images.shape[-2:]))

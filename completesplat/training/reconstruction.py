@@ -21,6 +21,8 @@ class ReconstructionModule(SceneModule):
         model: images -> `Reconstruction`: the Variational AutoReconstructor or a baseline.
         loss: weighted terms by name.
         checkpoint: of an earlier stage, whose weights this one starts from.
+        masked: the model sees the visible part of the reference picture only (`data.box_masks`), and is to complete it;
+            it is compared with whole pictures. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `SceneModule`.
     """
@@ -30,6 +32,7 @@ class ReconstructionModule(SceneModule):
         model: nn.Module,
         loss: WeightedSum,
         checkpoint: str | None = None,
+        masked: bool = False,
         channels_last: bool = False,
         compile: bool = False,
         **rendering_and_optimization: Any,
@@ -37,6 +40,7 @@ class ReconstructionModule(SceneModule):
         super().__init__(**rendering_and_optimization)
         self.model = model
         self.loss = loss
+        self.masked = masked
         if checkpoint is not None:
             load_part(model, checkpoint, prefix="model.")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
@@ -44,7 +48,8 @@ class ReconstructionModule(SceneModule):
 
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Splatter Images, and posteriors if the model has any, from the reference images alone."""
-        return self.model(scenes.reference.images.contiguous(memory_format=self.memory_format))
+        images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
+        return self.model(images.contiguous(memory_format=self.memory_format))
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         reconstruction = self(scenes)

@@ -8,8 +8,6 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
-from completesplat.scene import SceneBatch
-
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
 STATUS = Path("/proc/self/status")
 KIBIBYTES_OF_GIBIBYTE = 1024**2
@@ -48,7 +46,7 @@ class Throughput(Callback):
             self.paused += _now(pl_module) - self.pause
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: SceneBatch, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         self.scenes += len(batch.names)
         stepped, self.step = trainer.global_step != self.step, trainer.global_step

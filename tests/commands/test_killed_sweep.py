@@ -16,7 +16,7 @@ JOBS = ["ablation-full+seed-0", "ablation-full+seed-1", "ablation-m1+seed-0", "a
 
 def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
     script = folder / "completesplat"
-    script.write_text("from completesplat.cli import main; main()")
+    script.write_text("from completesplat.cli import main\n\nif __name__ == '__main__':\n    main()\n")
     arguments = [
         "fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, "trainer.max_steps=60", f"out={out}",
         "callbacks.checkpoint.every_n_train_steps=3", "autoreconstructor.encoder.channels=[8,8,16,16]",

@@ -71,3 +71,75 @@ def test_any_kind_of_picture_is_accepted(command, pipeline, tmp_path, mode):
     image = tmp_path / "picture.png"
     Image.new(mode, (50, 40), 30000 if mode == "I;16" else 0).save(image)
     assert predict(command, pipeline, tmp_path / "out", image=image).status == 0
+
+
+BOX = "box=[0.5,0,1,1]"
+
+
+def test_what_a_box_hides_has_no_influence(command, pipeline, tmp_path):
+    """The picture is larger than the model's, and resized: its border pixels mix with their neighbours."""
+    rng = np.random.default_rng(0)
+    one = rng.integers(0, 256, (100, 120, 3), dtype=np.uint8)
+    other = one.copy()
+    other[:, 60:110] = 255 - one[:, 60:110]  # the box, in the central square's pixels 10 to 110
+    found = []
+    for name, pixels in (("one", one), ("other", other)):
+        (tmp_path / name).mkdir()
+        Image.fromarray(pixels).save(tmp_path / name / "picture.png")
+        image = tmp_path / name / "picture.png"
+        assert predict(command, pipeline, tmp_path / name / "out", BOX, image=image).status == 0
+        found.append(hashes(tmp_path / name / "out/picture"))
+    assert found[0] == found[1]
+    scene = strict_json(tmp_path / "one/out/picture/scene.json")["settings"]
+    assert (scene["box"], scene["mask"], scene["skip_weight"]) == ([0.5, 0, 1, 1], None, 0)
+
+
+def test_a_mask_hides_what_a_box_hides(command, pipeline, tmp_path):
+    pixels = np.zeros((32, 32), np.uint8)
+    pixels[:, 16:] = 255
+    Image.fromarray(pixels).save(tmp_path / "mask.png")
+    found = []
+    for setting in (BOX, f"mask={tmp_path / 'mask.png'}", "skip_weight=0"):
+        assert predict(command, pipeline, tmp_path / str(len(found)), setting).status == 0
+        found.append(hashes(tmp_path / str(len(found)) / pipeline.photograph().stem))
+    assert set(found[0]) == set(found[1])
+    assert splats(tmp_path / "0", pipeline) == splats(tmp_path / "1", pipeline) != splats(tmp_path / "2", pipeline)
+
+
+def splats(out: Path, pipeline) -> bytes:
+    """A sample without the settings that its file records."""
+    return PlyData.read(out / pipeline.photograph().stem / "sample_00.ply")["vertex"].data.tobytes()
+
+
+@pytest.mark.parametrize(("name", "scheduler"), [("dpm20", "DPMSolverMultistepScheduler"), (None, "DDIMScheduler")])
+def test_the_sampler_can_be_another_one(command, pipeline, tmp_path, name, scheduler):
+    settings = [] if name is None else [f"sampler={name}"]
+    assert predict(command, pipeline, tmp_path / "out", *settings, "steps=null", "batch=1").status == 0
+    scene = strict_json(tmp_path / "out" / pipeline.photograph().stem / "scene.json")["settings"]
+    assert scene["sampler"] == scheduler
+    # Of the configuration, or those that the weights were saved with.
+    assert scene["steps"] == (20 if name else 2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["box=[0,0,1]"], "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
+        (["box=0.5"], "box=0.5: give [x0,y0,x1,y1]"),
+        (["box=[a,b,c,d]"], "give [x0,y0,x1,y1]"),
+        (["box=[0.5,0,0.5,1]"], "needs 0 <= x0 < x1 <= 1"),
+        (["mask=nowhere.png"], "nowhere.png: no such file"),
+        (["mask=nowhere.png", BOX], "not both"),
+        ([BOX, "skip_weight=1"], "skip_weight=1: must be 0 where the picture is hidden"),
+        (["sampler=nonsense"], "nonsense"),
+        (["steps=3"], "steps=3: DDIM's must divide 1000"),
+        (["batch=0"], "batch=0: must be at least 1"),
+        (["skip_weight=2"], "skip_weight=2: must lie between 0 and 1"),
+    ],
+)
+def test_settings_without_a_meaning_are_refused_in_one_line(command, pipeline, tmp_path, settings, said):
+    finished = predict(command, pipeline, tmp_path / "out", *settings)
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith("error: ")
+    assert said in finished.err.splitlines()[-1]
+    assert not (tmp_path / "out" / pipeline.photograph().stem).exists()

@@ -151,7 +151,7 @@ def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypat
 def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:
     """Run the command as a shell would, with the modules in a folder at hand."""
     script = folder / "completesplat"
-    script.write_text("from completesplat.cli import main; main()")
+    script.write_text("from completesplat.cli import main\n\nif __name__ == '__main__':\n    main()\n")
     environment = os.environ | {"PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, script, *arguments], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]

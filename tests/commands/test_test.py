@@ -4,6 +4,8 @@ import pytest
 from omegaconf import OmegaConf
 from support import strict_json
 
+from completesplat.diffusion.sampling import Sampler
+
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
 def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, stage):
@@ -42,3 +44,26 @@ def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_pa
     OmegaConf.save(config, tmp_path / "run/config.yaml")
     checkpoint = tmp_path / "run/checkpoints/last.ckpt"
     assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}").status == 0
+
+
+def test_samples_can_be_drawn_by_another_sampler(command, pipeline, tmp_path, monkeypatch):
+    used = []
+    draw = Sampler.__call__
+
+    def watched(self, *arguments):
+        used.append((type(self.scheduler).__name__, self.steps))
+        return draw(self, *arguments)
+
+    monkeypatch.setattr(Sampler, "__call__", watched)
+    checkpoint = f"ckpt={pipeline.diffusion / 'checkpoints/last.ckpt'}"
+    assert (
+        command("test", checkpoint, "sampler=dpm10", "trainer.accelerator=cpu", f"out={tmp_path / 'out'}").status == 0
+    )
+    assert set(used) == {("DPMSolverMultistepScheduler", 10)}
+
+
+def test_a_sampler_for_a_model_without_samples_is_refused(command, pipeline, tmp_path):
+    checkpoint = f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}"
+    finished = command("test", checkpoint, "sampler=dpm10", f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert "a diffusion model is needed" in finished.err.splitlines()[-1]

@@ -1,25 +1,54 @@
-"""What a training step of stage 2 shows to which network."""
+"""What a training step of stage 2 shows to which network, draws, and logs."""
+
+import math
+from typing import Any
 
 import pytest
 import torch
 from support import tiny_generator
+from torch import nn
 
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.scene import SceneBatch, Views
-from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.scene import EncodedScene, SceneBatch, Views
+from completesplat.training.latent_diffusion import LatentDiffusion, losses_by_timestep
 
 BATCH, SIZE = 2, 32
 
 
-def scenes(visible: torch.Tensor) -> SceneBatch:
+def scenes(visible: torch.Tensor | None = None) -> SceneBatch:
     cameras = Cameras(torch.eye(4).repeat(BATCH, 2, 1, 1), pinhole(60, SIZE).repeat(BATCH, 2, 1, 1), (SIZE, SIZE))
     images = torch.rand(BATCH, 2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
     views = Views(images, cameras, torch.ones(BATCH, 2, 1, SIZE, SIZE))
     depth_range = torch.tensor([[0.5, 4.0]]).repeat(BATCH, 1)
+    visible = torch.ones(BATCH, 1, SIZE, SIZE) if visible is None else visible
     return SceneBatch(
         views[:, 0], views[:, 1:], depth_range, visible, torch.zeros(BATCH, dtype=torch.int64), ("a", "b")
     )
+
+
+def half_hidden() -> torch.Tensor:
+    visible = torch.ones(BATCH, 1, SIZE, SIZE)
+    visible[..., SIZE // 2 :] = 0
+    return visible
+
+
+def module_of(monkeypatch, generator=None, **settings) -> tuple[LatentDiffusion, dict[str, float]]:
+    """A module without a trainer, and what it logs."""
+    surroundings = {"rasterizer": ReferenceRasterizer(), "optimizer": torch.optim.SGD, "schedule": lambda *_: None}
+    module = LatentDiffusion(generator or tiny_generator(), **surroundings, **settings)
+    logged: dict[str, float] = {}
+
+    def log_loss(errors, timestep):
+        logged["train/loss"] = errors.mean().item()
+        logged.update(losses_by_timestep(errors, timestep, module.completesplat.sampler.training_timesteps))
+
+    monkeypatch.setattr(module, "log_loss", log_loss)
+    return module, logged
+
+
+def gradients(module: LatentDiffusion) -> dict[str, torch.Tensor]:
+    return {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
@@ -27,10 +56,7 @@ def test_the_conditioning_sees_the_visible_part_and_the_encoder_everything(share
     visible = torch.ones(BATCH, 1, SIZE, SIZE)
     visible[..., round(share * SIZE) :] = 0
     batch = scenes(visible)
-    module = LatentDiffusion(
-        tiny_generator(), rasterizer=ReferenceRasterizer(), optimizer=torch.optim.SGD, schedule=lambda optimizer: None
-    )
-    monkeypatch.setattr(module, "log", lambda *_, **__: None)  # There is no trainer.
+    module, _ = module_of(monkeypatch)
     seen = {}
     parts = {
         "conditioning": module.completesplat.conditioning,
@@ -43,3 +69,132 @@ def test_the_conditioning_sees_the_visible_part_and_the_encoder_everything(share
     hidden = round(share * SIZE)
     assert torch.equal(seen["conditioning"][..., :hidden], batch.reference.images[..., :hidden])
     assert (seen["conditioning"][..., hidden:] == 0).all()
+
+
+class Recorder(nn.Module):
+    """A denoiser that predicts zeros and keeps what it is given."""
+
+    latent_channels = 4
+
+    def forward(self, noisy_latent, timestep, conditioning):
+        self.noisy_latent, self.timestep, self.conditioning = noisy_latent, timestep, conditioning
+        return torch.zeros_like(noisy_latent)
+
+
+class AsItIs(nn.Module):
+    """A frozen conditioning: what was encoded beforehand is used as it is."""
+
+    frozen, pretrained = True, None
+
+
+def encoded(count: int) -> EncodedScene:
+    generator = torch.Generator().manual_seed(0)
+    mean, condition = (torch.randn(count, 4, 2, 2, generator=generator) for _ in range(2))
+    names = tuple(map(str, range(count)))
+    return EncodedScene(mean, torch.full_like(mean, -2.0), condition, torch.zeros(count, dtype=torch.int64), names)
+
+
+def recording(monkeypatch, **settings) -> tuple[LatentDiffusion, dict[str, float]]:
+    generator = tiny_generator()
+    generator.denoiser, generator.conditioning = Recorder(), AsItIs()
+    return module_of(monkeypatch, generator, **settings)
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.2, 1.0])
+def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(probability, monkeypatch):
+    count = 4000
+    batch, steps = encoded(count), []
+    for rate in (0.0, probability):
+        module, _ = recording(monkeypatch, unconditional_probability=rate)
+        torch.manual_seed(0)
+        module.training_step(batch, 0)
+        steps.append(module.completesplat.denoiser)
+    never, sometimes = steps
+    assert torch.equal(never.conditioning, batch.condition)
+    dropped = (sometimes.conditioning == 0).all((1, 2, 3))
+    assert torch.equal(sometimes.conditioning[~dropped], batch.condition[~dropped])
+    # Five standard deviations of the binomial distribution.
+    assert abs(dropped.sum() - count * probability) <= 5 * math.sqrt(count * probability * (1 - probability))
+    assert torch.equal(sometimes.noisy_latent, never.noisy_latent)
+    assert torch.equal(sometimes.timestep, never.timestep)
+
+
+@pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
+def test_the_loss_is_that_of_the_prediction_type(kind, monkeypatch):
+    """For the prediction zero it is the target's mean square: 1 for eps; h and v mix h and eps, uncorrelated."""
+    module, logged = recording(monkeypatch)
+    module.completesplat.sampler.scheduler.register_to_config(prediction_type=kind)
+    batch = encoded(4000)
+    loss = module.training_step(batch, 0).item()
+    assert logged["train/loss"] == loss
+    bar = module.completesplat.sampler.scheduler.alphas_cumprod[module.completesplat.denoiser.timestep]
+    power = batch.mean.square().mean((1, 2, 3)) + math.exp(-2)  # of a draw from the posterior
+    expected = {"epsilon": torch.ones(()), "sample": power, "v_prediction": bar + (1 - bar) * power}[kind]
+    assert loss == pytest.approx(expected.mean().item(), rel=0.03)
+
+
+def test_the_buckets_losses_average_to_the_total(monkeypatch):
+    module, logged = recording(monkeypatch)
+    total = module.training_step(encoded(64), 0).item()
+    counts = torch.bincount(module.completesplat.denoiser.timestep // 250, minlength=4).tolist()
+    assert all(counts)
+    of_buckets = [logged[f"train/loss_t{bucket}"] for bucket in range(4)]
+    assert len(set(of_buckets)) == 4
+    mean = sum(n * value for n, value in zip(counts, of_buckets, strict=True)) / 64
+    assert mean == pytest.approx(total, rel=1e-5)
+
+
+def test_a_bucket_without_samples_is_not_logged():
+    values = losses_by_timestep(torch.tensor([1.0, 3.0, 5.0]), torch.tensor([249, 250, 499]), 1000)
+    assert values == {"train/loss_t0": 1.0, "train/loss_t1": 4.0}
+
+
+@pytest.mark.parametrize("visible", [None, half_hidden()], ids=["seen", "half hidden"])
+def test_what_was_encoded_beforehand_trains_the_same(visible, monkeypatch):
+    batch = scenes(visible)
+    found = []
+    for cached in (False, True):
+        module, logged = module_of(monkeypatch)
+        parts = module.completesplat
+        parts.latent_scale.fill_(0.7)
+        inputs: Any = batch
+        if cached:
+            with torch.no_grad():
+                posterior, _ = parts.autoreconstructor.encoder(batch.reference.images)
+            picture = batch.reference.images * batch.visible
+            inputs = EncodedScene(posterior.mean, posterior.log_variance, picture, batch.reference_frame, batch.names)
+        torch.manual_seed(5)
+        module.training_step(inputs, 0).backward()
+        found.append((logged, gradients(module)))
+    (first, first_gradients), (second, second_gradients) = found
+    assert first == second
+    assert any(name.startswith("completesplat.conditioning") for name in first_gradients)
+    assert first_gradients.keys() == second_gradients.keys()
+    assert all(torch.equal(value, second_gradients[name]) for name, value in first_gradients.items())
+
+
+def test_channels_last_is_the_same_training(monkeypatch):
+    found = []
+    for channels_last in (False, True):
+        module, logged = module_of(monkeypatch, channels_last=channels_last)
+        weight = module.completesplat.denoiser.network.conv_in.weight
+        assert weight.is_contiguous(memory_format=torch.channels_last) == channels_last
+        torch.manual_seed(5)
+        module.training_step(scenes(), 0).backward()
+        found.append((logged["train/loss"], gradients(module)))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
+    for name, value in found[0][1].items():
+        torch.testing.assert_close(found[1][1][name], value, atol=1e-4, rtol=1e-3, msg=name)
+
+
+def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(monkeypatch):
+    compiled = []
+
+    def compiler(call, **options):
+        return lambda *inputs: compiled.append(1) or call(*inputs)
+
+    monkeypatch.setattr(torch, "compile", compiler)
+    module, _ = module_of(monkeypatch, compile=True)
+    assert module.state_dict().keys() == module_of(monkeypatch)[0].state_dict().keys()
+    module.training_step(scenes(), 0)
+    assert compiled == [1]

@@ -4,6 +4,7 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from scenes_for_training import scene_batch
 from support import compose_config
 
 from completesplat.errors import WeightsError
@@ -30,3 +31,22 @@ def test_weights_of_another_architecture_are_no_start(pipeline):
         module(f"model.checkpoint={checkpoint}", "ablation=m1")
     assert isinstance(caught.value.__cause__, WeightsError)
     assert "another architecture" in str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
+    """Boxes reach the model only where it is told so, and never what it is compared with."""
+    scenes = scene_batch()
+    scenes.visible[..., 4:12, 2:9] = 0
+    trained = module(f"model.masked={str(masked).lower()}", "autoreconstructor.encoder.channels=[8,8,16,16]")
+    monkeypatch.setattr(trained, "log_dict", lambda *_, **__: None)  # There is no trainer.
+    monkeypatch.setattr(type(trained), "global_step", 0)
+    seen, compared = [], []
+    trained.model.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    loss = trained.loss
+    trained.loss = lambda prediction, views, step: compared.append(views.images) or loss(prediction, views, step)
+    trained.training_step(scenes, 0)
+    images = scenes.reference.images
+    assert torch.equal(seen[0], images * scenes.visible if masked else images)
+    assert torch.equal(compared[0], scenes.all_views().images)
+    assert (compared[0][:, 0][..., 4:12, 2:9] > 0).any()

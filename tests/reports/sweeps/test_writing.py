@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from completesplat.reports.sweeps.latex import escape
-from completesplat.reports.sweeps.summary import summarize
 from completesplat.reports.sweeps.rows import IDENTITY
+from completesplat.reports.sweeps.summary import summarize
 from completesplat.reports.sweeps.writing import show_summary, write_summary
 
 FILES = ["summary.csv", "summary.md", "summary.png", "summary.tex"]

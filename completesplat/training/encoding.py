@@ -1,0 +1,235 @@
+"""The latent cache: a training set encoded once by the frozen autoreconstructor, and latents drawn from it."""
+
+import hashlib
+import logging
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped, UInt8
+from torch import Tensor, nn
+
+from completesplat import __version__
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.data.encoded.arrays import ArrayWriter
+from completesplat.data.encoded.manifest import Array, Manifest, Origin, is_encoded, write_manifest
+from completesplat.data.encoded.pictures import Picture, Reading, check_space
+from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.module import SceneDataModule
+from completesplat.data.prepared.manifest import Refusal
+from completesplat.data.sequences import SequenceSource
+from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.scene import EncodedScene
+
+PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
+
+logger = logging.getLogger(__name__)
+
+
+def latent_draw(batch: EncodedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
+    """One draw of each scaled latent: the same noise as `CompleteSplat.encode` draws."""
+    return Posterior(batch.mean, batch.log_variance).sample() * scale
+
+
+def fingerprint(module: nn.Module) -> str:
+    """SHA-256 (hexadecimal) of a module's weights: names, types, shapes and bytes."""
+    digest = hashlib.sha256()
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)} ".encode())
+        digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def check_cache(
+    store: EncodedStore,
+    autoreconstructor: VariationalAutoReconstructor,
+    source: SequenceSource,
+    conditioning: nn.Module | None = None,
+) -> None:
+    """Refuse a stale cache. (The data module compares picture sizes and all other settings of the data.)
+
+    Args:
+        source: the training set.
+        conditioning: of the model: a frozen one needs its own features, one that is trained needs pictures; None: it
+            is not looked at.
+
+    Raises:
+        WeightsError: it was made with another autoreconstructor, or with another conditioning.
+        DataError: it was made of other data, or its latents have another shape than this autoreconstructor's.
+    """
+    if store.origin.encoder != fingerprint(autoreconstructor.encoder):
+        raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
+    store.must_be_of(source)
+    device = next(autoreconstructor.parameters()).device
+    blank = torch.zeros(1, 3, store.origin.image_size, store.origin.image_size, device=device)
+    with torch.no_grad():
+        shape = tuple(autoreconstructor.encoder(blank)[0].mean.shape[1:])
+    if shape != store.latent_shape:
+        raise DataError(f"latents of {store.latent_shape}, the autoreconstructor's are {shape}", str(store.folder))
+    if conditioning is not None and store.origin.conditioning != features_fingerprint(conditioning):
+        held = "pictures" if store.holds_pictures else "features of another conditioning"
+        raise WeightsError(f"{store.folder}: holds {held}; encode the training set again with this run's conditioning")
+
+
+def features_fingerprint(conditioning: nn.Module | None) -> str | None:
+    """Of a frozen conditioning, whose features are stored; None for one that is trained on pictures, or for none."""
+    return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
+
+
+@dataclass(frozen=True)
+class PictureEncoder:
+    """Pictures -> rows of the store's arrays, by frozen networks."""
+
+    encoder: Encoder
+    conditioning: nn.Module | None
+    precision: torch.dtype
+    device: torch.device
+
+    @torch.no_grad()
+    def __call__(
+        self, pictures: UInt8[Tensor, "picture 3 size size"]
+    ) -> dict[str, Shaped[np.ndarray, "picture _ _ _"]]:
+        """ "mean", "log_variance" and "condition"."""
+        # Divided as everywhere: torch multiplies by 1 / 255 on a GPU.
+        images = torch.from_numpy(np.divide(pictures.numpy(), 255, dtype=np.float32)).to(self.device)
+        posterior, _ = self.encoder(images)
+        rows = {"mean": posterior.mean, "log_variance": posterior.log_variance}
+        if self.conditioning is None:
+            return self._stored(rows) | {"condition": pictures.numpy()}
+        return self._stored(rows | {"condition": self.conditioning(images)})
+
+    def _stored(self, rows: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        return {name: value.to(self.precision).cpu().numpy() for name, value in rows.items()}
+
+
+class Moments:
+    """Sums over all elements of what was encoded, in float64, for the standard deviation of a draw."""
+
+    def __init__(self) -> None:
+        self.count, self.total, self.squares = 0, 0.0, 0.0
+
+    def add(self, mean: Float[np.ndarray, "*any"], log_variance: Float[np.ndarray, "*any"]) -> None:
+        """Some more elements."""
+        mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
+        self.count += mean.size
+        self.total += float(mean.sum())
+        self.squares += float((np.square(mean) + variance).sum())
+
+    def scale(self) -> float:
+        """1 / std, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
+        return float((self.squares / self.count - (self.total / self.count) ** 2) ** -0.5)
+
+
+def encode_training_set(
+    autoreconstructor: VariationalAutoReconstructor,
+    data: SceneDataModule,
+    out: Path,
+    frames: int | None = None,
+    precision: str = "float32",
+    conditioning: nn.Module | None = None,
+    batch_size: int = 64,
+    workers: int = 0,
+    device: torch.device | str = "cpu",
+    progress: bool = True,
+) -> EncodedStore:
+    """Encode every frame of every training sequence, as it is without augmentation.
+
+    A finished store of the same is left as it is. What cannot be read is skipped as `data.on_bad` and `data.most_bad`
+    say. Nothing that opens is left behind by a run that was interrupted.
+
+    Args:
+        out: folder of the store.
+        frames: at most so many evenly spaced frames of a sequence; None: all.
+        precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
+            first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
+        conditioning: frozen, images -> features, which are stored; None: the pictures are.
+        batch_size: pictures that are encoded together.
+        workers: processes that read pictures; 0: none.
+
+    Raises:
+        DataError: no space, unreadable data, another store in the folder, or encodings that are not finite.
+    """
+    if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
+        raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
+    origin = _origin(autoreconstructor, data, conditioning, frames, precision)
+    if is_encoded(out):
+        return _kept(out, origin)
+    out.mkdir(parents=True, exist_ok=True)
+    features = None if conditioning is None else conditioning.to(device).eval()
+    encoder = autoreconstructor.to(device).eval().encoder
+    encode = PictureEncoder(encoder, features, PRECISIONS[precision], torch.device(device))
+    blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
+    check_space(data.source("train"), frames, sum(array.nbytes for array in blank.values()), out)
+    reading = Reading(data.source("train"), frames, workers, *data.policy, progress)
+    arrays, scale = _write_arrays(out, encode, blank, reading, batch_size)
+    refused = tuple(Refusal.of(error) for error in reading.refused)
+    write_manifest(out, Manifest(__version__, origin, scale, arrays, reading.stored(), refused))
+    return EncodedStore(out)
+
+
+def _write_arrays(
+    out: Path, encode: PictureEncoder, blank: Mapping[str, np.ndarray], reading: Reading, batch_size: int
+) -> tuple[dict[str, Array], float]:
+    """Rows like those of `blank` for all pictures; what was written, and the scale."""
+    moments = Moments()
+    with ExitStack() as files:
+        writers = {
+            name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
+            for name, rows in blank.items()
+        }
+        pictures = iter(reading)
+        while batch := list(islice(pictures, batch_size)):
+            rows = encode(torch.stack([picture.image for picture in batch]))
+            _refuse_not_finite(rows, batch)
+            moments.add(rows["mean"], rows["log_variance"])
+            for name, writer in writers.items():
+                writer.append(rows[name])
+    return {name: writer.described() for name, writer in writers.items()}, moments.scale()
+
+
+def _origin(
+    autoreconstructor: VariationalAutoReconstructor,
+    data: SceneDataModule,
+    conditioning: nn.Module | None,
+    frames: int | None,
+    precision: str,
+) -> Origin:
+    if conditioning is not None and not conditioning.frozen:
+        raise CompleteSplatError("a conditioning that is trained needs pictures, not features: leave conditioning out")
+    return Origin(
+        fingerprint(autoreconstructor.encoder),
+        features_fingerprint(conditioning),
+        data.source("train").fingerprint(),
+        data.prepared_settings(),
+        data.image_size,
+        frames,
+        precision,
+    )
+
+
+def _kept(out: Path, origin: Origin) -> EncodedStore:
+    """The finished store that is there already.
+
+    Raises:
+        DataError: it is damaged, or another one than is to be made.
+    """
+    store = EncodedStore(out)
+    if store.origin != origin:
+        raise DataError("already holds another store: choose another folder, or remove this one", str(out))
+    logger.info("%s already holds these encodings", out)
+    return store
+
+
+def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: Sequence[Picture]) -> None:
+    for name, values in rows.items():
+        finite = np.isfinite(values).all(axis=(1, 2, 3))
+        if not finite.all():
+            bad = pictures[int(finite.argmin())]
+            limits = " in float16: try precision=float32" if values.dtype == np.float16 else ""
+            raise DataError(f"its {name} is not finite{limits}", None, bad.sequence, bad.number)

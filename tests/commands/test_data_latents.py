@@ -1,0 +1,62 @@
+"""`completesplat data latents`: stage 1's run to a cache, and training from it."""
+
+import pytest
+import torch
+from support import SMALL, strict_json
+
+from completesplat.data.encoded.store import EncodedStore
+from completesplat.generation import CompleteSplat
+
+
+def test_a_run_is_encoded_once_and_trained_from(command, pipeline, tmp_path):
+    cache, checkpoint = tmp_path / "cache", pipeline.var / "checkpoints/last.ckpt"
+    made = command("data", "latents", f"ckpt={checkpoint}", f"out={cache}")
+    assert made.status == 0
+    assert made.out.splitlines()[-1] == str(cache)
+    assert "for 8 frames of 2 sequences" in made.out + made.err
+    store = EncodedStore(cache)
+    encoder = CompleteSplat.from_pretrained(pipeline.weights).autoreconstructor.encoder
+    for name, sequence in store.sequences.items():
+        assert sequence.stored == tuple(range(4))
+        scene = store.scene(name, 3)
+        with torch.no_grad():
+            posterior, _ = encoder(scene.condition[None])
+        torch.testing.assert_close(scene.mean, posterior.mean[0], rtol=1e-4, atol=1e-5)
+
+    before = (cache / "mean.npy").stat().st_mtime_ns
+    assert command("data", "latents", f"ckpt={checkpoint}", f"out={cache}").status == 0
+    assert (cache / "mean.npy").stat().st_mtime_ns == before
+
+    stage2 = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_diffusion", "sampler.steps=2", "test=false"]
+    stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.encoded={cache}"]
+    assert command("fit", *stage2, f"out={tmp_path / 'run'}").status == 0
+    assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
+
+
+@pytest.mark.parametrize(
+    ("stage", "setting", "message"),
+    [
+        ("diffusion", "frames=2", "not of stage 1"),
+        ("var", "conditioning=learned", "needs pictures"),
+        ("var", "precision=float8", "needs precision"),
+        ("var", "ckpt=gone.ckpt", "no such checkpoint"),
+    ],
+)
+def test_what_cannot_be_encoded_is_refused_in_one_line(command, pipeline, tmp_path, stage, setting, message):
+    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
+    refused = command("data", "latents", f"ckpt={checkpoint}", setting, f"out={tmp_path / 'cache'}")
+    assert refused.status == 2
+    assert len(refused.err.splitlines()) == 1
+    assert message in refused.err
+    assert not list((tmp_path / "cache").glob("*.npy"))
+
+
+def test_few_frames_and_other_settings_of_the_run_can_be_asked_for(command, pipeline, tmp_path):
+    checkpoint, cache = pipeline.var / "checkpoints/last.ckpt", tmp_path / "cache"
+    change = "overrides=['data.most_training_sequences=1']"
+    settings = [f"ckpt={checkpoint}", change, "frames=2", "precision=float16", "batch_size=1", f"out={cache}"]
+    assert command("data", "latents", *settings).status == 0
+    store = EncodedStore(cache)
+    assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)]
+    assert store.arrays["mean"].dtype == "float16"
+    assert store.arrays["condition"].dtype == "uint8"

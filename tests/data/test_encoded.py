@@ -1,0 +1,200 @@
+"""Training from an encoded store: what is drawn is what training from pictures draws."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from encoded_stores import FRAMES, broken_rooms, rooms, small_autoreconstructor, sound_rooms
+from realestate10k_trees import FORMS
+
+from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.loading import SceneLoader
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.scene import EncodedScene
+from completesplat.training.encoding import encode_training_set
+
+BOXES = {"probability": 0.7}
+
+
+@pytest.fixture(scope="module", params=FORMS)
+def root(request, tmp_path_factory) -> Path:
+    return broken_rooms(tmp_path_factory.mktemp("root"), request.param)
+
+
+@pytest.fixture(scope="module")
+def cache(root, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("cache")
+    encode_training_set(small_autoreconstructor(), rooms(root), out, progress=False)
+    return out
+
+
+def loader(root: Path, cache: Path, workers: int = 0) -> SceneLoader:
+    return rooms(root, encoded=str(cache), box_masks=BOXES, workers=workers).train_dataloader()
+
+
+def same(one: EncodedScene, other: EncodedScene) -> bool:
+    tensors = [
+        (scene.mean, scene.log_variance, scene.condition, scene.reference_frame.float()) for scene in (one, other)
+    ]
+    return one.names == other.names and all(torch.equal(a, b) for a, b in zip(*tensors, strict=True))
+
+
+def equal(one: list[EncodedScene], other: list[EncodedScene]) -> bool:
+    return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
+
+
+def epoch(batches: SceneLoader, number: int) -> list[EncodedScene]:
+    batches.sampler.set_epoch(number)
+    return list(batches)
+
+
+@pytest.mark.parametrize("references", [1, 3])
+def test_an_item_is_the_sequence_and_reference_that_pictures_give(root, cache, references):
+    settings = {"box_masks": BOXES, "references_per_sequence": references}
+    pictures = rooms(root, **settings).train_dataloader()
+    encoded = rooms(root, encoded=str(cache), **settings).train_dataloader()
+    assert [list(part) for part in encoded.sampler.groups] == [list(part) for part in pictures.sampler.groups]
+    assert len(encoded.dataset) == len(pictures.dataset) == 8 * references
+    replaced = 0
+    for key in [(number, index) for number in (0, 1) for index in range(len(pictures.dataset))]:
+        expected, found = pictures.dataset[key], encoded.dataset[key]
+        scene, reference = found.scenes, expected.scenes
+        assert (scene.names, scene.reference_frame.item()) == (reference.names, reference.reference_frame.item())
+        assert torch.equal(scene.condition, reference.reference.images * reference.visible)
+        assert len(found.refused) == len(expected.refused)
+        replaced += len(found.refused)
+    assert replaced
+
+
+def test_an_item_holds_the_encoding_of_its_reference_picture(root, cache):
+    encoder = small_autoreconstructor().encoder
+    pictures, encoded = rooms(root).train_dataloader(), rooms(root, encoded=str(cache)).train_dataloader()
+    for index in range(8):
+        with torch.no_grad():
+            posterior, _ = encoder(pictures.dataset[0, index].scenes.reference.images[None])
+        scene = encoded.dataset[0, index].scenes
+        torch.testing.assert_close(scene.mean, posterior.mean[0], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(scene.log_variance, posterior.log_variance[0], rtol=1e-4, atol=1e-5)
+
+
+def test_batches_are_stacked_items(root, cache):
+    batch = epoch(loader(root, cache), 0)[0]
+    assert batch.mean.shape == (3, 4, 2, 2)
+    assert batch.condition.shape == (3, 3, 16, 16)
+    assert len(batch.names) == len(batch.reference_frame) == 3
+    assert same(batch[0:2], batch[0:2])
+    assert batch[1].names == batch.names[1]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_do_not_change_the_batches(root, cache, workers):
+    one, other = loader(root, cache), loader(root, cache, workers)
+    epochs = [epoch(one, number) for number in (0, 1)]
+    assert not equal(*epochs)
+    for number, expected in enumerate(epochs):
+        assert equal(epoch(other, number), expected)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_resumed_epoch_continues_exactly(root, cache, workers):
+    expected = epoch(loader(root, cache), 1)
+    for done in range(3):
+        interrupted = loader(root, cache, workers)
+        interrupted.sampler.set_epoch(1)
+        batches: Iterator[EncodedScene] = iter(interrupted)
+        assert equal([next(batches) for _ in range(done)], expected[:done])
+        resumed = loader(root, cache, workers)
+        resumed.load_state_dict(interrupted.state_dict())
+        assert equal(epoch(resumed, 1), expected[done:])
+
+
+def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp_path):
+    root = sound_rooms(tmp_path / "root")
+    store = encode_training_set(small_autoreconstructor(), rooms(root), tmp_path / "cache", frames=2, progress=False)
+    assert {sequence.stored for sequence in store.manifest.sequences} == {(1, 3)}
+    pictures = rooms(root).train_dataloader()
+    encoded = rooms(root, encoded=str(tmp_path / "cache")).train_dataloader()
+    nearest = {0: 1, 1: 1, 2: 1, 3: 3, 4: 3}
+    seen = set()
+    for key in [(number, index) for number in range(6) for index in range(4)]:
+        drawn, found = pictures.dataset[key].scenes, encoded.dataset[key].scenes
+        assert found.names == drawn.names
+        assert found.reference_frame.item() == nearest[drawn.reference_frame.item()]
+        seen.add(drawn.reference_frame.item())
+    assert len(seen) > 2
+
+
+def test_what_is_missing_is_raised_if_that_is_asked_for(root, cache):
+    strict = rooms(root, encoded=str(cache), on_bad="raise")
+    with pytest.raises(DataError, match="could not be read when the training set was encoded"):
+        list(strict.train_dataloader())
+
+
+def test_validation_reads_pictures(root, cache):
+    batch = next(iter(rooms(root, encoded=str(cache)).val_dataloader()))
+    assert batch.targets.images.shape[-3:] == (3, 16, 16)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"color_jitter": {"brightness": 0.1, "contrast": 0, "saturation": 0, "hue": 0}},
+        {"mirroring": True},
+        {"streaming": True},
+    ],
+    ids=["jitter", "mirroring", "streaming"],
+)
+def test_what_would_change_pictures_is_refused(tmp_path, changes):
+    with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):
+        rooms(tmp_path, encoded="somewhere", **changes)
+
+
+class Halves(torch.nn.Module):
+    """A frozen conditioning: the mean of each quarter of a picture."""
+
+    frozen = True
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.avg_pool2d(images, 8)
+
+
+def test_features_are_given_as_they_were_stored_and_cannot_be_masked(tmp_path):
+    root, out = sound_rooms(tmp_path / "root"), tmp_path / "cache"
+    encode_training_set(small_autoreconstructor(), rooms(root), out, conditioning=Halves(), progress=False)
+    pictures, encoded = rooms(root).train_dataloader(), rooms(root, encoded=str(out)).train_dataloader()
+    expected = Halves()(pictures.dataset[0, 1].scenes.reference.images)
+    torch.testing.assert_close(encoded.dataset[0, 1].scenes.condition, expected)
+    masked = rooms(root, encoded=str(out), box_masks=BOXES)
+    with pytest.raises(CompleteSplatError, match=r"data\.box_masks cannot"):
+        masked.setup("fit")
+
+
+def test_encodings_of_other_data_are_refused_before_training(cache, root, tmp_path):
+    other = rooms(sound_rooms(tmp_path / "other"), encoded=str(cache))
+    with pytest.raises(DataError, match="made from other data"):
+        other.setup("fit")
+    with pytest.raises(DataError, match=r"image_size=16 \(asked for: 8\)"):
+        rooms(root, encoded=str(cache), image_size=8).setup("fit")
+    with pytest.raises(DataError, match=r"crop=center \(asked for: principal\)"):
+        rooms(root, encoded=str(cache), crop="principal").setup("fit")
+    rooms(root, encoded=str(cache)).setup("fit")
+    # Testing needs no encodings.
+    rooms(root, encoded=str(tmp_path / "gone")).setup("test")
+    with pytest.raises(DataError, match="no finished store"):
+        rooms(root, encoded=str(tmp_path / "gone")).setup("fit")
+
+
+def test_opening_maps_the_arrays_of_all_frames_that_can_be_read(cache, root):
+    store, names = EncodedStore(cache), rooms(root).source("train").names
+    assert all(isinstance(array, np.memmap) and array.mode == "r" for array in store.arrays.values())
+    there = {"c5": (0, 2, 3, 4), "c6": (0,), "c7": ()}
+    assert {name: sequence.stored for name, sequence in store.sequences.items()} == {
+        name: there.get(name, tuple(range(FRAMES))) for name in names
+    }
+    assert {len(array) for array in store.arrays.values()} == {
+        sum(len(there.get(name, range(FRAMES))) for name in names)
+    }
+    refused = [(entry.sequence, entry.frame) for entry in store.manifest.refused]
+    assert sorted(refused, key=str) == [("c5", 1), *[("c6", frame) for frame in range(1, FRAMES)], ("c7", 0)]

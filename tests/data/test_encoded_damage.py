@@ -1,0 +1,130 @@
+"""An encoded store that is not what was written does not open."""
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from encoded_stores import rooms, small_autoreconstructor, sound_rooms
+
+from completesplat.data.encoded.arrays import ArrayWriter, open_array
+from completesplat.data.encoded.store import EncodedStore
+from completesplat.errors import DataError
+from completesplat.training.encoding import encode_training_set
+
+ARRAYS = ("mean", "log_variance", "condition")
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("encoded")
+    encode_training_set(
+        small_autoreconstructor(), rooms(sound_rooms(folder / "root")), folder / "store", progress=False
+    )
+    return folder / "store"
+
+
+@pytest.fixture
+def copy(sound, tmp_path) -> Path:
+    return Path(shutil.copytree(sound, tmp_path / "copy"))
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+@pytest.mark.parametrize("damage", ["cut", "header", "longer", "gone", "empty"])
+def test_a_damaged_array_is_refused_by_its_name(copy, name, damage):
+    path = copy / f"{name}.npy"
+    content = path.read_bytes()
+    changed = {"cut": content[:-1], "header": content[:40], "longer": content + b"x", "empty": b""}
+    path.unlink() if damage == "gone" else path.write_bytes(changed[damage])
+    with pytest.raises(DataError) as caught:
+        EncodedStore(copy)
+    assert caught.value.file == str(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_another_array_of_the_same_name_is_refused(copy, name):
+    np.save(copy / f"{name}.npy", np.zeros((3, 4), np.float32))
+    with pytest.raises(DataError, match="not the array that the manifest describes"):
+        EncodedStore(copy)
+
+
+def test_arrays_of_objects_are_not_loaded(copy):
+    np.save(copy / "mean.npy", np.array([{}, []], dtype=object), allow_pickle=True)
+    with pytest.raises(DataError):
+        EncodedStore(copy)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("format",), 99),
+        (("kind",), "prepared"),
+        (("scale",), "1.0"),
+        (("scale",), -1.0),
+        (("sequences",), {}),
+        (("sequences", 0, "stored"), [0, 0]),
+        (("sequences", 0, "stored"), [1]),
+        (("sequences", 0, "frames"), 2),
+        (("sequences", 0, "first"), 10**6),
+        (("sequences", 0, "first"), -1),
+        (("sequences", 0, "name"), "c1"),
+        (("sequences", 1, "name"), None),
+        (("arrays", "mean", "file"), "../mean.npy"),
+        (("arrays", "mean", "dtype"), "object"),
+        (("arrays", "mean", "shape"), [20, 4, 2]),
+        (("arrays", "condition"), None),
+        (("origin", "frames"), "all"),
+        (("origin",), None),
+    ],
+)
+def test_a_manifest_that_cannot_be_true_is_refused(copy, place, value):
+    path = copy / "manifest.json"
+    content = json.loads(path.read_text())
+    names = sorted(entry["name"] for entry in content["sequences"])
+    entry = content
+    for key in place[:-1]:
+        entry = entry[key]
+    entry[place[-1]] = names[1] if value == "c1" and content["sequences"][0]["name"] != names[1] else value
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError):
+        EncodedStore(copy)
+
+
+def test_a_manifest_that_is_cut_short_is_refused(copy):
+    path = copy / "manifest.json"
+    path.write_text(path.read_text()[:-20])
+    with pytest.raises(DataError, match="not a JSON file"):
+        EncodedStore(copy)
+    path.unlink()
+    with pytest.raises(DataError, match="no finished store"):
+        EncodedStore(copy)
+
+
+def test_a_store_goes_to_other_processes_without_its_arrays(sound):
+    store = EncodedStore(sound)
+    again = pickle.loads(pickle.dumps(store))
+    assert len(pickle.dumps(store)) < 1000
+    assert all(isinstance(array, np.memmap) for array in again.arrays.values())
+    assert again.manifest == store.manifest
+
+
+@pytest.mark.parametrize("parts", [[], [1], [3, 0, 100_000]])
+def test_rows_are_read_as_they_were_written(tmp_path, parts):
+    rng = np.random.default_rng(0)
+    blocks = [rng.normal(size=(count, 1, 2, 1)).astype(np.float16) for count in parts]
+    with ArrayWriter(tmp_path / "rows.npy", (1, 2, 1), "float16") as writer:
+        for block in blocks:
+            writer.append(block)
+    expected = np.concatenate([np.zeros((0, 1, 2, 1), np.float16), *blocks])
+    assert np.array_equal(np.load(tmp_path / "rows.npy"), expected)
+    if parts:
+        assert np.array_equal(open_array(tmp_path, writer.described()), expected)
+
+
+def test_rows_of_an_interrupted_writing_are_removed(tmp_path):
+    with pytest.raises(KeyboardInterrupt), ArrayWriter(tmp_path / "rows.npy", (1, 2, 1), "float16"):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,92 @@
+"""The frozen encoder of Stable Diffusion's VAE as the conditioning."""
+
+import pytest
+import torch
+from pretrained_vaes import SHAPE, random_vae
+from support import tiny_generator
+
+from completesplat.diffusion.conditioning import LearnedConditioning, StableDiffusionConditioning
+from completesplat.errors import WeightsError
+from completesplat.generation import CompleteSplat
+
+
+@pytest.fixture(scope="module")
+def vae():
+    return random_vae()
+
+
+@pytest.fixture(scope="module")
+def folder(vae, tmp_path_factory):
+    path = tmp_path_factory.mktemp("vae")
+    vae.save_pretrained(path)
+    return path
+
+
+@torch.no_grad()
+def test_features_are_the_vaes_mean_times_its_scale(vae, folder):
+    images = torch.rand(2, 3, 32, 48, generator=torch.Generator().manual_seed(2))
+    features = StableDiffusionConditioning(str(folder), **SHAPE)(images)
+    assert features.shape == (2, 4, 4, 6)
+    torch.testing.assert_close(features, vae.encode(images * 2 - 1).latent_dist.mean * 0.18215)
+
+
+def test_it_is_frozen_and_stays_in_evaluation_mode():
+    conditioning = StableDiffusionConditioning(**SHAPE)
+    assert conditioning.frozen
+    assert not LearnedConditioning.frozen
+    outer = torch.nn.ModuleList([conditioning]).train()
+    assert outer.training
+    assert not any(module.training for module in conditioning.modules())
+    assert not any(p.requires_grad for p in conditioning.parameters())
+    images = torch.rand(1, 3, 16, 16, requires_grad=True)
+    assert not conditioning(images).requires_grad
+
+
+def test_the_decoder_need_not_be_there(vae, folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    vae.save_pretrained(tmp_path)
+    path = tmp_path / "diffusion_pytorch_model.safetensors"
+    save_file({name: value for name, value in load_file(path).items() if "decoder" not in name}, path)
+    ours, theirs = (StableDiffusionConditioning(str(p), **SHAPE).state_dict() for p in (tmp_path, folder))
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "setting"),
+    [
+        ({"channels": (8, 8, 8, 8)}, "there and [8, ", "conditioning.channels=[8,8,16,16]"),
+        ({"out_channels": 8}, "there and [16, ", "conditioning.out_channels=4"),
+        ({"norm_groups": 8}, "4 groups and 8 here", "conditioning.norm_groups=4"),
+    ],
+)
+def test_another_size_names_the_conditionings_settings(folder, change, reason, setting):
+    with pytest.raises(WeightsError) as caught:
+        StableDiffusionConditioning(str(folder), **(SHAPE | change))
+    assert reason in str(caught.value)
+    assert setting in str(caught.value)
+    assert "autoreconstructor." not in str(caught.value)
+
+
+def test_missing_weights_are_refused_with_the_setting(tmp_path):
+    with pytest.raises(WeightsError, match=f"{tmp_path}/none: no such folder.*conditioning.pretrained=DIR"):
+        StableDiffusionConditioning(str(tmp_path / "none"), **SHAPE)
+
+
+def test_a_saved_generator_holds_the_weights_and_needs_no_vae(folder, tmp_path):
+    parts = dict(tiny_generator().architecture)
+    parts["conditioning"] = {
+        "_target_": "completesplat.diffusion.conditioning.StableDiffusionConditioning",
+        "pretrained": str(folder),
+        "channels": list(SHAPE["channels"]),
+        "layers_per_block": SHAPE["layers_per_block"],
+        "norm_groups": SHAPE["norm_groups"],
+    }
+    parts["denoiser"] = parts["denoiser"] | {"conditioning_channels": 4}
+    model = CompleteSplat(**parts)
+    assert parts["conditioning"]["pretrained"] == str(folder)
+    model.save_pretrained(tmp_path / "weights")
+    loaded = CompleteSplat.from_pretrained(tmp_path / "weights")
+    assert loaded.architecture["conditioning"]["pretrained"] is None
+    images = torch.rand(1, 3, 32, 32)
+    assert torch.equal(loaded.conditioning(images), StableDiffusionConditioning(str(folder), **SHAPE)(images))

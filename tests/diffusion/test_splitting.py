@@ -1,0 +1,39 @@
+"""Parts of a batch, and what happens when a GPU's memory is too small for them."""
+
+from itertools import chain
+
+import pytest
+import torch
+
+from completesplat.diffusion.splitting import in_parts
+
+
+@pytest.mark.parametrize(("most", "sizes"), [(None, [7]), (7, [7]), (3, [3, 3, 1]), (1, [1] * 7), (100, [7])])
+def test_all_are_drawn_in_order(most, sizes):
+    items = list(range(7))
+    parts = in_parts(lambda part: items[part], 7, most)
+    assert [len(part) for part in parts] == sizes
+    assert list(chain(*parts)) == items
+
+
+def test_parts_that_do_not_fit_are_halved_until_they_do(caplog):
+    asked = []
+
+    def draw(part: slice) -> list[int]:
+        items = list(range(11))[part]
+        asked.append(len(items))
+        if len(items) > 3:
+            raise torch.cuda.OutOfMemoryError
+        return items
+
+    assert list(chain(*in_parts(draw, 11))) == list(range(11))
+    assert asked == [11, 6, 3, 3, 3, 2]
+    assert [record.getMessage().split(" ")[0] for record in caplog.records] == ["11", "6"]
+
+
+def test_a_sample_that_does_not_fit_by_itself_is_an_error():
+    def draw(part: slice) -> None:
+        raise torch.cuda.OutOfMemoryError
+
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        in_parts(draw, 4)

@@ -1,0 +1,183 @@
+"""Stage 2 as it is run: what it starts from, what it keeps, what it writes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas
+import pytest
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from pretrained_vaes import random_vae
+from safetensors.torch import load_file
+from support import SMALL, call, compose_config
+
+from completesplat.errors import WeightsError
+from completesplat.generation import CompleteSplat
+from completesplat.training.checkpoints import read_checkpoint
+from completesplat.training.latent_diffusion import LatentDiffusion
+
+VAE = [
+    "conditioning=stable_diffusion",
+    "conditioning.channels=[8,8,16,16]",
+    "conditioning.layers_per_block=1",
+    "conditioning.norm_groups=4",
+]
+QUICK = [*SMALL, "sampler.steps=1", "test=false", "callbacks.pictures=null", "trainer.log_every_n_steps=1"]
+PREFIX = "completesplat."
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run with Stable Diffusion's conditioning, and the denoiser's weights as they were when it drew samples."""
+
+    folder: Path
+    vae: dict[str, torch.Tensor]
+    sampled: dict[str, torch.Tensor]
+
+    @property
+    def checkpoint(self) -> dict[str, Any]:
+        return torch.load(self.folder / "checkpoints/last.ckpt", weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def run(pipeline, tmp_path_factory) -> Run:
+    root = tmp_path_factory.mktemp("stage2")
+    vae = random_vae()
+    vae.save_pretrained(root / "vae")
+    sampled: dict[str, torch.Tensor] = {}
+    reconstruct = LatentDiffusion.reconstruct
+
+    def recorded(self, *inputs, **settings):
+        sampled.update({name: value.clone() for name, value in self.completesplat.denoiser.state_dict().items()})
+        return reconstruct(self, *inputs, **settings)
+
+    settings = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, *VAE]
+    settings += [f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"]
+    # With a decay so near 1 as for long runs, two steps would leave average and weights apart by little.
+    settings += [f"conditioning.pretrained={root / 'vae'}", "callbacks.ema.decay=0.5", f"out={root / 'run'}"]
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(root)
+        monkeypatch.setattr(LatentDiffusion, "reconstruct", recorded)
+        assert call(monkeypatch, "fit", *settings) == 0
+    return Run(root / "run", vae.state_dict(), sampled)
+
+
+def part(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tensor]:
+    return {key.removeprefix(name): value for key, value in state.items() if key.startswith(name)}
+
+
+def assert_equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> None:
+    assert first.keys() == second.keys()
+    assert [name for name, value in first.items() if not torch.equal(value, second[name])] == []
+
+
+def test_the_frozen_conditioning_stays_what_it_was_through_training_and_averaging(run):
+    for place in ("state_dict", "current_model_state"):
+        weights = part(run.checkpoint[place], f"{PREFIX}conditioning.encoder.")
+        assert len(weights) > 20
+        for name, value in weights.items():
+            theirs = name if name.startswith("quant_conv") else name.replace("network.", "encoder.")
+            assert torch.equal(value, run.vae[theirs]), name
+
+
+def test_the_average_is_what_is_sampled_and_written(run):
+    checkpoint = run.checkpoint
+    average, last = (part(checkpoint[place], PREFIX) for place in ("state_dict", "current_model_state"))
+    denoiser = part(average, "denoiser.")
+    assert any(not torch.equal(value, last[f"denoiser.{name}"]) for name, value in denoiser.items())
+    assert_equal(run.sampled, denoiser)
+    assert_equal(load_file(run.folder / "weights/model.safetensors"), average)
+
+
+def test_the_weights_need_no_vae_any_more(run, pipeline):
+    (run.folder.parent / "vae").rename(run.folder.parent / "elsewhere")
+    try:
+        model = CompleteSplat.from_pretrained(run.folder / "weights")
+    finally:
+        (run.folder.parent / "elsewhere").rename(run.folder.parent / "vae")
+    assert model.conditioning.frozen
+    assert len(model(pipeline.photograph(), samples=1)) == 1
+
+
+def test_the_latents_are_measured_and_logged_once(run):
+    table = pandas.read_csv(run.folder / "metrics.csv")
+    values = table.filter(regex="^latent").dropna()
+    assert len(values) == 1
+    measured = values.iloc[0]
+    assert measured["latents/std"] * measured["latent_scale"] == pytest.approx(1)
+    assert measured["latent_scale"] == pytest.approx(run.checkpoint["state_dict"][f"{PREFIX}latent_scale"].item())
+    # The variance over all elements is that within the channels and that of their means.
+    means, deviations = (measured[[f"latents/{of}_{i}" for i in range(4)]] for of in ("mean", "std"))
+    variance = (deviations**2).mean() + means.var(ddof=0)
+    assert variance == pytest.approx(measured["latents/std"] ** 2)
+
+
+def test_the_losses_of_two_samples_are_logged_by_timestep_at_every_step(run):
+    table = pandas.read_csv(run.folder / "metrics.csv")
+    rows = table.groupby("step")[[name for name in table if name.startswith("train/loss")]].max()
+    for step in (0, 1):
+        # Both in one bucket, or each in its own: the mean over the buckets is that over the samples.
+        row = rows.loc[step].dropna()
+        assert len(row) in (2, 3)
+        assert row.drop("train/loss").mean() == pytest.approx(row["train/loss"], rel=1e-5)
+
+
+def module(*settings: str) -> LatentDiffusion:
+    config = compose_config("fit", "rasterizer=reference", "data.image_size=32", *settings)
+    return instantiate(config.model, _convert_="all")
+
+
+def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
+    started = module("experiment=toy_diffusion_masked", f"model.checkpoint={checkpoint}")
+    assert_equal(started.state_dict(), read_checkpoint(checkpoint)["state_dict"])
+    assert started.completesplat.latent_scale != 1
+    assert started.skip_weight == 0
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_the_wrong_stages_checkpoint_is_refused(pipeline, stage):
+    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
+    setting = {"var": "checkpoint", "diffusion": "autoreconstructor_checkpoint"}[stage]
+    experiment = {"var": "toy_diffusion_masked", "diffusion": "toy_diffusion"}[stage]
+    with pytest.raises(InstantiationException) as caught:
+        module(f"experiment={experiment}", f"model.{setting}={checkpoint}")
+    assert isinstance(caught.value.__cause__, WeightsError)
+
+
+def test_an_autoreconstructor_of_another_shape_is_refused(pipeline):
+    checkpoint = pipeline.var / "checkpoints/last.ckpt"
+    given = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={checkpoint}"]
+    with pytest.raises(InstantiationException) as caught:
+        module(*given, "autoreconstructor.encoder.latent_channels=8")
+    assert isinstance(caught.value.__cause__, WeightsError)
+    assert "another architecture" in str(caught.value.__cause__)
+
+
+def test_two_starts_are_refused(pipeline):
+    one = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
+    with pytest.raises(InstantiationException) as caught:
+        module("experiment=toy_diffusion", one, f"model.checkpoint={pipeline.diffusion / 'checkpoints/last.ckpt'}")
+    assert "set model.autoreconstructor_checkpoint=null" in str(caught.value.__cause__)
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        (["model.autoreconstructor_checkpoint=null"], "give model.autoreconstructor_checkpoint=FILE"),
+        (["model.autoreconstructor_checkpoint={var}", *VAE], "give conditioning.pretrained=DIR"),
+        (
+            ["model.autoreconstructor_checkpoint={var}", "conditioning.channels=[8,8,16]"],
+            "latents are 4x4 and the conditioning's features 8x8 in size",
+        ),
+    ],
+    ids=["no autoreconstructor", "random frozen conditioning", "conditioning of another resolution"],
+)
+def test_training_that_cannot_work_ends_in_one_line(command, pipeline, settings, reason):
+    var = pipeline.var / "checkpoints/last.ckpt"
+    given = [setting.format(var=var) for setting in settings]
+    finished = command("fit", "experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, *given, "out=run")
+    assert finished.status == 2
+    assert reason in finished.err.splitlines()[-1]
