@@ -54,9 +54,10 @@ check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: $(READY) ## Time the rasterizer backends, and data loading, side by side
+bench: $(READY) ## Time the rasterizer backends, data loading, and stage 2, side by side
 	$(BIN)/completesplat bench rasterizers
 	$(BIN)/completesplat bench data
+	$(BIN)/completesplat bench diffusion
 
 notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb

@@ -46,6 +46,17 @@ def pipeline(toy_root, tmp_path_factory):
     return Pipeline(toy_root, runs / "var", runs / "diffusion")
 
 
+@pytest.fixture(scope="session")
+def latent_cache(pipeline, tmp_path_factory) -> Path:
+    """The training set, encoded by the pipeline's stage 1."""
+    cache = tmp_path_factory.mktemp("encoded") / "cache"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(cache.parent)
+        given = f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}"
+        assert call(monkeypatch, "data", "latents", given, f"out={cache}") == 0
+    return cache
+
+
 @dataclass(frozen=True)
 class Finished:
     """What a command left behind."""

@@ -1,6 +1,6 @@
-"""One picture of several scenes: a row of panels for each, with a heading for each column."""
+"""One picture of several scenes: rows of panels, with a heading for each column."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from completesplat.scene import SceneBatch
 
 ERROR_GAIN = 4
 READABLE_SIDE = 128
-GAP, LINE = 4, 16
+GAP, LINE, MARGIN = 4, 16, 72
 INK, PAPER = "black", "white"
 
 
@@ -24,8 +24,7 @@ def scene_panels(
     """Input and first target, what the Gaussians [batch] show from the target's camera, and each layer by itself.
 
     A layer is as many Gaussians as there are pixels (see `completesplat.splatter_image`). The error is the mean
-    absolute difference of the colours, times 4. Depth is linear in inverse depth, near bright, on one scale for a
-    scene; where nothing is seen it is black.
+    absolute difference of the colours, times 4.
     """
     target = scenes.targets[:, :1]
 
@@ -40,7 +39,7 @@ def scene_panels(
         "target": target.images[:, 0],
         "render": image,
         f"error x{ERROR_GAIN}": _grey(ERROR_GAIN * error),
-        "depth": _grey(_brightness(whole.expected_depth())),
+        "depth": depth_panels(whole.expected_depth()[:, None])[:, 0],
         "opacity": _grey(whole.alpha),
     }
     pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
@@ -54,27 +53,36 @@ def _grey(values: Float[Tensor, "batch 1 height width"]) -> Float[Tensor, "batch
     return values.expand(-1, 3, -1, -1)
 
 
-def _brightness(depth: Float[Tensor, "batch 1 height width"]) -> Float[Tensor, "batch 1 height width"]:
-    seen = depth > 0
-    inverse = torch.where(seen, 1 / depth, 0)
-    nearest = inverse.amax((1, 2, 3), keepdim=True)
-    farthest = torch.where(seen, inverse, torch.inf).amin((1, 2, 3), keepdim=True)
+def depth_panels(depth: Float[Tensor, "batch view 1 height width"]) -> Float[Tensor, "batch view 3 height width"]:
+    """Linear in inverse depth, near bright, on one scale for the views of a scene; black where nothing is seen.
+
+    The scale leaves the nearest and the farthest 2 % of the pixels out: single Gaussians before a camera are common.
+    """
+    inverse = torch.where(depth > 0, 1 / depth, torch.nan)
+    limits = torch.nanquantile(inverse.flatten(1), torch.tensor([0.02, 0.98]).to(inverse), dim=1)
+    farthest, nearest = limits[:, :, None, None, None, None]
     # From dark grey to white, so that what is far is not nothing.
-    share = 0.2 + 0.8 * (inverse - farthest) / (nearest - farthest).clamp(min=1e-6)
-    return torch.where(seen, share, 0)
+    share = 0.2 + 0.8 * ((inverse - farthest) / (nearest - farthest).clamp(min=1e-6)).clamp(0, 1)
+    return share.nan_to_num(0).expand(-1, -1, 3, -1, -1)
 
 
-def sheet(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
-    """All panels, each enlarged by a whole factor to about 128 px, a column for each name, a row for each scene."""
+def sheet(panels: Mapping[str, Float[Tensor, "row 3 height width"]], rows: Sequence[str] = ()) -> Image.Image:
+    """All panels, each enlarged by a whole factor to about 128 px, a column for each name, as many rows as they have.
+
+    Args:
+        rows: names of the rows, in a margin at the left; none by default, and no margin.
+    """
     height, width = next(iter(panels.values())).shape[-2:]
     factor = max(1, round(READABLE_SIDE / max(height, width)))
     cells = {name: _bytes(panel).repeat(factor, 1).repeat(factor, 2) for name, panel in panels.items()}
     tall, wide = height * factor + GAP, width * factor + GAP
-    rows = len(next(iter(cells.values())))
-    picture = Image.new("RGB", (GAP + wide * len(cells), LINE + tall * rows), PAPER)
+    margin = MARGIN if rows else GAP
+    picture = Image.new("RGB", (margin + wide * len(cells), LINE + tall * len(next(iter(cells.values())))), PAPER)
     draw = ImageDraw.Draw(picture)
+    for row, name in enumerate(rows):
+        draw.text((GAP, LINE + row * tall), name, INK)
     for column, (name, images) in enumerate(cells.items()):
-        left = GAP + column * wide
+        left = margin + column * wide
         draw.text((left, 2), name, INK)
         for row, image in enumerate(images):
             picture.paste(Image.fromarray(image), (left, LINE + row * tall))

@@ -21,22 +21,28 @@ SETTINGS = [
 PLACES_OF_WEIGHTS = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers")
 
 
-def settings(pipeline, stage: str) -> list[str]:
-    shared = ["fit", f"experiment=toy_{stage}", f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
-    if stage == "var":
-        return shared
+@pytest.fixture(scope="module")
+def settings(pipeline, latent_cache):
+    """Arguments of `completesplat`, by stage; "encoded" is stage 2 from the latent cache."""
+    shared = [f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
-    return [*shared, stage1, "sampler.steps=2", "data.targets=1"]
+    own = ["sampler.steps=2", "data.targets=1", "callbacks.samples.every_n_steps=2"]
+    stage2 = ["fit", "experiment=toy_diffusion", *shared, stage1, *own]
+    return {
+        "var": ["fit", "experiment=toy_var", *shared],
+        "diffusion": stage2,
+        "encoded": [*stage2, f"data.encoded={latent_cache}"],
+    }
 
 
 @pytest.fixture(scope="module")
-def whole(pipeline, tmp_path_factory):
+def whole(settings, tmp_path_factory):
     """Run directories of uninterrupted runs, by stage."""
     runs = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(runs)
-        for stage in ("var", "diffusion"):
-            assert call(monkeypatch, *settings(pipeline, stage), f"out={runs / stage}") == 0
+        for stage, arguments in settings.items():
+            assert call(monkeypatch, *arguments, f"out={runs / stage}") == 0
     return runs
 
 
@@ -61,11 +67,16 @@ def rows(run) -> pandas.DataFrame:
 
 @pytest.mark.parametrize(
     ("stage", "module", "saved"),
-    [("var", ReconstructionModule, 3), ("var", ReconstructionModule, 4), ("diffusion", LatentDiffusion, 3)],
+    [
+        ("var", ReconstructionModule, 3),
+        ("var", ReconstructionModule, 4),
+        ("diffusion", LatentDiffusion, 3),
+        ("encoded", LatentDiffusion, 3),
+    ],
 )
-def test_a_run_that_is_continued_is_bit_equal(pipeline, whole, tmp_path, monkeypatch, stage, module, saved):
+def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeypatch, stage, module, saved):
     monkeypatch.chdir(tmp_path)
-    arguments = [*settings(pipeline, stage), f"callbacks.checkpoint.every_n_train_steps={saved}", f"out={tmp_path}/run"]
+    arguments = [*settings[stage], f"callbacks.checkpoint.every_n_train_steps={saved}", f"out={tmp_path}/run"]
     step = module.training_step
 
     def interrupted_step(self, *inputs):
@@ -81,7 +92,7 @@ def test_a_run_that_is_continued_is_bit_equal(pipeline, whole, tmp_path, monkeyp
 
     expected, found = weights(whole / stage), weights(tmp_path / "run")
     assert expected.keys() == found.keys()
-    assert any("current_model_state" in name for name in expected) == (stage == "diffusion")
+    assert any("current_model_state" in name for name in expected) == (stage != "var")
     different = [
         name
         for name, value in expected.items()
@@ -91,15 +102,15 @@ def test_a_run_that_is_continued_is_bit_equal(pipeline, whole, tmp_path, monkeyp
     pandas.testing.assert_frame_equal(rows(whole / stage), rows(tmp_path / "run"), check_exact=True)
 
 
-def test_drawing_pictures_does_not_change_training(pipeline, whole, tmp_path, monkeypatch):
+def test_drawing_pictures_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for stage in ("var", "diffusion"):
-        without = [*settings(pipeline, stage), "~callbacks.pictures", f"out={tmp_path / stage}"]
-        without = [argument for argument in without if not argument.startswith("callbacks.pictures")]
-        assert call(monkeypatch, *without) == 0
-        assert not (tmp_path / stage / "pictures").exists()
+    for stage, drawn in {"var": ["pictures"], "diffusion": ["pictures", "samples"]}.items():
+        kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.pic", "callbacks.sam"))]
+        off = [f"callbacks.{name}=null" for name in drawn]
+        assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
         expected, found = (weights(run) for run in (whole / stage, tmp_path / stage))
         assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, torch.Tensor))
-        assert sorted(path.name for path in (whole / stage / "pictures").iterdir()) == [
-            f"step_00000{n}.png" for n in (2, 4, 6)
-        ]
+        for name in drawn:
+            assert not (tmp_path / stage / name).exists()
+            pictures = sorted(path.name for path in (whole / stage / name).glob("step_*"))
+            assert pictures == [f"step_00000{n}.png" for n in (2, 4, 6)]

@@ -14,8 +14,9 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.panels import scene_panels, sheet
-from completesplat.training.pictures import channel_kl, distributions, fixed_scenes, percentiles
+from completesplat.training.fixed_scenes import fixed_scenes
+from completesplat.training.panels import depth_panels, scene_panels, sheet
+from completesplat.training.pictures import channel_kl, distributions, percentiles
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
@@ -95,6 +96,21 @@ def test_every_panel_lies_in_its_row_and_column():
             assert abs(cell - 255 * panel[row].permute(1, 2, 0).numpy()).max() <= 0.5 + 1e-4
 
 
+def test_named_rows_move_the_panels_to_the_right():
+    images = {name: torch.rand(2, 3, 16, 16) for name in ("one", "two")}
+    without, named = (np.asarray(sheet(images, rows)) for rows in ((), ("first", "second")))
+    assert (named[:, 72:] == without[:, 4:]).all()
+    for row in range(2):
+        assert (named[16 + row * 132 : 148 + row * 132, :72] < 128).any()
+
+
+def test_the_views_of_a_scene_have_one_scale_of_depth_and_each_scene_its_own():
+    depth = torch.tensor([[1.0, 2, 4], [2.0, 4, 0]])[:, :, None, None, None].expand(2, 3, 1, 4, 4)
+    shades = depth_panels(depth)[:, :, 0, 0, 0]
+    # Linear in 1, 1/2, 1/4 and in 1/2, 1/4, from 0.2 to 1.
+    torch.testing.assert_close(shades, torch.tensor([[1, 0.2 + 0.8 / 3, 0.2], [1, 0.2, 0]]))
+
+
 def test_distributions_are_of_all_values():
     scenes = scene_batch()
     values = distributions(two_layers(scenes))
@@ -131,9 +147,16 @@ def test_scenes_are_the_first_of_validation_or_else_of_training():
     others = [scene_batch(2, seed=5)]
     for data in (Data(others, several), Data(several, [])):
         scenes = fixed_scenes(data, 4)
-        assert scenes.names == ("scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0")
-        assert torch.equal(scenes.targets.images[2, 0], several[1].targets.images[0, 0])
-    assert len(fixed_scenes(Data(others, several), 10).names) == 5
+        assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
+        assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
+    assert len(fixed_scenes(Data(others, several), 10)) == 5
+
+
+@pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (2, [0, 3]), (3, [0, 2, 4]), (6, range(6)), (9, range(6))])
+def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
+    (whole,) = batch = [scene_batch(1, targets=6)]
+    (scene,) = fixed_scenes(Data([], batch), 1, views)
+    assert torch.equal(scene.targets.images, whole.targets.images[0, list(chosen)])
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])

@@ -58,3 +58,23 @@ def test_an_offline_run_holds_pictures_histograms_and_rows(command, pipeline, tm
         assert sum(shown[f"histograms/{name}/values"]) == 32 * 32 * 2 * (3 if name == "log10_scale" else 1)
     (scalars,) = [row for row in rows if "gaussians/depth_p50" in row]
     assert {f"kl/channel_{i}" for i in range(4)} <= scalars.keys()
+
+
+def test_stage_two_adds_its_samples(command, pipeline, tmp_path, monkeypatch):
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
+    settings = ["experiment=toy_diffusion", stage1, "sampler.steps=2", f"data.root={pipeline.toy}", *SMALL]
+    finished = command("fit", *settings, "test=false", "logger=wandb", f"out={tmp_path / 'run'}")
+    assert finished.status == 0, finished.err
+    (folder,) = (tmp_path / "run/wandb").glob("offline-run-*")
+    for name, kind in (("samples", "step"), ("denoising", "strip")):
+        (picture,) = folder.glob(f"files/media/images/{name}_*.png")
+        drawn = tmp_path / f"run/samples/{kind}_000002.png"
+        assert list(Image.open(picture).getdata()) == list(Image.open(drawn).getdata())
+    (file,) = folder.glob("run-*.wandb")
+    rows = history(file)
+    (shown,) = [row for row in rows if "samples/path" in row]
+    assert shown["denoising/_type"] == "image-file"
+    assert shown["trainer/global_step"] == 1
+    (scalars,) = [row for row in rows if "samples/diversity" in row]
+    assert {"samples/psnr", "samples/psnr_of_mean"} <= scalars.keys()

@@ -5,9 +5,10 @@ from itertools import product
 
 import torch
 
+from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import psnr
 from completesplat.reports.sampling.drawing import Artist
-from completesplat.reports.sampling.measures import diversity, near, object_psnr
+from completesplat.reports.sampling.measures import near, object_psnr
 from completesplat.reports.sampling.strips import Strip
 from completesplat.scene import SceneBatch
 

@@ -1,26 +1,12 @@
-"""How faithful samples are to what is known, and how different from each other."""
+"""How faithful samples are to what is known."""
 
 import math
-from itertools import combinations
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
-
-
-def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
-    """Root mean square difference of two samples' renders, mean over all pairs of samples and all views.
-
-    Raises:
-        ValueError: less than two samples.
-    """
-    if len(images) < 2:
-        raise ValueError("needs two samples")
-    differences = [(one - other).square().mean((1, 2, 3)).sqrt() for one, other in combinations(images, 2)]
-    return torch.stack(differences).mean().item()
 
 
 def object_psnr(

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import psnr, ssim
 from completesplat.reports.sampling.drawing import Artist
-from completesplat.reports.sampling.measures import diversity
 from completesplat.scene import SceneBatch
 
 REFERENCE = ("ddim", 50)

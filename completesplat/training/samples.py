@@ -1,0 +1,144 @@
+"""What latent diffusion draws for a few fixed scenes while it trains: several samples, and how one of them forms."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lightning import Trainer
+from lightning.pytorch.loggers import WandbLogger
+from PIL import Image
+from torch import Tensor
+
+from completesplat.gaussians import Gaussians
+from completesplat.metrics.diversity import diversity
+from completesplat.metrics.images import psnr
+from completesplat.scene import SceneBatch
+from completesplat.tensors import stack
+from completesplat.training.fixed_scenes import DrawsFixedScenes
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.panels import depth_panels, sheet
+from completesplat.training.scene_module import SceneModule
+
+
+class Samples(DrawsFixedScenes):
+    """Several samples of each scene, seen from its reference and its targets; see `DrawsFixedScenes`.
+
+    `folder/step_000500.png` has for each scene a row of true pictures (the input first), one for each sample, and the
+    depth of the first sample (`depth_panels`). `folder/strip_000500.png` shows the first sample while it is denoised:
+    the scenes that estimates of the clean latent stand for, from the reference and from the middle target. All
+    loggers get, of the targets' views, `samples/diversity` (see `diversity`; not of one sample), `samples/psnr` (mean
+    over the samples) and `samples/psnr_of_mean` (of their mean picture); Weights & Biases also both pictures.
+
+    Args:
+        folder, every_n_steps, scenes, views: see `DrawsFixedScenes`.
+        samples: of a scene, always from the same noise.
+        strip: at most so many denoiser calls, evenly spaced from the first to the last.
+    """
+
+    def __init__(
+        self, folder: str, every_n_steps: int = 2000, scenes: int = 2, samples: int = 4, views: int = 8, strip: int = 8
+    ) -> None:
+        super().__init__(folder, every_n_steps, scenes, views)
+        self.samples = samples
+        self.strip = strip
+
+    def draw(self, trainer: Trainer, module: SceneModule, scenes: list[SceneBatch]) -> None:
+        assert isinstance(module, LatentDiffusion)
+        drawn = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
+        pictures = {"step": samples_sheet(drawn), "strip": strip_sheet(drawn)}
+        for kind, picture in pictures.items():
+            picture.save(self.folder / f"{kind}_{trainer.global_step:06}.png")
+        each = [one.scores() for one in drawn]
+        scalars = {f"samples/{name}": sum(scores[name] for scores in each) / len(each) for name in each[0]}
+        for logger in trainer.loggers:
+            # As Lightning counts: a row bears the number of the optimizer steps before its own.
+            logger.log_metrics(scalars, step=trainer.global_step - 1)
+            if isinstance(logger, WandbLogger):
+                import wandb
+
+                media: Any = {"samples": wandb.Image(pictures["step"]), "denoising": wandb.Image(pictures["strip"])}
+                logger.log_metrics(media, step=trainer.global_step - 1)
+
+    def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
+        generator, views = module.completesplat, scene.all_views()
+        shown: dict[int, tuple[int, Gaussians]] = {}
+
+        def keep(call: int, timestep: int, estimates: Gaussians) -> None:
+            if call in evenly_spaced(len(generator.sampler.scheduler.timesteps), self.strip):
+                # Samples that do not fit into memory together come in parts, the first sample in the first part.
+                shown.setdefault(call, (timestep, estimates[:1]))
+
+        with trainer.precision_plugin.forward_context():
+            gaussians = generator.generate(
+                scene.reference.images,
+                scene.reference.cameras,
+                scene.depth_range,
+                samples=self.samples,
+                skip_weight=module.skip_weight,
+                guidance_weight=module.guidance_weight,
+                visible=scene.visible,
+                seed=0,
+                on_step=keep,
+            )
+        # The reference, and the middle one of the targets.
+        pair = [0, 1 + (len(views.images[0]) - 1) // 2]
+        with torch.autocast(module.device.type, enabled=False):
+            cameras = views.cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
+            seen = module.rasterizer(gaussians, cameras)
+            of_pair = views.cameras[:, pair]
+            denoising = [module.rasterizer(part, of_pair).over(module.background)[0] for _, part in shown.values()]
+        return SceneDrawings(
+            views.images[0],
+            seen.over(module.background).clamp(0, 1),
+            seen.expected_depth()[:1],
+            [timestep for timestep, _ in shown.values()],
+            torch.stack([views.images[0, pair], *denoising]).clamp(0, 1),
+        )
+
+
+@dataclass(frozen=True)
+class SceneDrawings:
+    """True pictures and renders of one scene, the reference view first; of the strip, what is true comes first."""
+
+    true: Float[Tensor, "view 3 height width"]
+    samples: Float[Tensor, "sample view 3 height width"]
+    depth: Float[Tensor, "1 view 1 height width"]
+    timesteps: list[int]
+    strip: Float[Tensor, "call 2 3 height width"]
+
+    def scores(self) -> dict[str, float]:
+        """Of the targets' views."""
+        images, true = self.samples[:, 1:], self.true[1:]
+        found = {
+            "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),
+            "psnr_of_mean": psnr(images.mean(0), true).mean().item(),
+        }
+        return found | {"diversity": diversity(images)} if len(images) > 1 else found
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most so many of the numbers below `count`, the last one always."""
+    return sorted({round(place) for place in np.linspace(count - 1, 0, most)})
+
+
+def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
+    """A column for each view; views that a scene has less than others stay white."""
+    rows: list[Float[Tensor, "view 3 height width"]] = []
+    names: list[str] = []
+    for scene in drawn:
+        rows += [scene.true, *scene.samples, depth_panels(scene.depth)[0]]
+        names += ["true", *(f"sample {i + 1}" for i in range(len(scene.samples))), "depth of 1"]
+    most = max(map(len, rows))
+    white = torch.ones_like(rows[0][:1])
+    grid = torch.stack([torch.cat([row, white.expand(most - len(row), -1, -1, -1)]) for row in rows])
+    columns = ["input's view", *(f"target {i + 1}" for i in range(most - 1))]
+    return sheet(dict(zip(columns, grid.unbind(1), strict=True)), names)
+
+
+def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
+    """A column for each denoiser call that was kept."""
+    grid = torch.cat([scene.strip.transpose(0, 1) for scene in drawn])
+    columns = ["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)]
+    return sheet(dict(zip(columns, grid.unbind(1), strict=True)), ["input's view", "middle target"] * len(drawn))

@@ -1,0 +1,90 @@
+"""Stage 2 from the latent cache against stage 2 from pictures, by the command line."""
+
+from pathlib import Path
+
+import pandas
+import pytest
+import torch
+from support import SMALL, call
+
+from completesplat.data.encoded.store import EncodedStore
+
+STEPS = 3
+QUICK = [
+    *SMALL,
+    f"trainer.max_steps={STEPS}",
+    "trainer.precision=32-true",
+    "trainer.log_every_n_steps=1",
+    "callbacks.pictures=null",
+    "callbacks.samples=null",
+    "sampler.steps=1",
+    "test=false",
+]
+
+
+@pytest.fixture(scope="module")
+def fit(pipeline):
+    """Train stage 2 in a folder: from stage 1, and the latents' scale is measured, or on from stage 2, which has it."""
+
+    def run(out: Path, start: str, *settings: str) -> Path:
+        stage1, stage2 = (run / "checkpoints/last.ckpt" for run in (pipeline.var, pipeline.diffusion))
+        starts = {
+            "stage 1": [f"model.autoreconstructor_checkpoint={stage1}"],
+            "stage 2": ["model.autoreconstructor_checkpoint=null", f"model.checkpoint={stage2}"],
+        }
+        given = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, *starts[start], *settings]
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(out.parent)
+            assert call(monkeypatch, "fit", *given, f"out={out}") == 0
+        return out
+
+    return run
+
+
+def logged(run: Path, pattern: str) -> pandas.DataFrame:
+    """Rows by step of the columns whose names match; not the last, which repeats what there is at the end."""
+    table = pandas.read_csv(run / "metrics.csv")
+    return table.groupby("step").max().filter(regex=pattern).dropna(how="all").loc[: STEPS - 1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        [],
+        # The loss of a prediction of the latent itself tells more of errors in the latent.
+        [
+            "sampler.scheduler.prediction_type=sample",
+            "data.box_masks={probability: 0.5, boxes: [1, 4], sides: [0.1, 0.5]}",
+        ],
+    ],
+    ids=["noise", "latents, partly hidden"],
+)
+def test_losses_are_those_of_training_from_pictures(fit, latent_cache, tmp_path, settings):
+    pictures = logged(fit(tmp_path / "pictures", "stage 2", *settings), "^train/loss")
+    cached = logged(fit(tmp_path / "cached", "stage 2", *settings, f"data.encoded={latent_cache}"), "^train/loss")
+    assert list(pictures.index) == list(range(STEPS))
+    assert (pictures["train/loss"] > 0).all()
+    assert pictures["train/loss"].nunique() == STEPS
+    pandas.testing.assert_frame_equal(pictures, cached, rtol=1e-4, atol=0)
+
+
+def test_the_scale_is_the_caches_and_near_the_one_that_is_measured(fit, pipeline, latent_cache, tmp_path):
+    (exact,) = logged(fit(tmp_path / "run", "stage 1", f"data.encoded={latent_cache}"), "^latent_scale")["latent_scale"]
+    (measured,) = logged(pipeline.diffusion, "^latent_scale")["latent_scale"]
+    assert exact == pytest.approx(EncodedStore(latent_cache).scale)
+    assert exact == pytest.approx(measured, rel=0.1)
+
+
+def test_the_cache_of_another_autoreconstructor_is_refused_in_one_line(command, pipeline, latent_cache, tmp_path):
+    checkpoint = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)
+    name = next(name for name in checkpoint["state_dict"] if name.startswith("model.encoder."))
+    checkpoint["state_dict"][name].view(-1)[0] += 1
+    torch.save(checkpoint, tmp_path / "other.ckpt")
+    start = f"model.autoreconstructor_checkpoint={tmp_path / 'other.ckpt'}"
+    given = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, f"data.encoded={latent_cache}", start]
+    finished = command("fit", *given, f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    (line,) = [line for line in finished.err.splitlines() if line.startswith("error: ")]
+    assert line == finished.err.splitlines()[-1]
+    assert "made with another autoreconstructor; encode the training set again" in line
+    assert not (tmp_path / "run/checkpoints").exists()
