@@ -14,6 +14,7 @@ from completesplat.commands import conf_folder
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
+NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
 SMALL = [
     "trainer.max_steps=2",
     "trainer.accelerator=cpu",
@@ -23,6 +24,7 @@ SMALL = [
     "data.image_size=32",
     "data.batch_size=2",
     "data.evaluation_targets=2",
+    *NETWORKS,
 ]
 
 

@@ -42,6 +42,7 @@ def test_everything_is_measured_written_and_shown(command, tmp_path, monkeypatch
     assert not list((tmp_path / "out").glob("bench_diffusion_*"))
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compiled_here_is_named_with_the_reason(command, tmp_path, monkeypatch):
     def fail(network: torch.nn.Module) -> None:
         raise RuntimeError("no C++ compiler\nand a long story")

@@ -19,7 +19,7 @@ def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
     script.write_text("from completesplat.cli import main\n\nif __name__ == '__main__':\n    main()\n")
     arguments = [
         "fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, "trainer.max_steps=60", f"out={out}",
-        "callbacks.checkpoint.every_n_train_steps=3", "autoreconstructor.encoder.channels=[8,8,16,16]",
+        "callbacks.checkpoint.every_n_train_steps=3",
         "callbacks.pictures=null", "trainer.val_check_interval=60", "ablation=full,m1", "seed=0,1",
     ]  # fmt: skip
     return subprocess.Popen([sys.executable, script, *arguments], start_new_session=True, stdout=subprocess.DEVNULL)

@@ -27,7 +27,7 @@ def settings(root: Path, steps: int = STEPS) -> list[str]:
     return [
         "fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, f"trainer.max_steps={steps}",
         "callbacks.checkpoint.every_n_train_steps=1", "trainer.log_every_n_steps=1",
-        "autoreconstructor.encoder.channels=[8,8,16,16]", "callbacks.pictures=null",
+        "callbacks.pictures=null",
     ]  # fmt: skip
 
 
@@ -194,6 +194,7 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
         assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
 
 
+@pytest.mark.slow
 def test_submitit_runs_the_jobs_of_a_sweep_in_processes_of_their_own(toy_root, tmp_path):
     sweep = tmp_path / "sweep"
     arguments = [*settings(toy_root, steps=1), "seed=0,1", f"out={sweep}", "hydra/launcher=submitit_local"]

@@ -1,5 +1,7 @@
 """A run that was interrupted and continued is the run that never was: the same bits, the same rows."""
 
+from functools import cache
+
 import pandas
 import pytest
 import torch
@@ -37,13 +39,17 @@ def settings(pipeline, latent_cache):
 
 @pytest.fixture(scope="module")
 def whole(settings, tmp_path_factory):
-    """Run directories of uninterrupted runs, by stage."""
+    """The run directory of a stage's uninterrupted run, made when it is asked for."""
     runs = tmp_path_factory.mktemp("whole")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(runs)
-        for stage, arguments in settings.items():
-            assert call(monkeypatch, *arguments, f"out={runs / stage}") == 0
-    return runs
+
+    @cache
+    def run(stage):
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(runs)
+            assert call(monkeypatch, *settings[stage], f"out={runs / stage}") == 0
+        return runs / stage
+
+    return run
 
 
 def tensors(contents, name="") -> dict:
@@ -69,9 +75,9 @@ def rows(run) -> pandas.DataFrame:
     ("stage", "module", "saved"),
     [
         ("var", ReconstructionModule, 3),
-        ("var", ReconstructionModule, 4),
+        pytest.param("var", ReconstructionModule, 4, marks=pytest.mark.slow),
         ("diffusion", LatentDiffusion, 3),
-        ("encoded", LatentDiffusion, 3),
+        pytest.param("encoded", LatentDiffusion, 3, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeypatch, stage, module, saved):
@@ -90,7 +96,7 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
     assert rows(tmp_path / "run")["step"].max() == saved  # So it did more than it saved.
     assert call(monkeypatch, *arguments, "ckpt_path=last") == 0
 
-    expected, found = weights(whole / stage), weights(tmp_path / "run")
+    expected, found = weights(whole(stage)), weights(tmp_path / "run")
     assert expected.keys() == found.keys()
     assert any("current_model_state" in name for name in expected) == (stage != "var")
     different = [
@@ -99,18 +105,19 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
         if not (torch.equal(value, found[name]) if isinstance(value, torch.Tensor) else value == found[name])
     ]
     assert different == []
-    pandas.testing.assert_frame_equal(rows(whole / stage), rows(tmp_path / "run"), check_exact=True)
+    pandas.testing.assert_frame_equal(rows(whole(stage)), rows(tmp_path / "run"), check_exact=True)
 
 
+@pytest.mark.slow
 def test_drawing_pictures_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for stage, drawn in {"var": ["pictures"], "diffusion": ["pictures", "samples"]}.items():
         kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.pic", "callbacks.sam"))]
         off = [f"callbacks.{name}=null" for name in drawn]
         assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
-        expected, found = (weights(run) for run in (whole / stage, tmp_path / stage))
+        expected, found = (weights(run) for run in (whole(stage), tmp_path / stage))
         assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, torch.Tensor))
         for name in drawn:
             assert not (tmp_path / stage / name).exists()
-            pictures = sorted(path.name for path in (whole / stage / name).glob("step_*"))
+            pictures = sorted(path.name for path in (whole(stage) / name).glob("step_*"))
             assert pictures == [f"step_00000{n}.png" for n in (2, 4, 6)]

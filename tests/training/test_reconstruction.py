@@ -5,14 +5,14 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from scenes_for_training import scene_batch
-from support import compose_config
+from support import NETWORKS, compose_config
 
 from completesplat.errors import WeightsError
 from completesplat.training.checkpoints import read_checkpoint
 
 
 def module(*settings: str):
-    config = compose_config("fit", "experiment=toy_var", "rasterizer=reference", *settings)
+    config = compose_config("fit", "experiment=toy_var", "rasterizer=reference", *NETWORKS, *settings)
     return instantiate(config.model, _convert_="all")
 
 
@@ -38,7 +38,7 @@ def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
     """Boxes reach the model only where it is told so, and never what it is compared with."""
     scenes = scene_batch()
     scenes.visible[..., 4:12, 2:9] = 0
-    trained = module(f"model.masked={str(masked).lower()}", "autoreconstructor.encoder.channels=[8,8,16,16]")
+    trained = module(f"model.masked={str(masked).lower()}")
     monkeypatch.setattr(trained, "log_dict", lambda *_, **__: None)  # There is no trainer.
     monkeypatch.setattr(type(trained), "global_step", 0)
     seen, compared = [], []

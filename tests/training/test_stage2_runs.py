@@ -11,7 +11,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from pretrained_vaes import random_vae
 from safetensors.torch import load_file
-from support import SMALL, call, compose_config
+from support import NETWORKS, SMALL, call, compose_config
 
 from completesplat.errors import WeightsError
 from completesplat.generation import CompleteSplat
@@ -125,7 +125,7 @@ def test_the_losses_of_two_samples_are_logged_by_timestep_at_every_step(run):
 
 
 def module(*settings: str) -> LatentDiffusion:
-    config = compose_config("fit", "rasterizer=reference", "data.image_size=32", *settings)
+    config = compose_config("fit", "rasterizer=reference", "data.image_size=32", *NETWORKS, *settings)
     return instantiate(config.model, _convert_="all")
 
 
