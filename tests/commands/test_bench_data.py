@@ -50,6 +50,7 @@ def quick(command, tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_everything_is_measured_written_and_shown(quick):
     benchmark = quick("opening.sequences=7", "opening.epochs=2")
     results = benchmark.results

@@ -22,6 +22,7 @@ def in_this_process(monkeypatch):
     monkeypatch.setattr(comparing, "WARM_UP", 1)
 
 
+@pytest.mark.slow
 def test_everything_is_measured_written_and_shown(command, tmp_path, monkeypatch):
     monkeypatch.setattr(torch, "compile", lambda network: network)  # which would take a minute
     finished = command(*QUICK, f"out={tmp_path / 'out'}")
