@@ -18,6 +18,7 @@ CONFIG_FILE = "config.json"
 WEIGHTS_FILES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
 SUBFOLDERS = ("", "vae")  # a VAE by itself, or within a whole pipeline
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
+ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 # The names of older diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
 OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
@@ -43,17 +44,29 @@ def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str)
         WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
     """
     folder = _vae_folder(source)
+    decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
+    _load(folder, encoder, decoder, _read_vae(folder))
+
+
+def load_pretrained_encoder(encoder: Encoder, source: str) -> None:
+    """Load the encoder of a VAE, see `load_pretrained`; its decoder may be missing.
+
+    Raises:
+        WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
+    """
+    folder = _vae_folder(source)
+    weights = {name: value for name, value in _read_vae(folder).items() if name.startswith(ENCODER)}
+    _load(folder, encoder, {}, weights)
+
+
+def _read_vae(folder: Path) -> dict[str, Tensor]:
+    return {_current_name(name): value for name, value in _read_weights(folder).items()}
+
+
+def _load(folder: Path, encoder: Encoder, decoder: Mapping[str, nn.Module], weights: Mapping[str, Tensor]) -> None:
     config = _read_config(folder / CONFIG_FILE)
-    weights = {_current_name(name): value for name, value in _read_weights(folder).items()}
     # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
-    vae = nn.ModuleDict(
-        {
-            "encoder": encoder.network,
-            "quant_conv": encoder.quant_conv,
-            "post_quant_conv": reconstructor.post_quant_conv,
-            "decoder": reconstructor.network,
-        }
-    )
+    vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
     groups: Any = encoder.network.conv_norm_out
     mismatch = _mismatch(weights, vae.state_dict(), config.get("norm_num_groups", 32), groups.num_groups)
     if mismatch:

@@ -183,6 +183,27 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     return array.astype(np.float64)
 
 
+def optional_field(entry: object, key: str, kind: type) -> Any:
+    """A field of a JSON object that may be null.
+
+    Raises:
+        BadAnnotation: missing, or neither null nor of this kind.
+    """
+    return None if isinstance(entry, dict) and entry.get(key, "") is None else field(entry, key, kind)
+
+
+def list_field(entry: object, key: str, kind: type) -> tuple[Any, ...]:
+    """A list in a JSON object, all of its items of one kind.
+
+    Raises:
+        BadAnnotation: missing, no list, or with another item.
+    """
+    items = field(entry, key, list)
+    if not all(type(item) is kind for item in items):
+        raise BadAnnotation(f"{key} must be a list of {kind.__name__}")
+    return tuple(items)
+
+
 def require_rotation(matrix: np.ndarray, what: str) -> None:
     """Refuse a 3 x 3 matrix that is no rotation, within 1e-3 for each entry of R R^T.
 

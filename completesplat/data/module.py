@@ -195,11 +195,9 @@ class SceneDataModule(LightningDataModule):
     def train_dataloader(self) -> SceneLoader:
         """Random views of all training sequences, in random order."""
         scenes = self._training_scenes()
-        if self.streaming:
-            streamed = self._streamed(scenes)
-            return SceneLoader(streamed, self.batch_size, streamed, self.workers, *self.policy)
-        sampler = EpochSampler(scenes.groups(), self.seed)
-        return SceneLoader(scenes, self.batch_size, sampler, self.workers, *self.policy)
+        order = self._streamed(scenes) if self.streaming else EpochSampler(scenes.groups(), self.seed)
+        items = order if isinstance(order, StreamedScenes) else scenes
+        return SceneLoader(items, self.batch_size, order, self.workers, *self.policy)
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views

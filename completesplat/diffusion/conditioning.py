@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from diffusers.models.autoencoders import vae
@@ -12,15 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder
-from completesplat.autoreconstructor.pretrained import (
-    CONFIG_FILE,
-    _current_name,
-    _mismatch,
-    _needed_settings,
-    _read_config,
-    _read_weights,
-    _vae_folder,
-)
+from completesplat.autoreconstructor.pretrained import load_pretrained_encoder
 from completesplat.errors import WeightsError
 
 STABLE_DIFFUSION_SCALE = 0.18215
@@ -117,24 +108,9 @@ class StableDiffusionConditioning(nn.Module):
 
 def _load_encoder(encoder: Encoder, source: str) -> None:
     try:
-        _load_encoder_only(encoder, source)
+        load_pretrained_encoder(encoder, source)
     except WeightsError as error:
         message = str(error)
         for theirs, ours in SETTINGS.items():
             message = message.replace(theirs, ours)
         raise WeightsError(message) from error
-
-
-def _load_encoder_only(encoder: Encoder, source: str) -> None:
-    """As `load_pretrained`, of the encoder's half."""
-    folder = _vae_folder(source)
-    config = _read_config(folder / CONFIG_FILE)
-    # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
-    own = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv})
-    every = {_current_name(name): value for name, value in _read_weights(folder).items()}
-    weights = {name: value for name, value in every.items() if name.startswith(tuple(f"{part}." for part in own))}
-    groups: Any = encoder.network.conv_norm_out
-    mismatch = _mismatch(weights, own.state_dict(), config.get("norm_num_groups", 32), groups.num_groups)
-    if mismatch:
-        raise WeightsError(f"{folder}: {mismatch}; {_needed_settings(config)}")
-    own.load_state_dict(weights)

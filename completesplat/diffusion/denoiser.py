@@ -45,7 +45,7 @@ class TextlessStableDiffusion(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
-        self.network = UNet2DConditionModel(
+        network: Any = UNet2DConditionModel(
             in_channels=conditioning_channels + latent_channels,
             out_channels=latent_channels,
             block_out_channels=tuple(channels),
@@ -57,7 +57,8 @@ class TextlessStableDiffusion(nn.Module):
         )
         self.register_buffer("context", torch.zeros(1, 1, context_channels), persistent=False)
         if gradient_checkpointing:
-            _recompute_activations(self.network)
+            network.enable_gradient_checkpointing()
+        self.network = network
 
     def forward(
         self,
@@ -67,8 +68,7 @@ class TextlessStableDiffusion(nn.Module):
     ) -> Float[Tensor, "batch channel height width"]:
         """Predict the noise in h_t (paper, Eq. 3), or what else it is trained for (`objective.target`), in float32."""
         context = self.context.expand(len(noisy_latent), -1, -1)
-        network: Any = self.network
-        return network(torch.cat([conditioning, noisy_latent], dim=1), timestep, context).sample.float()
+        return self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep, context).sample.float()
 
 
 class Denoiser(nn.Module):
@@ -96,7 +96,7 @@ class Denoiser(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
-        self.network = UNet2DModel(
+        network: Any = UNet2DModel(
             in_channels=conditioning_channels + latent_channels,
             out_channels=latent_channels,
             block_out_channels=tuple(channels),
@@ -106,7 +106,8 @@ class Denoiser(nn.Module):
             norm_num_groups=norm_groups,
         )
         if gradient_checkpointing:
-            _recompute_activations(self.network)
+            network.enable_gradient_checkpointing()
+        self.network = network
 
     def forward(
         self,
@@ -115,8 +116,7 @@ class Denoiser(nn.Module):
         conditioning: Float[Tensor, "batch features height width"],
     ) -> Float[Tensor, "batch channel height width"]:
         """As `TextlessStableDiffusion`."""
-        network: Any = self.network
-        return network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample.float()
+        return self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample.float()
 
 
 def _blocks(attention: str, levels: int, attention_levels: Sequence[int]) -> dict[str, Any]:
@@ -124,7 +124,3 @@ def _blocks(attention: str, levels: int, attention_levels: Sequence[int]) -> dic
     down = [f"{attention if level in attention_levels else ''}DownBlock2D" for level in range(levels)]
     up = tuple(name.replace("Down", "Up") for name in reversed(down))
     return {"down_block_types": tuple(down), "up_block_types": up}
-
-
-def _recompute_activations(network: Any) -> None:
-    network.enable_gradient_checkpointing()

@@ -1,4 +1,8 @@
-"""What the denoiser learns to predict; the scheduler's `prediction_type` decides, in training as in sampling."""
+"""What the denoiser predicts; the scheduler's `prediction_type` decides, in training as in sampling.
+
+In h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps (paper, Eq. 2), `epsilon` is eps (Eq. 3), `sample` is h, and
+`v_prediction` sqrt(alpha_bar_t) eps - sqrt(1 - alpha_bar_t) h (Salimans and Ho 2022, Section 4).
+"""
 
 from typing import Any
 
@@ -16,22 +20,50 @@ def target(
     noise: Float[Tensor, "batch channel height width"],
     timestep: Int[Tensor, " batch"],
 ) -> Float[Tensor, "batch channel height width"]:
-    """The right answer for h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps.
-
-    `epsilon` is eps (paper, Eq. 3), `sample` is h, and `v_prediction` sqrt(alpha_bar_t) eps - sqrt(1 - alpha_bar_t) h
-    (Salimans and Ho 2022, Section 4).
+    """The right prediction for a latent and the noise that was added to it.
 
     Raises:
         CompleteSplatError: the scheduler predicts something else.
     """
-    kind = scheduler.config.prediction_type
+    kind = prediction_type(scheduler)
     if kind == "epsilon":
         return noise
     if kind == "sample":
         return latent
-    if kind == "v_prediction":
-        alpha_bar = scheduler.alphas_cumprod.to(latent)[timestep][:, None, None, None]
-        return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * latent
-    raise CompleteSplatError(
-        f"sampler.scheduler.prediction_type={kind}: cannot be trained; choose one of {', '.join(PREDICTION_TYPES)}"
-    )
+    alpha_bar = scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
+    return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * latent
+
+
+def clean_estimate(
+    scheduler: Any,
+    noisy_latent: Float[Tensor, "batch channel height width"],
+    predicted: Float[Tensor, "batch channel height width"],
+    timestep: Int[Tensor, ""],
+) -> Float[Tensor, "batch channel height width"]:
+    """The latent h that a prediction stands for.
+
+    Raises:
+        CompleteSplatError: the scheduler predicts something else.
+    """
+    kind = prediction_type(scheduler)
+    if kind == "sample":
+        return predicted
+    alpha_bar = scheduler.alphas_cumprod.to(noisy_latent)[timestep]
+    signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+    if kind == "epsilon":
+        return (noisy_latent - noise * predicted) / signal
+    return signal * noisy_latent - noise * predicted
+
+
+def prediction_type(scheduler: Any) -> str:
+    """One of `PREDICTION_TYPES`.
+
+    Raises:
+        CompleteSplatError: the scheduler has another one.
+    """
+    kind = scheduler.config.prediction_type
+    if kind not in PREDICTION_TYPES:
+        raise CompleteSplatError(
+            f"sampler.scheduler.prediction_type={kind}: unknown; choose one of {', '.join(PREDICTION_TYPES)}"
+        )
+    return kind

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.diffusion.guidance import Denoise, guided_noise
+from completesplat.diffusion.objective import clean_estimate
 from completesplat.errors import CompleteSplatError
 
 OnStep = Callable[[int, int, Tensor], None]
@@ -64,7 +65,7 @@ class Sampler:
             inputs = scheduler.scale_model_input(latent, timestep)
             predicted = guided_noise(denoise, inputs, level.expand(len(noise)), conditioning, guidance_weight)
             if on_step is not None:
-                on_step(index, int(level), self.estimate(inputs, predicted, level))
+                on_step(index, int(level), clean_estimate(scheduler, inputs, predicted, level))
             latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
 
@@ -78,25 +79,6 @@ class Sampler:
                 "sampler=dpm20 takes any number"
             )
         self.scheduler.set_timesteps(steps, device=device)
-
-    def estimate(
-        self, noisy_latent: Float[Tensor, "batch channel height width"], predicted: Tensor, timestep: Tensor
-    ) -> Float[Tensor, "batch channel height width"]:
-        """The clean latent h that a prediction stands for, with h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps.
-
-        Raises:
-            CompleteSplatError: an unknown prediction type.
-        """
-        alpha_bar = self.scheduler.alphas_cumprod.to(noisy_latent)[timestep]
-        signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
-        kind = self.scheduler.config.prediction_type
-        if kind == "epsilon":
-            return (noisy_latent - noise * predicted) / signal
-        if kind == "v_prediction":
-            return signal * noisy_latent - noise * predicted
-        if kind == "sample":
-            return predicted
-        raise CompleteSplatError(f"sampler.scheduler.prediction_type={kind}: unknown")
 
     def add_noise(
         self, latent: Float[Tensor, "batch channel height width"], noise: Tensor, timestep: Tensor

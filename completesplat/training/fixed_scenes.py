@@ -16,7 +16,7 @@ from completesplat.training.scene_module import SceneModule
 
 
 class DrawsFixedScenes(Callback):
-    """Draws the first scenes of the validation set, or of the training set if there is no other.
+    """Draws the first scenes of the validation set.
 
     The model is in evaluation mode, with averaged weights if training keeps them. Training is the same without.
 
@@ -81,9 +81,9 @@ def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
 
 
 def fixed_scenes(data: Any, count: int, views: int = 1) -> list[SceneBatch]:
-    """The first validation scenes, or training scenes where the data have no others, with some of their targets."""
+    """The first validation scenes, with some of their targets."""
     found: list[SceneBatch] = []
-    for batch in data.val_dataloader() or data.train_dataloader():
+    for batch in data.val_dataloader():
         for index in range(len(batch.names)):
             scene = batch[index]
             targets = len(scene.targets.images)

@@ -168,8 +168,8 @@ class LatentDiffusion(SceneModule):
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
 
-    def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
-        """One sample for each reference image."""
+    def reconstruct(self, scenes: SceneBatch, seed: int, **settings: Any) -> Gaussians:
+        """One sample for each reference image, or as many as `settings` (of `CompleteSplat.generate`) say."""
         return self.completesplat.generate(
             scenes.reference.images,
             scenes.reference.cameras,
@@ -178,6 +178,7 @@ class LatentDiffusion(SceneModule):
             guidance_weight=self.guidance_weight,
             visible=scenes.visible,
             seed=seed,
+            **settings,
         )
 
 

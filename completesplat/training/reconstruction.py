@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch
@@ -45,6 +46,11 @@ class ReconstructionModule(SceneModule):
             load_part(model, checkpoint, prefix="model.")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         prepare_network(model, channels_last, compile)
+
+    def on_fit_start(self) -> None:
+        """Refuse encoded pictures: this stage trains what would encode them."""
+        if getattr(self.trainer.datamodule, "encoded", None) is not None:  # type: ignore[attr-defined]
+            raise CompleteSplatError("data.encoded is for latent diffusion (model=latent_diffusion): set it to null")
 
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Splatter Images, and posteriors if the model has any, from the reference images alone."""

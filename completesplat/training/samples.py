@@ -62,26 +62,16 @@ class Samples(DrawsFixedScenes):
                 logger.log_metrics(media, step=trainer.global_step - 1)
 
     def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
-        generator, views = module.completesplat, scene.all_views()
+        sampler, views = module.completesplat.sampler, scene.all_views()
         shown: dict[int, tuple[int, Gaussians]] = {}
 
         def keep(call: int, timestep: int, estimates: Gaussians) -> None:
-            if call in evenly_spaced(len(generator.sampler.scheduler.timesteps), self.strip):
+            if call in evenly_spaced(len(sampler.scheduler.timesteps), self.strip):
                 # Samples that do not fit into memory together come in parts, the first sample in the first part.
                 shown.setdefault(call, (timestep, estimates[:1]))
 
         with trainer.precision_plugin.forward_context():
-            gaussians = generator.generate(
-                scene.reference.images,
-                scene.reference.cameras,
-                scene.depth_range,
-                samples=self.samples,
-                skip_weight=module.skip_weight,
-                guidance_weight=module.guidance_weight,
-                visible=scene.visible,
-                seed=0,
-                on_step=keep,
-            )
+            gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=keep)
         # The reference, and the middle one of the targets.
         pair = [0, 1 + (len(views.images[0]) - 1) // 2]
         with torch.autocast(module.device.type, enabled=False):

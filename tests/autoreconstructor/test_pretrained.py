@@ -1,27 +1,15 @@
 import shutil
 
 import huggingface_hub
-import pytest
 import torch
 from hydra.utils import instantiate
-from pretrained_vaes import BIN, SAFETENSORS, build, random_vae, rewrite, stable_diffusion_vae
+from pretrained_vaes import BIN, SAFETENSORS, build, rewrite, stable_diffusion_vae
 from safetensors.torch import load_file
 from support import compose_config, tiny_generator
 
 from completesplat.generation import CompleteSplat
 
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
-
-
-@pytest.fixture(scope="module")
-def vae():
-    return random_vae()
-
-
-@pytest.fixture
-def folder(vae, tmp_path):
-    vae.save_pretrained(tmp_path / "vae_only")
-    return tmp_path / "vae_only"
 
 
 def shared_weights(model) -> dict[str, torch.Tensor]:

@@ -3,20 +3,9 @@
 import huggingface_hub
 import pytest
 import torch
-from pretrained_vaes import BIN, SAFETENSORS, build, random_vae, rewrite
+from pretrained_vaes import BIN, SAFETENSORS, build, rewrite
 
 from completesplat.errors import WeightsError
-
-
-@pytest.fixture(scope="module")
-def vae():
-    return random_vae()
-
-
-@pytest.fixture
-def folder(vae, tmp_path):
-    vae.save_pretrained(tmp_path / "vae_only")
-    return tmp_path / "vae_only"
 
 
 def refusal(source, **changes) -> str:

@@ -60,3 +60,10 @@ def test_few_frames_and_other_settings_of_the_run_can_be_asked_for(command, pipe
     assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)]
     assert store.arrays["mean"].dtype == "float16"
     assert store.arrays["condition"].dtype == "uint8"
+
+
+def test_stage_one_does_not_train_from_what_it_would_encode(command, pipeline, latent_cache, tmp_path):
+    settings = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_var", "data.color_jitter=null", "test=false"]
+    refused = command("fit", *settings, f"data.encoded={latent_cache}", f"out={tmp_path / 'run'}")
+    assert refused.status == 2
+    assert "data.encoded is for latent diffusion" in refused.err.splitlines()[-1]

@@ -138,24 +138,22 @@ def test_the_divergence_of_the_channels_is_that_of_the_posterior():
 
 
 class Data:
-    def __init__(self, training: list[SceneBatch], validation: list[SceneBatch]) -> None:
-        self.train_dataloader, self.val_dataloader = (lambda: training), (lambda: validation)
+    def __init__(self, validation: list[SceneBatch]) -> None:
+        self.val_dataloader = lambda: validation
 
 
-def test_scenes_are_the_first_of_validation_or_else_of_training():
+def test_scenes_are_the_first_of_validation():
     several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
-    others = [scene_batch(2, seed=5)]
-    for data in (Data(others, several), Data(several, [])):
-        scenes = fixed_scenes(data, 4)
-        assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
-        assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
-    assert len(fixed_scenes(Data(others, several), 10)) == 5
+    scenes = fixed_scenes(Data(several), 4)
+    assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
+    assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
+    assert len(fixed_scenes(Data(several), 10)) == 5
 
 
 @pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (2, [0, 3]), (3, [0, 2, 4]), (6, range(6)), (9, range(6))])
 def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
     (whole,) = batch = [scene_batch(1, targets=6)]
-    (scene,) = fixed_scenes(Data([], batch), 1, views)
+    (scene,) = fixed_scenes(Data(batch), 1, views)
     assert torch.equal(scene.targets.images, whole.targets.images[0, list(chosen)])
 
 

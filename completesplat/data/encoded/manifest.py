@@ -6,7 +6,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.checks import BadAnnotation, UnreadableFile, at, field, inside, read_json
+from completesplat.data.checks import (
+    BadAnnotation,
+    UnreadableFile,
+    at,
+    field,
+    inside,
+    list_field,
+    optional_field,
+    read_json,
+)
 from completesplat.data.prepared.manifest import MANIFEST, Refusal, Scalar, refusal_from_json, write_json
 
 FORMAT = 1
@@ -107,11 +116,11 @@ def read_manifest(root: Path) -> Manifest:
 def _origin(entry: Mapping[str, Any]) -> Origin:
     return Origin(
         field(entry, "encoder", str),
-        _optional(entry, "conditioning", str),
+        optional_field(entry, "conditioning", str),
         field(entry, "data", str),
         field(entry, "settings", dict),
         field(entry, "image_size", int),
-        _optional(entry, "frames", int),
+        optional_field(entry, "frames", int),
         field(entry, "precision", str),
     )
 
@@ -121,11 +130,11 @@ def _array(root: Path, entry: Mapping[str, Any]) -> Array:
     inside(root, file)
     if dtype not in DTYPES:
         raise BadAnnotation(f"dtype must be one of {', '.join(DTYPES)}, not {dtype}")
-    return Array(file, dtype, _numbers(entry, "shape"))
+    return Array(file, dtype, list_field(entry, "shape", int))
 
 
 def _sequence(entry: object) -> Sequence:
-    frames, stored = field(entry, "frames", int), _numbers(entry, "stored")
+    frames, stored = field(entry, "frames", int), list_field(entry, "stored", int)
     # Strictly increasing from 0 on and below `frames`.
     if any(b <= a for a, b in pairwise((-1, *stored, frames))):
         raise BadAnnotation("stored frames must be places in the sequence, in order")
@@ -145,14 +154,3 @@ def _check(manifest: Manifest) -> None:
         raise BadAnnotation("two sequences of one name")
     if not manifest.scale > 0:
         raise BadAnnotation(f"scale must be above 0, not {manifest.scale}")
-
-
-def _numbers(entry: object, key: str) -> tuple[int, ...]:
-    numbers = field(entry, key, list)
-    if not all(type(number) is int for number in numbers):
-        raise BadAnnotation(f"{key} must be a list of integers")
-    return tuple(numbers)
-
-
-def _optional(entry: Mapping[str, Any], key: str, kind: type) -> Any:
-    return None if entry.get(key, "") is None else field(entry, key, kind)

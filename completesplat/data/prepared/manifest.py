@@ -7,7 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.checks import BadAnnotation, UnreadableFile, at, field, inside, read_json
+from completesplat.data.checks import (
+    BadAnnotation,
+    UnreadableFile,
+    at,
+    field,
+    inside,
+    list_field,
+    optional_field,
+    read_json,
+)
 from completesplat.errors import DataError
 
 FORMAT = 1
@@ -139,7 +148,7 @@ def shard_from_json(root: Path, entry: object) -> Shard:
     file = field(entry, "file", str)
     inside(root, file)
     size, frames = field(entry, "bytes", int), field(entry, "frames", int)
-    return Shard(file, field(entry, "sha256", str), size, frames, _names(entry, "sequences"))
+    return Shard(file, field(entry, "sha256", str), size, frames, list_field(entry, "sequences", str))
 
 
 def refusal_from_json(entry: object) -> Refusal:
@@ -151,14 +160,14 @@ def refusal_from_json(entry: object) -> Refusal:
     return Refusal(
         field(entry, "kind", str),
         field(entry, "reason", str),
-        _optional(entry, "file", str),
-        _optional(entry, "sequence", str),
-        _optional(entry, "frame", int),
+        optional_field(entry, "file", str),
+        optional_field(entry, "sequence", str),
+        optional_field(entry, "frame", int),
     )
 
 
 def _split(root: Path, entry: dict[str, Any]) -> Split:
-    names = _names(entry, "names")
+    names = list_field(entry, "names", str)
     shards = tuple(shard_from_json(root, shard) for shard in field(entry, "shards", list))
     if len(set(names)) < len(names) or sorted(name for shard in shards for name in shard.sequences) != sorted(names):
         raise BadAnnotation("the names of a split are not those of its shards")
@@ -167,14 +176,3 @@ def _split(root: Path, entry: dict[str, Any]) -> Split:
     return Split(
         field(entry, "fingerprint", str), names, shards, refused, {key: field(left_out, key, int) for key in left_out}
     )
-
-
-def _names(entry: object, key: str) -> tuple[str, ...]:
-    names = field(entry, key, list)
-    if not all(type(name) is str for name in names):
-        raise BadAnnotation(f"{key} must be a list of names")
-    return tuple(names)
-
-
-def _optional(entry: object, key: str, kind: type) -> Any:
-    return None if type(entry) is dict and entry.get(key, "") is None else field(entry, key, kind)
