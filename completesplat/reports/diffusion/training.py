@@ -10,23 +10,24 @@ from torch.optim import Optimizer
 from completesplat.data.module import SceneDataModule
 from completesplat.reports.diffusion.comparing import Comparison
 from completesplat.training.encoding import encode_training_set
-from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.scene_module import SceneModule
 
 MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 
 
 class Training:
-    """Optimizer steps as in a run, without what a run logs.
+    """Optimizer steps of either stage as in a run, without what a run logs.
 
     Args:
         module: on its device.
         precision: Lightning's; "bf16-mixed" computes the networks in bfloat16.
     """
 
-    def __init__(self, module: LatentDiffusion, precision: str) -> None:
-        self.module = module.train()
+    def __init__(self, module: SceneModule, precision: str) -> None:
+        self.module: Any = module.train()
         self.precision = precision
-        module.log_loss = lambda *_: None  # type: ignore[method-assign]  # there is no trainer that would log it
+        for logs in ("log_loss", "log_dict"):  # there is no trainer that would
+            setattr(module, logs, lambda *_, **__: None)
         self.optimizer: Optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
 
     def step(self, batch: Any) -> None:

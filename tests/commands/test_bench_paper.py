@@ -1,0 +1,85 @@
+"""`completesplat bench paper`: what it writes, says and refuses."""
+
+import pytest
+import torch
+from support import compose_config, strict_json
+
+from completesplat.commands.bench_paper import is_as_in_the_paper
+from completesplat.reports.diffusion import comparing
+from completesplat.reports.paper_speed import measuring
+from completesplat.reports.paper_speed.figures import FIGURES
+from completesplat.reports.paper_speed.ways import WAYS, compiled
+
+CHANNELS = "channels=[8,8,16,16]"
+QUICK = [
+    *("bench", "paper", "repeats=1", "device=cpu", "compile=false", "samples=3", "sampler.steps=2"),
+    *("autoreconstructor=tiny", "conditioning=learned", "denoiser=tiny", "rasterizer=tiled"),
+    *(f"autoreconstructor.encoder.{CHANNELS}", f"conditioning.{CHANNELS}", "denoiser.channels=[16,32]"),
+    *("denoiser.attention_levels=[1]", "data.scenes=4", "data.frames=3", "data.image_size=32", "data.batch_size=2"),
+]
+
+
+@pytest.mark.slow
+def test_both_stages_are_measured_written_and_shown(command, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # so few pictures are sooner written by this process alone
+    monkeypatch.setattr(measuring, "WARM_UP", 0)
+    finished = command(*QUICK, f"out={tmp_path / 'out'}")
+    assert finished.status == 0, finished.err
+    results = strict_json(tmp_path / "out/paper.json")
+    assert [(row["name"], row["way"]) for row in results["rows"]] == [
+        (name, way)
+        for names in (("reconstruct", "render", "stage1_step"), ("sample", "samples", "stage2_step"))
+        for way in ("float32", "bfloat16")
+        for name in names
+    ]
+    # Less work than the paper's, so its durations do not stand beside these.
+    assert all(set(row) == {"name", "way", "ms"} and row["ms"] > 0 for row in results["rows"])
+    assert results["workload"] == {
+        **{"device": "cpu", "image_size": 32, "batch": 2, "samples": 3, "steps": 2, "repeats": 1}
+    }
+    for figure in FIGURES.values():
+        assert figure.text in finished.out
+    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+
+
+def test_the_work_is_the_papers_unless_something_is_changed():
+    assert is_as_in_the_paper(compose_config("bench", "bench_task=paper"))
+    for change in ("samples=4", "data.image_size=64", "sampler=dpm20", "denoiser=tiny", "autoreconstructor=tiny"):
+        assert not is_as_in_the_paper(compose_config("bench", "bench_task=paper", change))
+
+
+def test_networks_are_compiled_within_the_context_only(monkeypatch):
+    network = torch.nn.Linear(1, 1)
+    asked = []
+    monkeypatch.setattr(torch, "compile", lambda call, **settings: asked.append(settings) or call)
+    for way in WAYS:
+        with compiled([network], way):
+            assert (network._compiled_call_impl is not None) == (way.compile is not None)
+        assert network._compiled_call_impl is None
+    assert asked == [{}, {"mode": "reduce-overhead"}]
+
+
+def test_what_fails_has_the_reason_in_its_row(monkeypatch):
+    monkeypatch.setattr(comparing, "WARM_UP", 0)
+
+    def fail() -> None:
+        raise RuntimeError("out of memory\nand a long story")
+
+    (row,) = measuring.rows(WAYS[0], {"samples": fail}, 1, torch.device("cpu"), lambda _: None)
+    assert row == {"name": "samples", "way": "float32", "not_measured": "RuntimeError: out of memory"}
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("repeats=0", "repeats=0: must be at least 1"),
+        ("device=tpu", "device=tpu: choose one of cuda, cpu"),
+        ("device=cuda", "the paper's figures are a GPU's, and there is none here"),
+    ],
+)
+def test_refusals_are_one_line_and_status_two(command, tmp_path, monkeypatch, argument, said):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    finished = command("bench", "paper", argument, f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith("error: ")
+    assert said in finished.err
