@@ -9,7 +9,7 @@ VERBS = {
     "test": "score a checkpoint on held-out scenes",
     "predict": "draw complete scenes from one photograph",
     "report": "compare samplers and controls of a trained model (report samplers, controls, masked)",
-    "bench": "time rasterizers, data loading, diffusion, and what the paper times (bench rasterizers, data, diffusion, paper)",
+    "bench": "time what takes time (bench rasterizers, bench data, bench diffusion, bench paper)",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
     f"  {verb:9} {description}" for verb, description in VERBS.items()
