@@ -5,7 +5,7 @@ scenes = model("photo.jpg", samples=4, seed=0)
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.photograph import Photograph, read_photograph
-from completesplat.diffusion.sampling import with_forward_process
+from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts, joined
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
@@ -105,20 +105,20 @@ class CompleteSplat(nn.Module):
         skip_weight: float | None = None,
         guidance_weight: float = 0.0,
         steps: int | None = None,
-        seed: int = 0,
+        seed: int | Sequence[int] = 0,
         visible: Float[Tensor, "batch 1 height width"] | None = None,
         batch: int | None = None,
         on_step: Callable[[int, int, Gaussians], None] | None = None,
     ) -> Gaussians:
         """Draw `samples` scenes for each image.
 
-        Noise is drawn for all samples first: it depends on the seed and their number. How many are then computed at a
-        time changes no more than the rounding of float32.
+        Noise is drawn first: how many samples are computed at a time changes no more than the rounding of float32.
 
         Args:
             skip_weight: 1, the default, is most faithful (supplement, "Diverse Sampling"); 0 if something is hidden.
             guidance_weight: share of the unconditional prediction; more gives more diverse samples.
             steps: denoising steps; the sampler's own number by default.
+            seed: of all noise, or one for each image: what is drawn for it then depends on no other image.
             visible: 0 where an image is hidden: what is there has no influence.
             batch: at most so many latents at a time; all by default, or fewer if a GPU's memory does not suffice.
             on_step: called after each denoiser call, for each batch, with its number, the timestep and the scenes that
@@ -134,8 +134,8 @@ class CompleteSplat(nn.Module):
         images = images if visible is None else images * visible
         conditioning = self.conditioning(images)
         _, features = self.autoreconstructor.encoder(images)
-        shape = (len(images) * samples, self.denoiser.latent_channels, *conditioning.shape[-2:])
-        noise = torch.randn(shape, generator=torch.Generator().manual_seed(seed)).to(images.device)
+        shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
+        noise = draw_noise(len(images), samples, shape, seed).to(images.device)
         image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
 
         def draw(part: slice) -> Gaussians:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.cameras import Cameras, crop_resize
 from completesplat.tensors import TensorDataclass
 
 
@@ -17,6 +17,11 @@ class Views(TensorDataclass):
     images: Float[Tensor, "*batch 3 height width"]
     cameras: Cameras
     masks: Float[Tensor, "*batch 1 height width"]
+
+    def resized(self, size: int) -> "Views":
+        """The same in smaller square pictures, each pixel the mean of those that it covers."""
+        cameras = crop_resize(self.cameras, 0, 0, self.cameras.image_size[1], size)
+        return Views(_shrunk(self.images, size), cameras, _shrunk(self.masks, size))
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,13 @@ class SceneBatch(TensorDataclass):
     def __getitem__(self, index: int | slice) -> "SceneBatch":
         """One scene of a batch, or some of them."""
         return replace(super().__getitem__(index), names=self.names[index])
+
+    def resized(self, size: int) -> "SceneBatch":
+        """The same scenes in smaller pictures, each pixel the mean of those that it covers."""
+        visible = _shrunk(self.visible, size).floor()  # what is partly hidden is hidden
+        return replace(
+            self, reference=self.reference.resized(size), targets=self.targets.resized(size), visible=visible
+        )
 
     def all_views(self) -> Views:
         """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
@@ -77,3 +89,8 @@ class EncodedScene(TensorDataclass):
 
 def _prepend(one: Tensor, many: Tensor, axis: int) -> Tensor:
     return torch.cat([one.unsqueeze(axis), many], dim=axis)
+
+
+def _shrunk(images: Float[Tensor, "*batch channel _ _"], size: int) -> Float[Tensor, "*batch channel _ _"]:
+    shrunk = torch.nn.functional.adaptive_avg_pool2d(images.reshape(-1, *images.shape[-3:]), size)
+    return shrunk.view(*images.shape[:-2], size, size)

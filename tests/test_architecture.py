@@ -17,6 +17,7 @@ TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(), str(path
 # A module imports from its own floor and from those before it.
 FLOORS = [
     "errors",
+    "weights_files",
     "tensors",
     "geometry",
     "gaussians",

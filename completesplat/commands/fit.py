@@ -11,8 +11,10 @@ def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     from hydra.utils import instantiate
     from lightning import seed_everything
+    from lightning.pytorch.callbacks import WeightAveraging
 
     from completesplat.commands import quieten
+    from completesplat.commands.protocol import protocol
     from completesplat.export.atomic import atomic_path
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
@@ -22,6 +24,7 @@ def run(config: Any, out: Path) -> None:
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     module = instantiate(config.model, _convert_="all")
+    module.evaluation = instantiate(config.evaluation.scoring, _convert_="all")
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
@@ -34,13 +37,15 @@ def run(config: Any, out: Path) -> None:
             logger.save()
     finally:
         _finish(loggers)
+    scores = module.test_results() if config.test else None
     if not trainer.is_global_zero:
         return
-    if config.test:
-        show(evaluation_table(module.evaluation.results()))
     results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
-    if config.test:
-        results |= {"upper_bound": module.upper_bound, "test": module.evaluation.results()}
+    if scores is not None:
+        show(evaluation_table(scores))
+        ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)
+        described = protocol(config.evaluation.name, module, data, scores) | {"ema": ema}
+        results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
     with atomic_path(out / "metrics.json") as temporary:  # which also tells that the job is done
         temporary.write_text(json.dumps(results, indent=2) + "\n")
 

@@ -1,6 +1,5 @@
-"""`completesplat test`: score a checkpoint beside two naive predictors."""
+"""`completesplat test`: score a checkpoint; which file that is, and the configuration that it was trained with."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +16,10 @@ ONLY_FOR_TRAINING = (
 
 
 def run(config: Any, out: Path) -> None:
-    """Write `metrics.json` and print the table."""
-    from hydra.utils import instantiate
-    from lightning import seed_everything
-    from omegaconf import OmegaConf
+    """Measure what the chosen protocol says (`conf/evaluation/`)."""
+    from hydra.utils import get_method
 
-    from completesplat.commands import quieten
-    from completesplat.reports.evaluation_table import evaluation_table, show
-    from completesplat.training.checkpoints import load_part
-
-    run_config = config_of_run(Path(config.ckpt), list(config.overrides))
-    quieten()
-    seed_everything(config.seed, verbose=False)
-    data = instantiate(run_config.data, _convert_="all")
-    module = instantiate(run_config.model, _convert_="all")
-    load_part(module, config.ckpt, prefix="")
-    if config.get("sampler") is not None:
-        diffusion_of(module).replace_sampler(OmegaConf.to_container(config.sampler))
-    trainer = instantiate(config.trainer, logger=False, _convert_="all")
-    trainer.test(module, datamodule=data, verbose=False)
-    results = module.evaluation.results()
-    (out / "metrics.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
-    show(evaluation_table(results))
+    get_method(config.evaluation.task)(config, out)
 
 
 def diffusion_of(module: Any) -> Any:

@@ -61,6 +61,15 @@ class CO3DDataModule(SceneDataModule):
         self.framing = Framing(self.image_size, depth_before, depth_after)
         self.evaluation_targets = evaluation_targets
 
+    def describe(self) -> dict[str, str]:
+        """See `SceneDataModule`."""
+        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
+        return {
+            "data_set": f"co3d/{self.category}",
+            "crop": "largest square around the principal point",
+            "protocol_views": f"reference: a sequence's first frame; targets: {targets}",
+        }
+
     def prepared_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
         parts = vars(self.filters) | vars(self.framing)

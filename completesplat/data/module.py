@@ -107,6 +107,10 @@ class SceneDataModule(LightningDataModule):
         """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
 
     @abstractmethod
+    def describe(self) -> dict[str, str]:
+        """For results: "data_set", and how pictures are cut ("crop") and views chosen ("protocol_views")."""
+
+    @abstractmethod
     def open(self, split: str) -> Mapping[str, SequenceSource]:
         """The data set's own files: the sequences of this split, and of others that come with it.
 
@@ -195,7 +199,9 @@ class SceneDataModule(LightningDataModule):
     def train_dataloader(self) -> SceneLoader:
         """Random views of all training sequences, in random order."""
         scenes = self._training_scenes()
-        order = self._streamed(scenes) if self.streaming else EpochSampler(scenes.groups(), self.seed)
+        order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
+        if self.streaming:
+            order = StreamedScenes(scenes, self.source("train"), self.batch_size)
         items = order if isinstance(order, StreamedScenes) else scenes
         return SceneLoader(items, self.batch_size, order, self.workers, *self.policy)
 
@@ -205,12 +211,6 @@ class SceneDataModule(LightningDataModule):
         if self.encoded is not None:
             return EncodedTraining(self.encoded_store, *drawing, self.box_masks, *counting)
         return TrainingScenes(*drawing, self.augment, *counting)
-
-    def _streamed(self, scenes: TrainingScenes) -> StreamedScenes:
-        source = self.source("train")
-        if not isinstance(source, PreparedSource):
-            raise CompleteSplatError("data.streaming=true needs prepared data: completesplat data prepare")
-        return StreamedScenes(scenes, source, self.batch_size)
 
     def val_dataloader(self) -> SceneLoader:
         """The validation sequences."""
@@ -223,7 +223,8 @@ class SceneDataModule(LightningDataModule):
     def _evaluation_loader(self, split: str) -> SceneLoader:
         scenes = EvaluationScenes(self.store(split), self.evaluation_views)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
-        return SceneLoader(scenes, batch_size, None, self.workers, *self.policy)
+        own = scenes.share(batch_size) if split == "test" else scenes
+        return SceneLoader(own, batch_size, None, self.workers, *self.policy)
 
     def state_dict(self) -> dict[str, Any]:
         """The data's fingerprint, for checkpoints."""

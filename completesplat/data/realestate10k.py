@@ -73,6 +73,16 @@ class RE10KDataModule(SceneDataModule):
         self.val_seed = val_seed
         self._test_views: dict[str, tuple[int, list[int]]] | None = None
 
+    def describe(self) -> dict[str, str]:
+        """See `SceneDataModule`."""
+        count, gap = self.evaluation
+        views = f"reference: first frame; {count} targets within {gap} frames"
+        return {
+            "data_set": "realestate10k",
+            "crop": f"largest square, {self.framing.crop}",
+            "protocol_views": views if self.evaluation_index is None else "those of the evaluation index",
+        }
+
     def prepared_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
         return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}

@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from completesplat.data.processes import processes
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.data.view_selection import draws
 from completesplat.errors import DataError
@@ -158,17 +159,28 @@ class EvaluationScenes(Dataset[Loaded]):
 
     Args:
         choose: sequence -> views. Raises `DataError` where it has not got them.
+        names: the sequences; None: all.
     """
 
-    def __init__(self, store: SceneStore, choose: Callable[[PosedSequence], Choice]) -> None:
+    def __init__(
+        self, store: SceneStore, choose: Callable[[PosedSequence], Choice], names: Sequence[str] | None = None
+    ) -> None:
         self.store = store
         self.choose = choose
+        self.names = store.names if names is None else names
 
     def __len__(self) -> int:
-        return len(self.store.names)
+        return len(self.names)
+
+    def share(self, batch_size: int) -> "EvaluationScenes":
+        """What this process of several evaluates: whole batches, so that each is made up as in one process alone."""
+        rank, count = processes()
+        starts = range(rank * batch_size, len(self.names), count * batch_size)
+        own = [name for start in starts for name in self.names[start : start + batch_size]]
+        return EvaluationScenes(self.store, self.choose, own)
 
     def __getitem__(self, index: int) -> Loaded:
-        name = self.store.names[index]
+        name = self.names[index]
         try:
             sequence = self.store.source.read(name)
             return Loaded(self.store.scene(sequence, *self.choose(sequence)), ())
@@ -178,7 +190,7 @@ class EvaluationScenes(Dataset[Loaded]):
     def stackable(self) -> bool:
         """Whether all scenes have the same number of targets, as far as they can be read."""
         counts = set()
-        for name in self.store.names:
+        for name in self.names:
             with suppress(DataError):
                 counts.add(len(self.choose(self.store.source.read(name))[1]))
         return len(counts) <= 1

@@ -9,9 +9,9 @@ from completesplat.data.prepared.source import PreparedSource
 from completesplat.data.prepared.streaming import stream
 from completesplat.data.processes import processes
 from completesplat.data.scenes import Loaded, TrainingScenes
-from completesplat.data.sequences import PosedSequence
+from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.view_selection import draws
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 
 
 class StreamedScenes(IterableDataset):
@@ -25,9 +25,14 @@ class StreamedScenes(IterableDataset):
     Attributes:
         epoch: of the iterations that start from now on.
         start: items of this process that are left out at the beginning of the next iteration.
+
+    Raises:
+        CompleteSplatError: the source is not a prepared store.
     """
 
-    def __init__(self, scenes: TrainingScenes, source: PreparedSource, batch_size: int) -> None:
+    def __init__(self, scenes: TrainingScenes, source: SequenceSource, batch_size: int) -> None:
+        if not isinstance(source, PreparedSource):
+            raise CompleteSplatError("data.streaming=true needs prepared data: completesplat data prepare")
         self.scenes = scenes
         self.source = source
         self.batch_size = batch_size

@@ -1,6 +1,6 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -97,3 +97,19 @@ def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any])
     """A sampler's configuration with the noise schedule and the prediction type of the one trained with."""
     kept = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
     return {**sampler, "scheduler": {**sampler["scheduler"], **kept}}
+
+
+def draw_noise(
+    images: int, samples: int, shape: tuple[int, ...], seed: int | Sequence[int]
+) -> Float[Tensor, "latent _ _ _"]:
+    """Noise of this shape for so many samples of each image, those of one image next to each other.
+
+    Args:
+        seed: of all noise, or one for each image.
+    """
+    if isinstance(seed, int):
+        return torch.randn((images * samples, *shape), generator=torch.Generator().manual_seed(seed))
+    drawn = [torch.randn((samples, *shape), generator=torch.Generator().manual_seed(own)) for own in seed]
+    if len(drawn) != images:
+        raise ValueError(f"{images} images, but {len(drawn)} seeds")
+    return torch.cat(drawn)

@@ -1,14 +1,11 @@
 """VGG16's features with torchvision's weights, without torchvision, whose import breaks beside some builds of torch."""
 
-import hashlib
-from pathlib import Path
-from urllib.parse import urlparse
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
+from completesplat.weights_files import weights_file
 
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
@@ -53,11 +50,7 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
     Raises:
         WeightsError: the weights are missing, cannot be downloaded, are another file, or have another layout.
     """
-    path = _download(weights, sha256) if weights.startswith(("http://", "https://")) else Path(weights).expanduser()
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such file; {ADVICE}")
-    if sha256 is not None:
-        _check_hash(path, sha256)
+    path = weights_file(weights, sha256, ADVICE, "loss.terms.lpips.term.vgg_sha256")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
         part = {key: value for key, value in contents.items() if key.startswith("features.")}
@@ -72,26 +65,3 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
         first = str(error).splitlines()[1].strip()
         raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({first:.200}); {ADVICE}") from error
     return network.float()
-
-
-def _download(url: str, sha256: str | None) -> Path:
-    """The file of a URL in torch's hub cache, where torchvision keeps it too."""
-    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
-    if path.is_file():
-        return path
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(url, str(path), hash_prefix=sha256)
-    except (OSError, RuntimeError) as error:
-        raise WeightsError(f"{url} cannot be downloaded to {path.parent} ({error}); elsewhere, {ADVICE}") from error
-    return path
-
-
-def _check_hash(path: Path, sha256: str) -> None:
-    with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if not found.startswith(sha256.lower()):
-        raise WeightsError(
-            f"{path}: SHA-256 {found}, not {sha256}; {ADVICE} (if that file is meant, "
-            f"loss.terms.lpips.term.vgg_sha256={found})"
-        )

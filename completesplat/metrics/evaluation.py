@@ -1,52 +1,162 @@
 """The protocol: per image, averaged over the views of a scene, then over scenes."""
 
+import zlib
 from collections import defaultdict
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.data.processes import gathered
+from completesplat.errors import CompleteSplatError
+from completesplat.metrics.best_of import best, expected_best_curve
+from completesplat.metrics.diversity import diversity
+from completesplat.metrics.image_sets import ImageSets, SetMetric
 from completesplat.metrics.images import object_only, psnr, ssim
-from completesplat.scene import SceneBatch
+from completesplat.metrics.missing import Missing
+from completesplat.scene import SceneBatch, Views
 
-METRICS = {"psnr": psnr, "ssim": ssim}
+ImageMetric = Callable[[Tensor, Tensor], Tensor]
+Scores = dict[tuple[str, str, str], float]
+REGIONS = ("full", "object")
+MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
 
 class Evaluation:
     """Collects the scores of several predictors over a test set.
 
     For each predictor: all pixels (`full`) and true object pixels (`object`), for the reference view and the novel
-    views apart, by every metric (CO3D protocol, paper Section 4 and supplement).
+    views apart, by every metric (CO3D protocol, paper Section 4 and supplement). A scene counts once, whichever
+    process of several scored it.
+
+    Args:
+        samples: drawn of each scene. With more than one there are three rows: `model` (the first sample), `best_of_k`
+            (the one that is best by `criterion`, an oracle, since it takes the truth to choose it) and `mean_of_k`.
+        criterion: metric by which the best is chosen: mean of the novel views, all pixels.
+        seed: of what is drawn; each scene has its own, which depends on its name only besides.
+        model_size: side of the pictures that the model sees, where it is smaller than that of the pictures that its
+            renders are compared with, after they are upsampled (bilinear); None: the same.
+        perceptual: LPIPS, or why it is missing.
+        sets: metrics of whole sets of images, of the novel views; or why they are missing, by name.
     """
 
-    def __init__(self) -> None:
-        self.scores: dict[str, dict[tuple[str, str, str], list[float]]] = defaultdict(lambda: defaultdict(list))
-        self.views: dict[str, int] = defaultdict(int)
+    def __init__(
+        self,
+        samples: int = 1,
+        criterion: str = "psnr",
+        seed: int = 0,
+        model_size: int | None = None,
+        perceptual: ImageMetric | Missing | None = None,
+        sets: Mapping[str, SetMetric | Missing | None] | None = None,
+    ) -> None:
+        self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
+        self.missing: dict[str, str] = {}
+        if isinstance(perceptual, Missing):
+            self.missing["lpips"] = str(perceptual)
+        elif perceptual is not None:
+            self.metrics["lpips"] = perceptual
+        self.missing |= {name: str(metric) for name, metric in (sets or {}).items() if isinstance(metric, Missing)}
+        present = [metric for metric in (sets or {}).values() if metric is not None and not isinstance(metric, Missing)]
+        if samples < 1:
+            raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
+        if criterion not in self.metrics:
+            said = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
+            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {said}")
+        self.samples, self.criterion, self.seed, self.model_size = samples, criterion, seed, model_size
+        self.set_metrics = present
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all scores."""
+        self.sets = ImageSets(self.set_metrics)
+        self.scores: dict[str, dict[str, Scores]] = defaultdict(dict)
+        self.views: dict[str, int] = {}
+        self.drawn: dict[str, dict[str, Any]] = {}
+        self.skipped = 0
+        """Scenes that could not be read."""
+
+    def scene_seed(self, name: str) -> int:
+        """What is drawn for a scene: the same whichever scenes come before it."""
+        return zlib.crc32(f"{self.seed} {name}".encode())
 
     @torch.no_grad()
     def update(self, predictor: str, images: Float[Tensor, "batch view 3 height width"], scenes: SceneBatch) -> None:
         """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
         truth = scenes.all_views()
-        clipped = images.clamp(0, 1)
-        for b in range(len(images)):
-            for region in ("full", "object"):
-                predicted, true = clipped[b], truth.images[b]
-                if region == "object":
-                    predicted, true = (object_only(x, truth.masks[b]) for x in (predicted, true))
-                for name, metric in METRICS.items():
-                    values = metric(predicted, true)
-                    self.scores[predictor][region, "reference", name].append(values[0].item())
-                    self.scores[predictor][region, "novel", name].append(values[1:].mean().item())
-            self.views[predictor] += images.shape[1] - 1
+        for b, name in enumerate(scenes.names):
+            self._add(predictor, name, images[b].clamp(0, 1), truth[b])
+
+    @torch.no_grad()
+    def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
+        """Score all samples of one scene as `model`, `best_of_k` and `mean_of_k`."""
+        images = images.clamp(0, 1)
+        each = [self.score(sample, truth) for sample in images]
+        self._add(MODEL, name, images[0], truth)
+        if len(each) == 1:
+            return
+        by = [scores["full", "novel", self.criterion] for scores in each]
+        higher = HIGHER_IS_BETTER[self.criterion]
+        self._add(BEST, name, images[best(by, higher)], truth)
+        self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
+        self.drawn[name] = {"curve": expected_best_curve(by, higher), "diversity": diversity(images[:, 1:])}
+
+    def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
+        """One prediction of one scene, values in [0, 1]: means over the novel views."""
+        scores: Scores = {}
+        for region in REGIONS:
+            predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
+            for name, metric in self.metrics.items():
+                with torch.autocast(images.device.type, enabled=False):  # whatever networks compute in
+                    values = metric(predicted.float(), true)
+                scores[region, "reference", name] = values[0].item()
+                scores[region, "novel", name] = values[1:].mean().item()
+        return scores
+
+    def _add(self, predictor: str, name: str, images: Float[Tensor, "view 3 height width"], truth: Views) -> None:
+        self.scores[predictor][name] = self.score(images, truth)
+        self.views[name] = len(images) - 1
+        seeds = [self.scene_seed(f"{name} {view}") for view in range(1, len(images))]
+        for region in REGIONS:
+            for owner, pictures in ((predictor, images), (ImageSets.TRUE, truth.images)):
+                with torch.autocast(images.device.type, enabled=False):
+                    self.sets.add(owner, region, name, _region(pictures.float(), truth, region)[1:], seeds)
+
+    def gather(self) -> None:
+        """Know what all processes scored; each of them must call it."""
+        own = self.scores, self.views, self.drawn, self.sets.state(), self.skipped
+        self.reset()
+        for scores, views, drawn, sets, skipped in gathered(own):
+            for predictor, scenes in scores.items():
+                self.scores[predictor] |= scenes
+            self.views |= views
+            self.drawn |= drawn
+            self.sets.merge(sets)
+            self.skipped += skipped
 
     def results(self) -> dict[str, Any]:
         """{predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": novel views in all}}."""
         results: dict[str, Any] = {}
-        for predictor, scores in self.scores.items():
-            entry: dict[str, Any] = {"scenes": 0, "views": self.views[predictor]}
-            for (region, view, name), values in scores.items():
-                entry["scenes"] = len(values)
-                entry.setdefault(region, {}).setdefault(view, {})[name] = sum(values) / len(values)
+        for predictor, scenes in self.scores.items():
+            names = sorted(scenes)
+            entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
+            for region, view, metric in scenes[names[0]]:
+                values = [scenes[name][region, view, metric] for name in names]
+                entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
+            for region in REGIONS:
+                entry[region]["novel"] |= self.sets.results(predictor, region)
             results[predictor] = entry
+        if self.drawn:
+            names = sorted(self.drawn)
+            curves = zip(*(self.drawn[name]["curve"] for name in names), strict=True)
+            results[BEST]["curve"] = [sum(values) / len(values) for values in curves]
+            results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
         return results
+
+
+def _region(
+    images: Float[Tensor, "view 3 height width"], truth: Views, region: str
+) -> Float[Tensor, "view 3 height width"]:
+    return object_only(images, truth.masks) if region == "object" else images

@@ -11,6 +11,8 @@ COLUMNS = [
     for view in ("novel", "reference")
     for metric in ("psnr", "ssim")
 ]
+WHERE_MEASURED = ("lpips", "fid", "kid", "swd")
+FORMATS = {"psnr": ".2f", "fid": ".1f", "kid": ".4f", "swd": ".1f"}
 LABELS = {"full": "all\npixels", "object": "object\npixels", "psnr": "PSNR", "ssim": "SSIM"}
 
 
@@ -19,12 +21,13 @@ def evaluation_table(results: dict[str, Any]) -> Table:
     first = next(iter(results.values()))
     table = Table(title=f"{first['scenes']} scenes, {first['views']} novel views")
     table.add_column("predictor", no_wrap=True)
-    for region, view, metric in COLUMNS:
-        table.add_column(f"{LABELS[region]}\n{view}\n{LABELS[metric]}", justify="right", no_wrap=True)
+    more = [("full", "novel", metric) for metric in WHERE_MEASURED if metric in first["full"]["novel"]]
+    for region, view, metric in [*COLUMNS, *more]:
+        label = LABELS.get(metric, metric.upper())
+        table.add_column(f"{LABELS[region]}\n{view}\n{label}", justify="right", no_wrap=True)
     for predictor, scores in results.items():
-        cells = [scores[region][view][metric] for region, view, metric in COLUMNS]
-        formats = [".2f" if metric == "psnr" else ".3f" for _, _, metric in COLUMNS]
-        table.add_row(predictor, *(format(cell, f) for cell, f in zip(cells, formats, strict=True)))
+        cells = [(metric, scores[region][view].get(metric)) for region, view, metric in [*COLUMNS, *more]]
+        table.add_row(predictor, *("" if x is None else format(x, FORMATS.get(metric, ".3f")) for metric, x in cells))
     return table
 
 

@@ -1,5 +1,6 @@
 """Stage 2: latent diffusion over the frozen autoreconstructor's latents (paper, Section 3.3)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -38,6 +39,8 @@ class LatentDiffusion(SceneModule):
     Raises:
         WeightsError: a checkpoint is unusable, or both are given.
     """
+
+    draws_samples = True
 
     def __init__(
         self,
@@ -168,7 +171,11 @@ class LatentDiffusion(SceneModule):
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
 
-    def reconstruct(self, scenes: SceneBatch, seed: int, **settings: Any) -> Gaussians:
+    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
+        """See `SceneModule`: what is drawn for an image depends on no other image."""
+        return self.reconstruct(scenes, seeds, samples=samples)
+
+    def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
         """One sample for each reference image, or as many as `settings` (of `CompleteSplat.generate`) say."""
         return self.completesplat.generate(
             scenes.reference.images,

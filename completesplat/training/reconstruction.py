@@ -52,6 +52,11 @@ class ReconstructionModule(SceneModule):
         if getattr(self.trainer.datamodule, "encoded", None) is not None:  # type: ignore[attr-defined]
             raise CompleteSplatError("data.encoded is for latent diffusion (model=latent_diffusion): set it to null")
 
+    @property
+    def method(self) -> str:
+        """The reconstruction model's class."""
+        return type(self.model).__name__
+
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Splatter Images, and posteriors if the model has any, from the reference images alone."""
         images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images

@@ -1,7 +1,8 @@
 """What both training stages share: rendering a batch of scenes, and scoring the renders."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,11 +13,14 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.evaluation import Evaluation
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene import SceneBatch
+from completesplat.training.timing import Timings
 
 
 def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> None:
@@ -45,6 +49,9 @@ class SceneModule(LightningModule):
     upper_bound = False
     """Whether the model has seen the views that it is scored on."""
 
+    draws_samples = False
+    """Whether it has several answers for one image."""
+
     def __init__(
         self,
         rasterizer: Rasterizer,
@@ -57,10 +64,34 @@ class SceneModule(LightningModule):
         self.optimizer = optimizer
         self.schedule = schedule
         self.background = background
+        self.evaluation = Evaluation()
+        self.timings = Timings()
+        # Lightning's name: of several processes that test, some may have no scene.
+        self.allow_zero_length_dataloader_with_multiple_devices = True
 
     @abstractmethod
     def reconstruct(self, scenes: SceneBatch, seed: int) -> Gaussians:
         """One set of Gaussians [batch] for each reference image, in its camera's frame."""
+
+    def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
+        """So many sets of Gaussians for each reference image, next to each other: [batch * samples].
+
+        Args:
+            seeds: one for each image.
+        """
+        return self.reconstruct(scenes, seeds[0])
+
+    @property
+    def method(self) -> str:
+        """What it is called in tables."""
+        return type(self).__name__
+
+    def render_from(self, gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "sample view 3 height width"]:
+        """Several sets of Gaussians [sample], each from the same cameras [view]."""
+        count = len(gaussians.means)
+        everywhere = cameras.map(lambda tensor: tensor.expand(count, *tensor.shape))
+        with torch.autocast(self.device.type, enabled=False):
+            return self.rasterizer(gaussians, everywhere).over(self.background)
 
     def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
         """The reference view and all targets, in full precision even where the network runs in less."""
@@ -73,16 +104,48 @@ class SceneModule(LightningModule):
         self.log("val/psnr_novel", values.mean(), prog_bar=True, batch_size=len(images))
 
     def on_test_start(self) -> None:
-        self.evaluation = Evaluation()
+        if self.evaluation.samples > 1 and not self.draws_samples:
+            raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
+        self.evaluation.reset()
+        self.timings = Timings()
         self.mean_image = self.trainer.datamodule.mean_image()  # type: ignore[attr-defined]
 
     def test_step(self, scenes: SceneBatch, index: int) -> None:
-        self.evaluation.update("model", self.render(self.reconstruct(scenes, seed=index), scenes), scenes)
-        self.evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
-        self.evaluation.update("copy_reference", copy_reference(scenes), scenes)
+        evaluation, names = self.evaluation, scenes.names
+        seen = scenes if evaluation.model_size is None else scenes.resized(evaluation.model_size)
+        seeds = [evaluation.scene_seed(name) for name in names]
+        gaussians = self.timings.of("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
+        truth, cameras = scenes.all_views(), seen.all_views().cameras
+        for b, name in enumerate(names):
+            own = gaussians[b * evaluation.samples : (b + 1) * evaluation.samples]
+            images = self.timings.of("rendering", partial(self.render_from, own, cameras[b]), evaluation.samples)
+            evaluation.update_samples(name, upsampled(images, truth.cameras.image_size), truth[b])
+        evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
+        evaluation.update("copy_reference", copy_reference(scenes), scenes)
+
+    def on_test_end(self) -> None:
+        self.evaluation.skipped = len(self.trainer.test_dataloaders.refused)  # type: ignore[union-attr]
+
+    def test_results(self) -> dict[str, Any]:
+        """`Evaluation.results` of all processes, each of which must call it, with the model's seconds for a scene."""
+        self.evaluation.gather()
+        self.timings.gather()
+        results = self.evaluation.results()
+        results["model"] |= {"upper_bound": self.upper_bound, "seconds": self.timings.results()}
+        return results
 
     def configure_optimizers(self) -> Any:
         """The schedule spans the run, whether its length is given in steps or epochs."""
         optimizer = self.optimizer([p for p in self.parameters() if p.requires_grad])
         schedule = self.schedule(optimizer, self.trainer.estimated_stepping_batches)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def upsampled(
+    images: Float[Tensor, "sample view 3 _ _"], size: tuple[int, int]
+) -> Float[Tensor, "sample view 3 height width"]:
+    """Images at the size (height, width) of those that they are compared with (paper, Table 3: "by upsampling")."""
+    if images.shape[-2:] == size:
+        return images
+    resized = torch.nn.functional.interpolate(images.flatten(0, 1), size, mode="bilinear", align_corners=False)
+    return resized.unflatten(0, images.shape[:2])

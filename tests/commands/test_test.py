@@ -1,3 +1,4 @@
+import hashlib
 import shutil
 
 import pytest
@@ -14,7 +15,10 @@ def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, s
     assert finished.status == 0
     assert finished.out.splitlines()[-1] == str(tmp_path / "scores")
     metrics = strict_json(tmp_path / "scores" / "metrics.json")
+    described = metrics.pop("protocol")
     assert list(metrics) == ["model", "mean_image", "copy_reference"]
+    assert described["data_set"] == "toy_objects"
+    assert described["missing"].keys() == {"lpips", "inception"}
     for scores in metrics.values():
         for region in ("full", "object"):
             for view in ("novel", "reference"):
@@ -67,3 +71,61 @@ def test_a_sampler_for_a_model_without_samples_is_refused(command, pipeline, tmp
     finished = command("test", checkpoint, "sampler=dpm10", f"out={tmp_path / 'out'}")
     assert finished.status == 2
     assert "a diffusion model is needed" in finished.err.splitlines()[-1]
+
+
+def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path):
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
+    change = "overrides=['model.guidance_weight=0.5']"
+    finished = command("test", f"ckpt={checkpoint}", change, "sampler=dpm10", "seed=3", f"out={tmp_path}")
+    assert finished.status == 0, finished.err
+    metrics = strict_json(tmp_path / "metrics.json")
+    described, model = metrics["protocol"], metrics["model"]
+    assert (described["method"], described["name"], described["samples"]) == ("LatentDiffusion", "images", 1)
+    assert (described["sampler"], described["steps"]) == ("DPMSolverMultistepScheduler", 10)
+    assert (described["skip_weight"], described["guidance_weight"], described["seed"]) == (1.0, 0.5, 3)
+    assert (described["image_size"], described["resolution"]) == (32, 32)
+    assert (described["scenes"], described["views"], described["skipped"]) == (model["scenes"], model["views"], 0)
+    assert described["checkpoint"]["sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    assert described["ema"] is True  # stage 2 averages its weights
+    assert described["metrics"]["ssim"]["window"] == 11
+    assert model["seconds"].keys() == {"inference", "rendering"}
+    assert model["full"]["novel"]["swd"] > 0
+    for name, reason in described["missing"].items():
+        assert f"{name}: missing: give " in finished.out
+        assert reason.startswith("missing: ")
+
+
+def test_the_best_of_several_samples_stands_beside_one_and_the_mean(command, pipeline, tmp_path):
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
+    several = command("test", f"ckpt={checkpoint}", "evaluation.scoring.samples=3", "sampler=dpm10", f"out={tmp_path}")
+    assert several.status == 0, several.err
+    metrics = strict_json(tmp_path / "metrics.json")
+    one, best, mean = (metrics[row]["full"]["novel"]["psnr"] for row in ("model", "best_of_k", "mean_of_k"))
+    assert best >= max(one, mean)
+    curve = metrics["best_of_k"]["curve"]
+    assert curve == sorted(curve)
+    assert (curve[0], curve[2]) == (pytest.approx(mean), pytest.approx(best))
+    assert metrics["mean_of_k"]["diversity"] > 0
+    assert metrics["protocol"]["samples"] == 3
+
+
+def test_a_larger_size_is_reached_by_upsampling(command, pipeline, tmp_path):
+    checkpoint = pipeline.var / "checkpoints/last.ckpt"
+    assert command("test", f"ckpt={checkpoint}", "evaluation.resolution=48", f"out={tmp_path}").status == 0
+    described = strict_json(tmp_path / "metrics.json")["protocol"]
+    assert (described["image_size"], described["resolution"]) == (32, 48)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["evaluation.scoring.samples=2"], "draws no samples"),
+        (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
+        (["evaluation=realestate10k_100", "evaluation.scene_list=FILE"], "have no setting scene_list"),
+        (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
+    ],
+)
+def test_protocols_that_do_not_fit_are_refused(command, pipeline, tmp_path, arguments, said):
+    finished = command("test", f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", *arguments, f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert said in finished.err.splitlines()[-1]

@@ -1,10 +1,6 @@
-"""VGG16's weights from files and URLs: the right ones, or a refusal that says how to get them."""
+"""VGG16's weights: the right ones, or a refusal that says how to get them."""
 
-import socket
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 
 import pytest
 import torch
@@ -77,47 +73,3 @@ def test_weights_of_another_layout_are_refused(key, value, said, tmp_path):
     else:
         changed[key] = value[:1, :1].expand(value.shape)
     assert said in refusal(saved(changed, tmp_path / "changed.pth"))
-
-
-@pytest.fixture
-def hub(tmp_path, monkeypatch):
-    monkeypatch.setattr(torch.hub, "_hub_dir", None)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
-    return tmp_path / "torch" / "hub" / "checkpoints"
-
-
-def test_an_unreachable_url_is_refused(hub):
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        url = f"http://127.0.0.1:{unused.getsockname()[1]}/vgg16.pth"
-        assert f"{url} cannot be downloaded" in refusal(url)
-    assert list(hub.iterdir()) == []
-
-
-@pytest.fixture
-def served(tmp_path):
-    """A folder with weights, and its URL while `server.shutdown` has not been called."""
-    folder = tmp_path / "served"
-    folder.mkdir()
-    saved(blank(), folder / "vgg16.pth")
-    handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        yield folder, f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
-
-
-def test_a_url_is_downloaded_once_into_torchs_cache(hub, served):
-    folder, url = served
-    load_vgg16(f"{url}/vgg16.pth", digest(folder / "vgg16.pth"))
-    assert [path.name for path in hub.iterdir()] == ["vgg16.pth"]
-    (folder / "vgg16.pth").unlink()
-    load_vgg16(f"{url}/vgg16.pth")
-
-
-def test_a_download_with_another_hash_or_without_a_file_is_refused_and_not_kept(hub, served):
-    _, url = served
-    assert "cannot be downloaded" in refusal(f"{url}/vgg16.pth", "0" * 64)
-    assert "404" in refusal(f"{url}/none.pth")
-    assert list(hub.iterdir()) == []

@@ -6,6 +6,7 @@ from typing import Any
 from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.prepared.manifest import is_prepared
 from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import CATEGORY, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
 
@@ -27,10 +28,23 @@ class ToyObjectsDataModule(CO3DDataModule):
         self.frames = frames
         self.data_seed = data_seed
 
+    def describe(self) -> dict[str, str]:
+        """See `SceneDataModule`."""
+        return super().describe() | {"data_set": CATEGORY}
+
     def prepare_data(self) -> None:
         """Write the scenes unless a complete set is there (its description is written last)."""
         if not is_prepared(self.root) and not (self.root / CATEGORY / "toy.json").is_file():
             write_objects(self.root, self.scenes, self.frames, self.image_size, self.data_seed)
+
+    def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
+        """The test scenes with every colour that the patch on the back could have had; see `KnowsHiddenModes`.
+
+        Raises:
+            DataError: the files are not the toy objects as they were written, or none is of the test split.
+        """
+        store = self.store("test")
+        return ToyHiddenModes(self.root, store, self.evaluation_views, self.image_size, views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):
@@ -59,6 +73,10 @@ class ToyRoomsDataModule(RE10KDataModule):
         super().__init__(str(home if is_prepared(home) else home / ROOMS / form), **reading)
         self.home = home
         self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
+
+    def describe(self) -> dict[str, str]:
+        """See `SceneDataModule`."""
+        return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
         """Write the rooms unless a complete set is there (its description is written last)."""

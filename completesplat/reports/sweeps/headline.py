@@ -10,9 +10,9 @@ GROUPS = {
     "object_novel": "object pixels, novel views",
     "full_reference": "reference view",
 }
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID"}
-FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f"}
-LOWER_IS_BETTER = {"lpips", "fid", "kid"}
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
+FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
+LOWER_IS_BETTER = {"lpips", "fid", "kid", "swd"}
 BEST, SECOND, UNMARKED = "best", "second", ""
 
 

@@ -11,6 +11,9 @@ from omegaconf import OmegaConf
 
 from completesplat.reports.sweeps.planned import planned
 
+PROTOCOL = "protocol"
+"""Where results say how they were measured, beside the entries of the predictors."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -27,6 +30,15 @@ class Job:
     @property
     def test(self) -> dict[str, Any]:
         """`Evaluation.results` of the test set, by predictor; empty where nothing was tested."""
+        return {key: entry for key, entry in self._results.items() if key != PROTOCOL}
+
+    @property
+    def protocol(self) -> dict[str, Any]:
+        """How the test was done; empty where nothing was tested, or where the results do not say it."""
+        return self._results.get(PROTOCOL, {})
+
+    @property
+    def _results(self) -> dict[str, Any]:
         return (self.metrics or {}).get("test", {})
 
 

@@ -53,7 +53,8 @@ def _flat(entry: dict[str, Any]) -> Iterator[tuple[str, float]]:
     for region, views in entry.items():
         if isinstance(views, dict):
             for view, metrics in views.items():
-                yield from ((f"{region}_{view}_{metric}", value) for metric, value in metrics.items())
+                if isinstance(metrics, dict):  # the seconds of a sequence are not
+                    yield from ((f"{region}_{view}_{metric}", value) for metric, value in metrics.items())
 
 
 def _row(label: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:

@@ -1,0 +1,73 @@
+"""What figures were measured of, and how: without it they say nothing."""
+
+import hashlib
+import sys
+from pathlib import Path
+from typing import Any
+
+from completesplat import __version__
+from completesplat.commands.source import git_commit
+
+LPIPS = {"net": "vgg", "version": "0.1", "range": [-1, 1]}
+METRICS: dict[str, dict[str, Any]] = {
+    "psnr": {"range": [0, 1], "limit_db": 100},
+    "ssim": {"window": 11, "sigma": 1.5, "range": [0, 1]},
+    "lpips": LPIPS,
+}
+
+
+def protocol(name: str, module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
+    """The statement that stands beside the results of a test.
+
+    Args:
+        name: of the protocol.
+        results: of the module's test.
+    """
+    from completesplat.reports.machine import machine
+
+    evaluation, model = module.evaluation, results["model"]
+    resolution = data.image_size
+    described = {
+        "name": name,
+        "method": module.method,
+        **data.describe(),
+        "image_size": evaluation.model_size or resolution,
+        "resolution": resolution,
+        **{"scenes": model["scenes"], "skipped": evaluation.skipped, "views": model["views"]},
+        **{"samples": evaluation.samples, "criterion": evaluation.criterion, "seed": evaluation.seed},
+        **drawing(module),
+        "object_pixels": "background black in both, by the true mask cut at 0.5",
+        "average": "over the views of a scene, then over scenes",
+        "metrics": {name: METRICS[name] for name in evaluation.metrics if name in METRICS},
+        "missing": evaluation.missing,
+        "data_fingerprint": data.source("test").fingerprint(),
+        **{"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)},
+        "machine": machine(),
+    }
+    for metric in evaluation.set_metrics:
+        described["metrics"] |= metric.settings()
+    return described
+
+
+def drawing(module: Any) -> dict[str, Any]:
+    """How samples are drawn; nulls for a model that draws none."""
+    if not module.draws_samples:
+        return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight"))
+    sampler = module.completesplat.sampler
+    return {
+        "sampler": type(sampler.scheduler).__name__,
+        "steps": sampler.steps,
+        "skip_weight": module.skip_weight,
+        "guidance_weight": module.guidance_weight,
+    }
+
+
+def checkpoint_facts(path: Path) -> dict[str, Any]:
+    """Which weights a file holds, and whether they are an average over training (Lightning's `WeightAveraging`)."""
+    from completesplat.training.checkpoints import read_checkpoint
+
+    contents = read_checkpoint(path)
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    facts = {"path": str(path), "sha256": digest, "step": contents.get("global_step")}
+    return {"checkpoint": facts, "ema": "averaging_state" in contents}

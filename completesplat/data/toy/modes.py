@@ -1,0 +1,166 @@
+"""The toy objects' hidden modes: every colour that the patch on the back could have had, rendered.
+
+A set's scenes are drawn again from the seed in its `toy.json`, and rendered once for each colour of the patch.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from completesplat.data.checks import at, field, read_json
+from completesplat.data.hidden_modes import HiddenModes
+from completesplat.data.scenes import Choice, SceneStore
+from completesplat.data.sequences import PosedSequence
+from completesplat.data.toy.co3d_files import CATEGORY
+from completesplat.data.toy.objects import FORMAT_VERSION
+from completesplat.data.toy.scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
+from completesplat.data.toy.visibility import unseen
+from completesplat.data.transforms import cut_square, principal_square
+from completesplat.data.view_selection import evaluation_views
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.scene import SceneBatch
+from completesplat.tensors import stack
+
+# A channel of two modes must differ by more than this for a pixel to be of the patch; less is its blurred edge.
+DIFFERENCE = 0.1
+# Modes must not differ in the reference picture by more than rounding to bytes can.
+LEAK = 1.5 / 255
+# Share of a picture that the patch must cover.
+SMALLEST_PATCH = 0.005
+# Root mean square difference of a picture from its render: JPEG stays below, another colour of the patch above.
+SAME_PICTURE = 0.025
+
+Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
+
+
+class ToyHiddenModes:
+    """The test scenes of a set of toy objects with all their modes.
+
+    Args:
+        root: folder of the category.
+        store: its test scenes.
+        choose: sequence -> reference and targets, of which the reference counts.
+        image_size: side of the store's pictures.
+        views, spread_views: see `KnowsHiddenModes.hidden_modes`.
+
+    Raises:
+        DataError: `root` holds no complete set that was written by this version.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        store: SceneStore,
+        choose: Callable[[PosedSequence], Choice],
+        image_size: int,
+        views: int,
+        spread_views: int,
+    ) -> None:
+        self.store = store
+        self.choose = choose
+        self.image_size = image_size
+        self.views = views
+        self.spread_views = spread_views
+        self.folder = root / CATEGORY
+        description = self.folder / "toy.json"
+        if not description.is_file():
+            raise DataError("no toy.json: hidden modes need toy objects as they were written", str(self.folder))
+        with at(description):
+            parameters = read_json(description)
+            if field(parameters, "format", int) != FORMAT_VERSION:
+                raise DataError("of another version: write the toy objects again into another folder")
+            self.seed, self.frames, self.size = (field(parameters, key, int) for key in ("seed", "frames", "size"))
+
+    def __len__(self) -> int:
+        return len(self.store.names)
+
+    def __getitem__(self, index: int) -> HiddenModes:
+        """See `HiddenModeScenes`."""
+        name = self.store.names[index]
+        toy, sequence = self._drawn_again(name), self.store.source.read(name)
+        reference, _ = self.choose(sequence)
+        frames = sequence.frames
+        if self._differs(self._truths(toy, frames[reference]), LEAK).any():
+            raise DataError("the reference view tells the patch's colour", sequence=name)
+        behind, truths, region = self._from_behind(toy, name, frames, reference)
+        targets = sorted({*behind, *self._spread(frames, reference)})
+        scene = stack([self.store.scene(sequence, reference, targets)])
+        true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
+        self._check_pictures(toy, scene, frames[reference], truths[true_mode], views)
+        hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
+        colors = tuple(PATCH_COLORS)
+        # `draw_scene` chooses among the colours uniformly, whatever else is in the scene.
+        chances = torch.full((len(colors),), 1 / len(colors))
+        return HiddenModes(scene, views, truths, region, chances, torch.stack(hidden), colors, true_mode)
+
+    def _drawn_again(self, name: str) -> ToyScene:
+        number, _, family = name.partition("_")
+        scene = draw_scene(np.random.default_rng([self.seed, int(number)]), self.frames) if number.isdigit() else None
+        if scene is None or scene.family != family:
+            raise self._other_set(name)
+        return scene
+
+    def _other_set(self, name: str) -> CompleteSplatError:
+        return CompleteSplatError(
+            f"{self.folder}: {name} is not the scene that toy.json describes: write the set again"
+        )
+
+    def _truths(self, scene: ToyScene, frame: int) -> Float[Tensor, "mode 3 size size"]:
+        """The picture of a frame in every mode, in the pixels of the set's own pictures."""
+        modes = [scene.patch._replace(color=np.array(color)) for color in PATCH_COLORS.values()]
+        return torch.stack([self._render(replace(scene, patch=mode), frame) for mode in modes])
+
+    def _render(self, scene: ToyScene, frame: int) -> Float[Tensor, "3 size size"]:
+        """As written to disk (but for JPEG) and read again."""
+        picture = Image.fromarray(np.round(255 * render_frame(scene, frame, self.size)[0].clip(0, 1)).astype(np.uint8))
+        square = principal_square((self.size / 2, self.size / 2), (self.size, self.size))
+        return cut_square(picture, square, self.image_size).float() / 255
+
+    def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
+        """Up to `views` views that show enough of the patch, with their truths and the patch's pixels.
+
+        Those that look at it most directly come first.
+        """
+        toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
+        facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
+        chosen, truths, regions = [], [], []
+        for view in sorted(range(len(frames)), key=lambda view: -facing[frames[view]]):
+            if len(chosen) == self.views or facing[frames[view]] <= 0:
+                break
+            pictures = self._truths(scene, frames[view])
+            region = self._differs(pictures, DIFFERENCE)
+            if view != reference and region.float().mean() >= SMALLEST_PATCH:
+                chosen.append(view)
+                truths.append(pictures)
+                regions.append(region)
+        if not chosen:
+            raise DataError("no view shows enough of the patch", sequence=name)
+        return chosen, torch.stack(truths, dim=1), torch.stack(regions)
+
+    @staticmethod
+    def _differs(truths: Float[Tensor, "mode 3 size size"], by: float) -> Bool[Tensor, "size size"]:
+        return ((truths.amax(0) - truths.amin(0)) > by).any(0)
+
+    def _spread(self, frames: tuple[int, ...], reference: int) -> list[int]:
+        others = [view for view in range(len(frames)) if view != reference]
+        return [others[place - 1] for place in evaluation_views(len(frames), self.spread_views)[1]]
+
+    def _check_pictures(
+        self,
+        toy: ToyScene,
+        scene: SceneBatch,
+        frame: int,
+        truth: Float[Tensor, "view 3 size size"],
+        views: tuple[int, ...],
+    ) -> None:
+        """That the drawn scene is the one on the disk: the reference picture and those that show the modes."""
+        drawn = torch.cat([self._render(toy, frame)[None], truth])
+        stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
+        if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
+            raise self._other_set(scene.names[0])

@@ -1,0 +1,33 @@
+"""Metrics that cannot be measured here: they are named with the reason, and nothing stands in for them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from completesplat.errors import WeightsError
+
+Metric = TypeVar("Metric")
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Why a metric is not measured."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return f"missing: {self.reason}"
+
+
+def unless_missing(weights: str | None, load: Callable[[str], Metric], advice: str) -> Metric | Missing:
+    """What `load` makes of the weights; without them, or where they cannot be used, the reason.
+
+    Args:
+        advice: what to do where there are none.
+    """
+    if weights is None:
+        return Missing(advice)
+    try:
+        return load(weights)
+    except WeightsError as error:
+        return Missing(" ".join(str(error).split()))

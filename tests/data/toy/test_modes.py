@@ -1,0 +1,104 @@
+"""Toy objects in every colour of the patch: the pictures on the disk are one of them, and the front tells nothing."""
+
+import json
+import shutil
+from itertools import combinations
+
+import pytest
+import torch
+
+from completesplat.data.hidden_modes import hidden_modes
+from completesplat.data.toy.modes import DIFFERENCE, SAME_PICTURE
+from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
+from completesplat.data.toy.scene import PATCH_COLORS
+from completesplat.errors import CompleteSplatError, DataError
+
+
+def scenes_of(root, views=2, spread_views=3, **settings):
+    module = ToyObjectsDataModule(str(root), **{"image_size": 32} | settings)
+    module.setup("test")
+    return hidden_modes(module, views, spread_views), module
+
+
+@pytest.fixture(scope="module")
+def scene(toy_root):
+    return scenes_of(toy_root)[0][0]
+
+
+@pytest.mark.parametrize("image_size", [32, 20])
+def test_the_true_colour_and_no_other_is_what_the_data_module_yields(toy_root, image_size):
+    scenes, module = scenes_of(toy_root, image_size=image_size)
+    assert len(scenes) == 1
+    scene, batch = scenes[0], next(iter(module.test_dataloader()))
+    name, views = scene.scene.names[0], list(scene.views)
+    told = json.loads((toy_root / "toy_objects" / name / "toy.json").read_text())
+    assert scene.modes[scene.true_mode] == told["patch_color"]
+    assert batch.names == (name,)
+    assert torch.equal(batch.reference.images, scene.scene.reference.images)
+    stored = scene.scene.targets.images[0, views]
+    # The same frames in the evaluation batch, whose targets are all of them.
+    same = (batch.targets.images[0, :, None] == stored).flatten(2).all(2)
+    assert same.any(0).all()
+    errors = (scene.truths - stored).square().mean((1, 2, 3, 4)).sqrt()
+    assert errors[scene.true_mode] < 0.015  # JPEG's
+    others = [mode for mode in range(len(PATCH_COLORS)) if mode != scene.true_mode]
+    assert errors[others].min() > SAME_PICTURE
+
+
+def test_modes_differ_in_the_patch_and_nowhere_else(scene):
+    assert scene.truths.shape[:2] == (len(PATCH_COLORS), len(scene.views))
+    assert torch.equal(scene.probabilities, torch.full((4,), 0.25))
+    differences = torch.stack([(one - other).abs().amax(1) for one, other in combinations(scene.truths, 2)])
+    assert (differences[:, ~scene.region] <= DIFFERENCE).all()
+    assert (differences.amax(0)[scene.region] > DIFFERENCE).all()
+
+
+def test_the_reference_does_not_show_the_patch(scene):
+    # But for the middles of pixels at its edge.
+    assert scene.unseen[list(scene.views)][scene.region].float().mean() > 0.95
+
+
+def test_views_look_at_the_back(toy_root):
+    scene = scenes_of(toy_root, views=1, spread_views=3)[0][0]
+    (view,) = scene.views
+    # In the frame of the reference, which looks along z.
+    axes = scene.scene.targets.cameras.world_to_camera[0, :, 2, :3]
+    assert len(axes) == 3
+    assert axes[view, 2] == axes[:, 2].min()
+    assert axes[view, 2] < -0.3
+
+
+def test_a_front_that_tells_the_colour_is_refused(toy_root):
+    scenes, _ = scenes_of(toy_root)
+    scenes.choose = lambda sequence: (len(sequence.frames) // 2, [0])  # the reference looks at the back
+    with pytest.raises(DataError, match="tells the patch's colour"):
+        scenes[0]
+
+
+def test_other_data_are_refused(tmp_path):
+    rooms = ToyRoomsDataModule(str(tmp_path))
+    with pytest.raises(CompleteSplatError, match="needs data whose hidden parts are known: toy objects"):
+        hidden_modes(rooms, 1, 1)
+
+
+def changed(toy_root, tmp_path, **parameters):
+    shutil.copytree(toy_root, tmp_path / "copy")
+    path = tmp_path / "copy/toy_objects/toy.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | parameters))
+    return tmp_path / "copy"
+
+
+def test_scenes_of_other_numbers_are_refused(toy_root, tmp_path):
+    scenes, _ = scenes_of(changed(toy_root, tmp_path, seed=6))
+    with pytest.raises(CompleteSplatError, match=r"not the scene that toy\.json describes") as refusal:
+        scenes[0]
+    assert not isinstance(refusal.value, DataError)  # which would be skipped
+
+
+def test_another_version_or_nothing_written_down_is_refused(toy_root, tmp_path):
+    copy = changed(toy_root, tmp_path, format=0)
+    with pytest.raises(DataError, match="another version"):
+        scenes_of(copy)
+    (copy / "toy_objects/toy.json").unlink()
+    with pytest.raises(DataError, match=r"no toy\.json"):
+        scenes_of(copy)

@@ -1,0 +1,101 @@
+"""FID and KID against computations by other means."""
+
+import warnings
+from itertools import combinations, product
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import sqrtm
+
+from completesplat.metrics.distribution import frechet_distance, kernel_distance
+
+
+@pytest.fixture(scope="module")
+def features() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    mixing = torch.randn(6, 6, generator=generator)
+    return torch.randn(50, 6, generator=generator) @ mixing, 0.3 + torch.randn(40, 6, generator=generator).abs()
+
+
+def moments(features: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    values = features.double().numpy()
+    return values.mean(0), np.cov(values, rowvar=False)
+
+
+def test_frechet_distance_agrees_with_a_matrix_square_root(features):
+    (mean, covariance), (other_mean, other_covariance) = (moments(x) for x in features)
+    root = sqrtm(covariance @ other_covariance).real
+    expected = ((mean - other_mean) ** 2).sum() + np.trace(covariance + other_covariance - 2 * root)
+    assert frechet_distance(*features) == pytest.approx(expected, rel=1e-6)
+    assert frechet_distance(*reversed(features)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_frechet_distance_of_a_set_that_is_shifted_and_scaled_has_a_closed_form(features):
+    """Of N(m, S) and N(am + b, a^2 S): the squared distance of the means and (a - 1)^2 tr S."""
+    mean, covariance = moments(features[0])
+    changed = 1.5 * features[0].double() + 2
+    expected = ((0.5 * mean + 2) ** 2).sum() + 0.25 * np.trace(covariance)
+    assert frechet_distance(features[0].double(), changed) == pytest.approx(expected, rel=1e-6)
+
+
+def test_equal_sets_have_no_frechet_distance_even_with_fewer_items_than_features(features):
+    few = features[0][:4]
+    assert frechet_distance(few, few.flip(0)) == pytest.approx(0, abs=1e-4)
+
+
+def test_small_differences_beside_a_large_mean_are_kept(features):
+    """In float32 the squares of the means would drown the variances."""
+    near = frechet_distance(features[0].double(), features[0].double() * 1.01)
+    far = frechet_distance(features[0].double() + 3e4, (features[0].double() * 1.01) + 3e4)
+    mean, covariance = moments(features[0])
+    assert near == pytest.approx(1e-4 * ((mean**2).sum() + np.trace(covariance)), rel=1e-4)
+    assert far == pytest.approx(near, rel=1e-2)
+
+
+def kernel(one: np.ndarray, other: np.ndarray) -> float:
+    return float(one @ other / len(one) + 1) ** 3
+
+
+def test_kernel_distance_agrees_with_sums_over_pairs(features):
+    first, second = (x[:12].double().numpy() for x in features)
+    within = [np.mean([kernel(a, b) for a, b in combinations(values, 2)]) for values in (first, second)]
+    expected = sum(within) - 2 * np.mean([kernel(a, b) for a, b in product(first, second)])
+    found = kernel_distance(features[0][:12], features[1][:12], subsets=2)
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_kernel_distance_is_unbiased():
+    """The mean over all subsets of a size is the same for every size; a biased estimate would grow as they shrink."""
+    generator = torch.Generator().manual_seed(1)
+    first, second = torch.randn(20, 3, generator=generator), torch.randn(20, 3, generator=generator)
+    whole = kernel_distance(first, second)
+    halves = kernel_distance(first, second, subset_size=5, subsets=1500)
+    # A biased one adds, for each set, about this much more to a subset of 5 than to all 20.
+    bias = np.mean([kernel(a.numpy(), a.numpy()) for a in first]) * (1 / 5 - 1 / 20)
+    assert abs(halves - whole) < 0.2 * bias
+
+
+def test_the_seed_alone_decides_the_subsets(features):
+    torch.manual_seed(1)
+    one = kernel_distance(*features, subset_size=10, subsets=3, seed=5)
+    state = torch.get_rng_state()
+    assert kernel_distance(*features, subset_size=10, subsets=3, seed=5) == one
+    assert kernel_distance(*features, subset_size=10, subsets=3, seed=6) != one
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_sets_are_not_added_up_over_processes(features, monkeypatch):
+    expected = frechet_distance(*features)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda *_: 2)
+    assert frechet_distance(*features) == expected
+
+
+@pytest.mark.parametrize("distance", [frechet_distance, kernel_distance])
+def test_one_item_is_no_set_and_two_are(distance, features):
+    with pytest.raises(ValueError, match="two items"):
+        distance(features[0][:1], features[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        distance(features[0][:2], features[1])

@@ -1,0 +1,96 @@
+"""The Inception of FID and KID, with a small TorchScript network of the same calling convention in its place."""
+
+import hashlib
+
+import pytest
+import torch
+
+from completesplat.errors import WeightsError
+from completesplat.metrics.inception import SHA256, URL, load_inception
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
+
+
+class Means(torch.nn.Module):
+    """Mean of each channel, by a product that autocast would round, and mean of the whole image."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.factor = torch.nn.Parameter(torch.eye(3))
+
+    def forward(self, img: torch.Tensor, return_features: bool = False, use_fp16: bool = False) -> torch.Tensor:
+        assert img.dtype == torch.uint8
+        assert not self.training
+        x = img.float().mean((2, 3)) @ self.factor
+        if return_features:
+            return torch.cat([x, x.mean(1, keepdim=True)], 1)
+        return x.softmax(1)
+
+
+class Nameless(torch.nn.Module):
+    def forward(self, img: torch.Tensor) -> torch.Tensor:
+        return img
+
+
+@pytest.fixture
+def file(tmp_path):
+    torch.jit.script(Means()).save(str(tmp_path / "inception.pt"))
+    return tmp_path / "inception.pt"
+
+
+def test_features_are_those_of_the_image_in_8_bits(file):
+    network = load_inception(str(file), hashlib.sha256(file.read_bytes()).hexdigest())
+    levels = torch.tensor([0.0, 0.4999 / 255, 0.5001 / 255, 0.6, 1.0, 1.5, -1.0])
+    images = levels.view(-1, 1, 1, 1) * torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1).expand(3, 4, 5)
+    features = network(images)
+    red = torch.tensor([0.0, 0, 1, 153, 255, 255, 0])
+    torch.testing.assert_close(features[:, 0], red)
+    torch.testing.assert_close(features[:, 3], red / 3)
+    assert features.shape == (7, 4)
+    assert not features.requires_grad
+
+
+def test_the_network_is_frozen_and_knows_no_autocast(file):
+    network = load_inception(str(file), None)
+    image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(0))
+    exact = network(image)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(network(image), exact)
+    assert not any(parameter.requires_grad for parameter in network.parameters())
+
+
+def refusal(path: object, sha256: str | None) -> str:
+    with pytest.raises(WeightsError) as caught:
+        load_inception(str(path), sha256)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"{path}: ")
+    assert f"curl -LO {URL}" in message
+    return message
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    assert "no such file" in refusal(tmp_path / "none.pt", None)
+
+
+def test_only_the_published_file_is_run_unless_another_hash_is_given(file):
+    with pytest.raises(WeightsError, match=f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}, not {SHA256}"):
+        load_inception(str(file))
+    refusal(file, "0" * 64)
+
+
+def test_a_damaged_file_is_refused(file, tmp_path):
+    contents = file.read_bytes()
+    for name, damaged in (("page", b"<html>"), ("empty", b""), ("half", contents[: len(contents) // 2])):
+        (tmp_path / name).write_bytes(damaged)
+        assert "not a readable TorchScript file" in refusal(tmp_path / name, None)
+
+
+def test_mere_weights_are_refused(tmp_path):
+    torch.save(Means().state_dict(), tmp_path / "weights.pt")
+    assert "not a readable TorchScript file" in refusal(tmp_path / "weights.pt", None)
+
+
+def test_another_network_is_refused(tmp_path):
+    torch.jit.script(Nameless()).save(str(tmp_path / "other.pt"))
+    assert "gives no features" in refusal(tmp_path / "other.pt", None)

@@ -1,0 +1,101 @@
+"""Files of weights from disk and from URLs: the right ones, or a refusal that says what to do."""
+
+import hashlib
+import socket
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+import torch
+
+from completesplat.errors import WeightsError
+from completesplat.weights_files import weights_file
+
+CONTENTS = b"weights"
+HASH = hashlib.sha256(CONTENTS).hexdigest()
+
+
+def find(weights: object, sha256: str | None = None) -> Path:
+    return weights_file(str(weights), sha256, "do this", "its.hash")
+
+
+def refusal(weights: object, sha256: str | None = None) -> str:
+    with pytest.raises(WeightsError) as caught:
+        find(weights, sha256)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "do this" in message
+    return message
+
+
+@pytest.fixture
+def file(tmp_path):
+    (tmp_path / "net.pth").write_bytes(CONTENTS)
+    return tmp_path / "net.pth"
+
+
+def test_the_right_hash_its_first_digits_or_none_find_the_file(file):
+    for sha256 in (None, HASH, HASH[:8], HASH.upper()):
+        assert find(file, sha256) == file
+
+
+def test_a_file_may_be_given_from_home(file, monkeypatch):
+    monkeypatch.setenv("HOME", str(file.parent))
+    assert find("~/net.pth") == file
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
+    for path in (tmp_path / "none.pth", tmp_path):
+        assert refusal(path) == f"{path}: no such file; do this"
+
+
+def test_another_file_is_refused_with_the_hash_it_has(file):
+    message = refusal(file, "0" * 64)
+    assert f"{file}: SHA-256 {HASH}, not {'0' * 64}" in message
+    assert f"its.hash={HASH}" in message
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.hub, "_hub_dir", None)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    return tmp_path / "torch" / "hub" / "checkpoints"
+
+
+def test_an_unreachable_url_is_refused(hub):
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{unused.getsockname()[1]}/net.pth"
+        assert f"{url} cannot be downloaded" in refusal(url)
+    assert list(hub.iterdir()) == []
+
+
+@pytest.fixture
+def url(file):
+    """Of the file's folder."""
+    handler = partial(SimpleHTTPRequestHandler, directory=str(file.parent))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=partial(server.serve_forever, poll_interval=0.01), daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+def test_a_url_is_downloaded_once_into_torchs_cache(hub, file, url):
+    assert find(f"{url}/net.pth?token=1", HASH.upper()) == hub / "net.pth"
+    file.unlink()
+    assert find(f"{url}/net.pth").read_bytes() == CONTENTS
+
+
+def test_a_download_with_another_hash_or_without_a_file_is_refused_and_not_kept(hub, url):
+    assert "cannot be downloaded" in refusal(f"{url}/net.pth", "0" * 64)
+    assert "404" in refusal(f"{url}/none.pth")
+    assert list(hub.iterdir()) == []
+
+
+def test_another_file_in_the_cache_is_refused(hub, url):
+    hub.mkdir(parents=True)
+    (hub / "net.pth").write_bytes(b"another")
+    assert f"{hub / 'net.pth'}: SHA-256" in refusal(f"{url}/net.pth", HASH)
