@@ -129,7 +129,8 @@ class ToyHiddenModes:
         """
         toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
         facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
-        chosen, truths, regions = [], [], []
+        chosen: list[int] = []
+        truths, regions = [], []
         for view in sorted(range(len(frames)), key=lambda view: -facing[frames[view]]):
             if len(chosen) == self.views or facing[frames[view]] <= 0:
                 break

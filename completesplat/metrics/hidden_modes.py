@@ -1,0 +1,127 @@
+"""How well samples cover what could be there, where all of it is known: the modes of a hidden region.
+
+A sample belongs to its nearest mode (root mean square difference over the region's pixels) if it is nearer to it than
+half the smallest distance between two modes, and nearer than to the modes' mean. All others are rejected, as blurred or
+as something else altogether.
+
+- Within half the smallest distance of a mode no other mode is as near, so the class is certain; the even mixture of two
+  modes never belongs to any.
+- The second condition rejects the modes' mean, the best guess in the squared error, and what is close to it, even where
+  a mode happens to lie beside the mean.
+- A region that resembles a mode by chance counts as that mode: one that is yellow because the whole object is.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+REJECTED = -1
+
+
+@dataclass(frozen=True)
+class HiddenModeScores:
+    """Scores of one scene's samples, or means of several scenes'.
+
+    Attributes:
+        coverage: share of the modes (of positive probability) that at least one sample belongs to.
+        total_variation: of the samples' shares from the modes' probabilities, half the sum of absolute differences;
+            rejected samples are a class of their own, of probability 0, so that 1 is the worst: nothing but them.
+            A perfect sampler of few samples does not reach 0; compare with draws of the true distribution.
+        sharpness: distance of a sample to its nearest mode, over that of the modes' mean to its nearest mode; mean over
+            the samples, the rejected too. 0: exactly modes; 1: as far from them as their mean.
+        rejected: share of the samples.
+    """
+
+    coverage: float
+    total_variation: float
+    sharpness: float
+    rejected: float
+
+
+def distances(
+    samples: Float[Tensor, "sample pixel 3"], modes: Float[Tensor, "mode pixel 3"]
+) -> Float[Tensor, "sample mode"]:
+    """Root mean square difference of every sample and every mode."""
+    return torch.stack([(samples - mode).square().mean((1, 2)).sqrt() for mode in modes], dim=1)
+
+
+def classify(
+    samples: Float[Tensor, "sample pixel 3"],
+    modes: Float[Tensor, "mode pixel 3"],
+    probabilities: Float[Tensor, " mode"],
+) -> Int64[Tensor, " sample"]:
+    """The mode that each sample belongs to, or `REJECTED`.
+
+    Raises:
+        ValueError: fewer than two modes, equal ones, or no pixels.
+    """
+    if len(modes) < 2 or not modes.shape[1]:
+        raise ValueError("needs two modes and a pixel")
+    between = distances(modes, modes).fill_diagonal_(torch.inf)
+    if not between.min() > 0:
+        raise ValueError("two modes are equal")
+    nearest, mode = distances(samples, modes).min(dim=1)
+    from_mean = distances(samples, mean_of(modes, probabilities)[None])[:, 0]
+    accepted = (nearest < between.min() / 2) & (nearest < from_mean)
+    return mode.where(accepted, torch.full_like(mode, REJECTED))
+
+
+def mean_of(
+    modes: Float[Tensor, "mode *picture _"], probabilities: Float[Tensor, " mode"]
+) -> Float[Tensor, "*picture _"]:
+    """The modes' mean, weighted by their probabilities."""
+    return torch.tensordot(probabilities, modes, dims=1)
+
+
+def scores(
+    samples: Float[Tensor, "sample pixel 3"],
+    modes: Float[Tensor, "mode pixel 3"],
+    probabilities: Float[Tensor, " mode"],
+) -> HiddenModeScores:
+    """Scores of one scene.
+
+    Args:
+        samples: renders of the region, the pixels of all its views in one row.
+        modes: its pixels in every mode.
+        probabilities: of the modes; they sum to 1.
+
+    Raises:
+        ValueError: no samples, or what `classify` refuses.
+    """
+    if not len(samples):
+        raise ValueError("needs a sample")
+    classes = classify(samples, modes, probabilities)
+    shares = torch.stack([(classes == mode).float().mean() for mode in range(len(modes))])
+    rejected = (classes == REJECTED).float().mean()
+    possible = probabilities > 0
+    from_mean = distances(mean_of(modes, probabilities)[None], modes).min()
+    return HiddenModeScores(
+        coverage=(shares[possible] > 0).float().mean().item(),
+        total_variation=0.5 * ((shares - probabilities).abs().sum() + rejected).item(),
+        sharpness=(distances(samples, modes).min(dim=1).values.mean() / from_mean).item(),
+        rejected=rejected.item(),
+    )
+
+
+def mean_scores(of_scenes: Iterable[HiddenModeScores]) -> HiddenModeScores:
+    """Every scene counts the same.
+
+    Raises:
+        ValueError: no scenes.
+    """
+    values = list(of_scenes)
+    if not values:
+        raise ValueError("needs a scene")
+    names = [field.name for field in fields(HiddenModeScores)]
+    return HiddenModeScores(**{name: sum(getattr(one, name) for one in values) / len(values) for name in names})
+
+
+def draw_modes(
+    modes: Float[Tensor, "mode *picture _"], probabilities: Float[Tensor, " mode"], samples: int, seed: int
+) -> Float[Tensor, "sample *picture _"]:
+    """What a perfect model would draw: modes by their probabilities."""
+    generator = torch.Generator().manual_seed(seed)
+    return modes[torch.multinomial(probabilities.cpu(), samples, replacement=True, generator=generator)]

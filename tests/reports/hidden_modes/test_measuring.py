@@ -1,0 +1,140 @@
+"""The benchmark on constructed predictors, and samples of real models as renders."""
+
+import pytest
+import torch
+from support import tiny_generator
+
+from completesplat.data.hidden_modes import HiddenModes
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.losses import WeightedSum
+from completesplat.losses.mse import MeanSquaredError
+from completesplat.rasterizers import Rendering
+from completesplat.reports.hidden_modes.measuring import in_region, measure, usable
+from completesplat.reports.hidden_modes.predictors import predictors
+from completesplat.scene import SceneBatch, Views
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.reconstruction import ReconstructionModule
+
+SIZE, MODES, SAMPLES = 32, 4, 8
+
+
+def hidden_scene(seed: int) -> HiddenModes:
+    """Three targets, of which the last two show modes of random colours in a square."""
+    generator = torch.Generator().manual_seed(seed)
+    images = torch.rand(1, 4, 3, SIZE, SIZE, generator=generator)
+    cameras = Cameras(torch.eye(4).repeat(1, 4, 1, 1), pinhole(60, SIZE).repeat(1, 4, 1, 1), (SIZE, SIZE))
+    views = Views(images, cameras, torch.ones(1, 4, 1, SIZE, SIZE))
+    visible, frame = torch.ones(1, 1, SIZE, SIZE), torch.zeros(1, dtype=torch.int64)
+    depth_range = torch.tensor([[0.5, 4.0]])
+    scene = SceneBatch(views[:, 0], views[:, 1:], depth_range, visible, frame, (f"scene {seed}",))
+    region = torch.zeros(2, SIZE, SIZE, dtype=torch.bool)
+    region[:, 4:9, 10:17] = True
+    colors = torch.rand(MODES, 1, 3, 1, 1, generator=generator)
+    truths = torch.where(region[:, None], colors, images[0, 2:])
+    images[0, 2:] = truths[1]
+    unseen = torch.zeros(3, SIZE, SIZE, dtype=torch.bool)
+    unseen[1:] = region
+    even = torch.full((MODES,), 1 / MODES)
+    return HiddenModes(scene, (1, 2), truths, region, even, unseen, ("a", "b", "c", "d"), true_mode=1)
+
+
+SCENES = [hidden_scene(seed) for seed in range(2)]
+BY_NAME = {scene.scene.names[0]: scene for scene in SCENES}
+
+
+def renders(scene: SceneBatch, modes: list[int]) -> torch.Tensor:
+    """The true pictures, with one mode after the other where they can be seen."""
+    images = scene.targets.images[0].repeat(SAMPLES, 1, 1, 1, 1)
+    images[:, 1:] = BY_NAME[scene.names[0]].truths[(modes * SAMPLES)[:SAMPLES]]
+    return images
+
+
+def measured(modes: list[int], scenes=SCENES):
+    return measure({"model": lambda scene, seed: renders(scene, modes)}, iter(scenes), SAMPLES, 0, 1, 3)
+
+
+def test_constructed_predictors_have_their_scores():
+    perfect = measured([0, 1, 2, 3]).results(SAMPLES)
+    assert perfect["model"] == {
+        **{"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0},
+        **{"scenes": 2, "samples": SAMPLES},
+    }
+    collapsed = measured([2]).results(SAMPLES)["model"]
+    assert (collapsed["coverage"], collapsed["total_variation"]) == (1 / MODES, 1 - 1 / MODES)
+    mean, true = perfect["mean_predictor"], perfect["true_sampler"]
+    assert (mean["coverage"], mean["total_variation"], mean["rejected"]) == (0, 1, 1)
+    assert mean["sharpness"] == pytest.approx(1)
+    assert (true["sharpness"], true["rejected"]) == (0, 0)
+    assert 0 < true["total_variation"] < 0.6
+
+
+def test_the_error_of_wrong_modes_is_in_the_hidden_region():
+    found = measured([2]).calibration()["model"]
+    assert found["visible"]["squared_error"] == pytest.approx(0, abs=1e-12)
+    wrong = [(in_region(s.truths, s.region)[2] - in_region(s.truths, s.region)[1]).square().mean() for s in SCENES]
+    assert found["hidden"]["squared_error"] == pytest.approx(torch.stack(wrong).mean().item(), rel=1e-4)
+    assert found["hidden"]["variance"] == pytest.approx(0, abs=1e-12)
+
+
+def test_the_figure_shows_the_class_of_each_sample():
+    (shown,) = measured([3, 0, 1, 1]).shown["model"]
+    assert (shown.name, shown.classes) == ("scene 0", (3, 0, 1))
+    assert torch.equal(shown.samples, SCENES[0].truths[[3, 0, 1], 0])
+
+
+def test_scenes_of_no_use_are_counted():
+    found = measured([1], [DataError("broken", sequence="bad"), *SCENES])
+    assert (found.names, found.skipped) == (["scene 0", "scene 1"], ["bad: broken"])
+    with pytest.raises(CompleteSplatError, match=r"no test scene can be used.*bad: broken"):
+        measured([1], [DataError("broken", sequence="bad")])
+
+
+def test_scenes_that_cannot_be_made_are_passed_on_as_the_reason():
+    class Broken(list):
+        def __getitem__(self, index):
+            found = super().__getitem__(index)
+            if isinstance(found, DataError):
+                raise found
+            return found
+
+    scenes = Broken([SCENES[0], DataError("broken"), SCENES[1]])
+    assert [type(scene) for scene in usable(scenes, None)] == [HiddenModes, DataError, HiddenModes]
+    assert len(list(usable(scenes, 1))) == 1
+
+
+def flat(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+    """Pictures of one colour, the Gaussians' mean colour: all that is needed to tell samples apart."""
+    shape = (*cameras.world_to_camera.shape[:2], 3, SIZE, SIZE)
+    color = gaussians.colors.mean(1)[:, None, :, None, None].expand(shape)
+    return Rendering(color, color[:, :, :1], torch.ones_like(color[:, :, :1]))
+
+
+SURROUNDINGS = {"rasterizer": flat, "optimizer": torch.optim.SGD, "schedule": lambda *_: None}
+
+
+def test_a_model_that_draws_gives_the_same_samples_in_batches_of_any_size():
+    module = LatentDiffusion(tiny_generator(), **SURROUNDINGS).eval()
+    with torch.no_grad():
+        one, all_at_once = (predictors(module, 3, batch)["model"](SCENES[0].scene, 5) for batch in (1, 3))
+    assert one.shape == (3, 3, 3, SIZE, SIZE)
+    assert torch.allclose(one, all_at_once, atol=1e-5)
+    assert (one[0] - one[1]).abs().max() > 1e-4
+
+
+def test_a_model_of_one_answer_repeats_it_and_its_posterior_does_not():
+    model = tiny_generator().autoreconstructor
+    module = ReconstructionModule(
+        model, WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}}), **SURROUNDINGS
+    ).eval()
+    scene = SCENES[0].scene
+    with torch.no_grad():
+        several, at_once = (predictors(module, 3, batch) for batch in (2, 3))
+        repeated, drawn = several["model"](scene, 5), several["posterior_samples"](scene, 5)
+        expected = module.render(module.reconstruct(scene), scene)[0, 1:].clamp(0, 1)
+        together, others = at_once["posterior_samples"](scene, 5), at_once["posterior_samples"](scene, 6)
+    assert torch.equal(repeated, expected.expand(3, -1, -1, -1, -1))
+    assert torch.allclose(drawn, together, atol=1e-5)
+    for other in (drawn[[1, 2, 0]], others, repeated):
+        assert (drawn - other).abs().amax((1, 2, 3, 4)).min() > 1e-4
