@@ -8,7 +8,7 @@ VERBS = {
     "fit": "train a model, one stage at a time",
     "test": "score a checkpoint on held-out scenes",
     "predict": "draw complete scenes from one photograph",
-    "report": "compare samplers and controls of a trained model (report samplers, controls, masked)",
+    "report": "tables of results beside the paper's (report runs=DIR); samplers, controls, masks, depth (report NAME)",
     "bench": "time what takes time (bench rasterizers, bench data, bench diffusion, bench paper)",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(

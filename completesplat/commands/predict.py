@@ -46,6 +46,7 @@ def run(config: Any, out: Path) -> None:
             "fov_source": photograph.fov_source,
             "depth_range": model.depth_range.tolist(),
         },
+        maps=config.maps,
     )
 
 

@@ -1,4 +1,4 @@
-"""`completesplat report`: what samplers, controls and masks do to the samples of a trained model."""
+"""`completesplat report`: tables of results, and what samplers, controls and masks do to a trained model's samples."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -13,9 +13,6 @@ def run(config: Any, out: Path) -> None:
     """Do the chosen task (`conf/report_task/`)."""
     from hydra.utils import get_method
 
-    for name, least in (("scenes", 1), ("samples", 2)):
-        if config[name] < least:
-            raise CompleteSplatError(f"{name}={config[name]}: must be at least {least}")
     get_method(config.task)(config, out)
 
 
@@ -107,7 +104,7 @@ def open_run(config: Any) -> tuple[Any, list[Any]]:
 
     Raises:
         WeightsError: the checkpoint or its run's configuration is missing or does not fit.
-        CompleteSplatError: it is no latent diffusion model.
+        CompleteSplatError: it is no latent diffusion model, or there are too few scenes or samples.
     """
     import torch
     from hydra.utils import instantiate
@@ -117,6 +114,9 @@ def open_run(config: Any) -> tuple[Any, list[Any]]:
     from completesplat.reports.sampling.drawing import Artist, first_scenes
     from completesplat.training.checkpoints import load_part
 
+    for name, least in (("scenes", 1), ("samples", 2)):
+        if config[name] < least:
+            raise CompleteSplatError(f"{name}={config[name]}: must be at least {least}")
     run_config = config_of_run(Path(config.ckpt), list(config.overrides))
     quieten()
     module = instantiate(run_config.model, _convert_="all")

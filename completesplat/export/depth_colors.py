@@ -35,10 +35,15 @@ def color_depth(
     near, far = ordered[stray], ordered[-1 - stray]
     inverse = 1 / torch.where(seen, depth, far)
     span = (1 / near - 1 / far).clamp(min=1e-12)
-    position = ((inverse - 1 / far) / span).clamp(0, 1) * (len(STOPS) - 1)
-    stops = torch.tensor(STOPS, dtype=depth.dtype, device=depth.device)
+    colors = ramp((inverse - 1 / far) / span)
+    return torch.where(seen, colors, NOTHING), (near.item(), far.item())
+
+
+def ramp(values: Float[Tensor, "*batch 1 height width"]) -> Float[Tensor, "*batch 3 height width"]:
+    """Colours of values from 0 (dark) to 1 (bright); beyond these the ends' colours."""
+    position = values.clamp(0, 1) * (len(STOPS) - 1)
+    stops = torch.tensor(STOPS, dtype=values.dtype, device=values.device)
     lower = position.floor().clamp(max=len(STOPS) - 2)
     index = lower.long().squeeze(-3)
     mix = (position - lower).squeeze(-3)[..., None]
-    colors = torch.lerp(stops[index], stops[index + 1], mix).movedim(-1, -3)
-    return torch.where(seen, colors, torch.full_like(colors, NOTHING)), (near.item(), far.item())
+    return torch.lerp(stops[index], stops[index + 1], mix).movedim(-1, -3)

@@ -10,6 +10,7 @@ from rich.progress import track
 from torch import Tensor
 
 from completesplat.export.contact_sheet import Row, contact_sheet
+from completesplat.export.maps import write_maps
 from completesplat.export.ply import write_ply
 from completesplat.export.scene_json import write_scene_json
 from completesplat.export.video import write_video
@@ -31,6 +32,7 @@ def write_prediction(
     frames: int,
     background: float,
     settings: Mapping[str, Any],
+    maps: bool = False,
 ) -> None:
     """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
 
@@ -44,6 +46,7 @@ def write_prediction(
         frames: of each video.
         background: grey value where a scene leaves a pixel open.
         settings: recorded in `scene.json`; must hold the seed.
+        maps: depth, normals and opacity of the reference view as well, see `completesplat.export.maps`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rows, files, counts = [], {}, []
@@ -59,6 +62,10 @@ def write_prediction(
     angles = [360 / DIRECTIONS * k for k in range(DIRECTIONS)]
     contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows, angles)
     recorded = {**settings, "gaussians": counts, "up": up.tolist()}
+    if maps:
+        written, ends = write_maps(folder, scenes, reference, rasterizer)
+        files |= written
+        recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
 
 

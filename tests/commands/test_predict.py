@@ -143,3 +143,14 @@ def test_settings_without_a_meaning_are_refused_in_one_line(command, pipeline, t
     assert finished.err.splitlines()[-1].startswith("error: ")
     assert said in finished.err.splitlines()[-1]
     assert not (tmp_path / "out" / pipeline.photograph().stem).exists()
+
+
+def test_maps_are_written_if_wanted(command, pipeline, tmp_path):
+    assert predict(command, pipeline, tmp_path / "out", "maps=true").status == 0
+    folder = tmp_path / "out" / pipeline.photograph().stem
+    names = {f"{kind}_{index:02}.png" for kind in ("depth", "normals", "opacity") for index in (0, 1)}
+    assert {Image.open(folder / name).size for name in names} == {(32, 32)}
+    scene = strict_json(folder / "scene.json")
+    assert names <= set(scene["files"].values())
+    near, far = scene["settings"]["depth_map_ends"]
+    assert 0 < near < far

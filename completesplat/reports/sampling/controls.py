@@ -1,6 +1,6 @@
 """Skip and guidance weight: faithfulness to the input against diversity."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 
 import torch
@@ -8,7 +8,7 @@ import torch
 from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import psnr
 from completesplat.reports.sampling.drawing import Artist
-from completesplat.reports.sampling.measures import near, object_psnr
+from completesplat.reports.sampling.measures import farthest, mean_over_scenes, near, object_psnr
 from completesplat.reports.sampling.strips import Strip
 from completesplat.scene import SceneBatch
 
@@ -34,32 +34,36 @@ def rows(
     at most `near_degrees` away from the reference: mostly surface that the input shows (which surface it shows exactly
     would take depth maps, which scenes have not got). `diversity` is of the targets.
     """
+
+    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
+        images = artist(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        true = scene.all_views()
+        seen = near(scene.reference.cameras[0], scene.targets.cameras[0], near_degrees)
+        return {
+            "reference_psnr": psnr(images[:, 0], true.images[:, 0].expand_as(images[:, 0])).mean().item(),
+            "near_object_psnr": object_psnr(
+                images[:, 1:][:, seen], scene.targets.images[0, seen], scene.targets.masks[0, seen]
+            ),
+            "diversity": diversity(images[:, 1:]),
+        }
+
+    return over_settings(settings, scenes, measure, tick)
+
+
+def over_settings(
+    settings: Sequence[tuple[float, float]],
+    scenes: Sequence[SceneBatch],
+    measure: Callable[[SceneBatch, float, float], Mapping[str, float | None]],
+    tick: Callable[[str], None],
+) -> list[dict[str, float | bool | None]]:
+    """A row for each setting: the mean over the scenes of what is measured with its skip and guidance weight."""
     found: list[dict[str, float | bool | None]] = []
     for skip_weight, guidance_weight in settings:
         tick(f"skip weight {skip_weight:g}, guidance weight {guidance_weight:g}")
-        measured = [_measure(artist, scene, skip_weight, guidance_weight, near_degrees) for scene in scenes]
-        means: dict[str, float | bool | None] = {}
-        for key in measured[0]:
-            values = [value for row in measured if (value := row[key]) is not None]
-            means[key] = sum(values) / len(values) if values else None
+        means = mean_over_scenes([measure(scene, skip_weight, guidance_weight) for scene in scenes])
         paper = (skip_weight, guidance_weight) in PAPER
         found.append({"skip_weight": skip_weight, "guidance_weight": guidance_weight, "paper": paper, **means})
     return found
-
-
-def _measure(
-    artist: Artist, scene: SceneBatch, skip_weight: float, guidance_weight: float, near_degrees: float
-) -> dict[str, float | None]:
-    images = artist(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-    true = scene.all_views()
-    seen = near(scene.reference.cameras[0], scene.targets.cameras[0], near_degrees)
-    return {
-        "reference_psnr": psnr(images[:, 0], true.images[:, 0].expand_as(images[:, 0])).mean().item(),
-        "near_object_psnr": object_psnr(
-            images[:, 1:][:, seen], scene.targets.images[0, seen], scene.targets.masks[0, seen]
-        ),
-        "diversity": diversity(images[:, 1:]),
-    }
 
 
 def strips(
@@ -70,8 +74,7 @@ def strips(
     The far view is the target that looks in the direction most different from the reference's. The first row is the
     truth.
     """
-    axes = scene.targets.cameras.world_to_camera[0, :, 2, :3]
-    far = 1 + int((axes @ scene.reference.cameras.world_to_camera[0, 2, :3]).argmin())
+    far = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0])
     skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
     true = scene.all_views().images[0]
     rows: list[list[Strip | None]] = [[Strip(true[[0, far]], "truth: reference, far"), *[None] * (len(weights) - 1)]]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from completesplat.errors import DataError
 from completesplat.generation import CompleteSplat
-from completesplat.rasterizers import Rasterizer
+from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
 
 
@@ -29,9 +29,17 @@ class Artist:
     samples: int
     seed: int
 
-    @torch.no_grad()
     def __call__(self, scene: SceneBatch, **settings: Any) -> Float[Tensor, "sample view 3 height width"]:
-        """Renders of one scene (a batch of one), in [0, 1].
+        """Renders of one scene (a batch of one) over the background, in [0, 1]; see `render`."""
+        return self.over_background(self.render(scene, **settings))
+
+    def over_background(self, rendering: Rendering) -> Float[Tensor, "*batch 3 height width"]:
+        """Renders in [0, 1]."""
+        return rendering.over(self.background).clamp(0, 1)
+
+    @torch.no_grad()
+    def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
+        """Colour, depth and opacity of one scene (a batch of one), [sample view].
 
         Args:
             **settings: of `CompleteSplat.generate`.
@@ -46,7 +54,7 @@ class Artist:
             **settings,
         )
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
-        return self.rasterizer(gaussians, cameras).over(self.background).clamp(0, 1)
+        return self.rasterizer(gaussians, cameras)
 
 
 def first_scenes(data: Any, count: int) -> Iterator[SceneBatch]:

@@ -1,6 +1,7 @@
 """How faithful samples are to what is known."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -24,5 +25,23 @@ def object_psnr(
 
 def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
     """Which targets [view] look in the reference's direction, up to an angle between the optical axes."""
-    axis, axes = reference.world_to_camera[2, :3], targets.world_to_camera[:, 2, :3]
-    return axes @ axis >= math.cos(math.radians(degrees))
+    return _cosines(reference, targets) >= math.cos(math.radians(degrees))
+
+
+def farthest(reference: Cameras, targets: Cameras) -> int:
+    """Which of the targets [view] looks in the direction most different from the reference's."""
+    return int(_cosines(reference, targets).argmin())
+
+
+def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:
+    """Of the angles between the optical axes."""
+    return targets.world_to_camera[:, 2, :3] @ reference.world_to_camera[2, :3]
+
+
+def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """The mean of each figure, over the scenes that have it; None if none has."""
+    means: dict[str, float | None] = {}
+    for key in measured[0]:
+        values = [value for row in measured if (value := row[key]) is not None]
+        means[key] = sum(values) / len(values) if values else None
+    return means

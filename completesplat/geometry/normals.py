@@ -1,0 +1,45 @@
+"""Surface normals from a depth map."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from completesplat.geometry.cameras import Cameras, pixel_rays
+
+
+def normals_from_depth(
+    depth: Float[Tensor, "*batch 1 height width"], cameras: Cameras
+) -> Float[Tensor, "*batch 3 height width"]:
+    """Unit normals in the camera's frame (+x right, +y down, +z forward) that face the camera.
+
+    A pixel's normal is orthogonal to the two lines through its neighbours' points: left and right, above and below. It
+    is exact on planes, and of second order in the pixels' distance on smooth surfaces. Where one of two neighbours is
+    missing, the pixel's own point stands in.
+
+    Args:
+        depth: along the optical axis, through the pixels' centres. What is not finite or not positive is missing.
+        cameras: of the depth's size, [*batch] or one for all. Only their intrinsics matter.
+
+    Returns:
+        Normals, 0 where the depth is missing, or both neighbours are along a row or a column.
+    """
+    known = depth.isfinite() & (depth > 0)
+    points = torch.where(known, depth, 0) * pixel_rays(cameras).movedim(-1, -3)
+    right, down = _difference(points, known, -1), _difference(points, known, -2)
+    # Rows run downwards: right x down would point away from the camera.
+    normals = torch.nn.functional.normalize(torch.linalg.cross(down, right, dim=-3), dim=-3, eps=1e-30)
+    return torch.where(known, normals, 0)
+
+
+def _difference(
+    points: Float[Tensor, "*batch 3 height width"], known: Bool[Tensor, "*batch 1 height width"], axis: int
+) -> Float[Tensor, "*batch 3 height width"]:
+    """The next point minus the one before; the point itself in place of a missing one."""
+    size = points.shape[axis]
+    following = torch.arange(1, size + 1, device=points.device).clamp(max=size - 1)
+    before = torch.arange(-1, size - 1, device=points.device).clamp(min=0)
+    ends = (
+        torch.where(known.index_select(axis, index), points.index_select(axis, index), points)
+        for index in (following, before)
+    )
+    return next(ends) - next(ends)

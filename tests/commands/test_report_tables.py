@@ -1,0 +1,38 @@
+"""`completesplat report`: the paper's tables, with and without results of ours."""
+
+import json
+
+import pytest
+
+FILES = ("tables.md", "tables.csv", "tables.tex")
+PROTOCOL = {"data_set": "toy_objects", "resolution": 64, "scenes": 2}
+
+
+def test_without_runs_the_published_tables_are_written_and_printed(command, tmp_path):
+    finished = command("report", f"out={tmp_path / 'out'}")
+    assert finished.status == 0
+    for place in ("Table 2", "Table 3", "Table 4", "Table D1"):
+        assert place in finished.out
+        assert all(place in (tmp_path / "out" / name).read_text() for name in FILES)
+    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+
+
+def test_runs_are_found_and_what_is_broken_is_named(command, tmp_path):
+    for name in ("good", "bad"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    scores = {"scenes": 2, "views": 4, "full": {"novel": {"psnr": 21.125}}}
+    (tmp_path / "runs/good/metrics.json").write_text(json.dumps({"protocol": PROTOCOL, "model": scores}))
+    (tmp_path / "runs/bad/metrics.json").write_text("{")
+    finished = command("report", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}")
+    assert finished.status == 0
+    assert "toy_objects, scores, 64 pixels" in finished.out
+    assert "21.12" in (tmp_path / "out/tables.md").read_text()
+    assert str(tmp_path / "runs/bad/metrics.json") in finished.out + finished.err
+
+
+@pytest.mark.parametrize(("folder", "said"), [("nowhere", "no such folder"), ("", "completesplat test")])
+def test_a_folder_without_results_is_refused_in_one_line(command, tmp_path, folder, said):
+    finished = command("report", f"runs={tmp_path / folder}", f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith("error: runs=")
+    assert said in finished.err.splitlines()[-1]

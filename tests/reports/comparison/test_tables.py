@@ -1,0 +1,204 @@
+"""Which run stands in which table, and what its cells say."""
+
+import json
+
+import pytest
+
+from completesplat.errors import CompleteSplatError
+from completesplat.reports.comparison.building import tables
+from completesplat.reports.comparison.cells import Table
+from completesplat.reports.comparison.entries import duration
+
+HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
+ROOMS = {"name": "realestate10k_100", "data_set": "realestate10k", "resolution": 128, "image_size": 128, "scenes": 100}
+PAPERS = ["full_images", "realestate10k", "ablations", "objects_only"]
+
+
+def made(runs) -> dict[str, Table]:
+    return {table.name: table for table in tables(runs)[0]}
+
+
+def ours(table: Table) -> list[dict[str, str]]:
+    """The rows that are not the paper's, by heading."""
+    names = [f"{heading.group} {heading.text}".strip() for heading in table.headings]
+    rows = [row for row in table.rows if row.source != "paper"]
+    return [dict(zip(names, (cell.text for cell in row.cells), strict=True)) for row in rows]
+
+
+def entry(psnr: float) -> dict:
+    return {"scenes": 20, "views": 80, "full": {"novel": {"psnr": psnr}}, "object": {"novel": {"psnr": psnr + 1}}}
+
+
+def test_without_runs_there_are_the_published_tables_alone() -> None:
+    found, warnings = tables(None)
+    assert ([table.name for table in found], warnings) == (PAPERS, [])
+    assert not any(ours(table) for table in found)
+
+
+def test_a_run_by_the_papers_protocol_stands_below_its_rows_in_its_own_columns(runs, run) -> None:
+    run("a", 17.456, **HYDRANTS)
+    found = made(runs)
+    assert list(found) == PAPERS
+    (row,) = ours(found["full_images"])
+    assert row["method"] == "completesplat: VariationalAutoReconstructor [1]"
+    assert (row["Hydrants PSNR ↑"], row["Teddybears PSNR ↑"]) == ("17.46", "-")
+    assert (row["time per sequence inference"], row["time per sequence rendering"]) == ("15.7 ms", "4.1 min")
+    assert (row["scenes"], row["pixels"]) == ("77", "128")
+    (row,) = ours(found["objects_only"])
+    assert row["Hydrants PSNR ↑"] == "18.46"
+
+
+@pytest.mark.parametrize(
+    "different",
+    [
+        {"name": "images"},
+        {"resolution": 64},
+        {"resolution": 256},
+        {"skipped": 3},
+        {"data_set": "co3d/apple"},
+        {"data_set": "toy_objects"},
+        ROOMS | {"scenes": 99},
+        ROOMS | {"resolution": 256},
+        ROOMS | {"scenes": 6473, "resolution": 64},
+    ],
+)
+def test_a_run_by_another_protocol_stands_in_a_table_of_its_own(runs, run, different) -> None:
+    run("a", 17.5, **(HYDRANTS | different))
+    found = made(runs)
+    assert not any(ours(found[name]) for name in PAPERS)
+    (row,) = ours(found["own_1"])
+    assert row["all pixels, novel views PSNR ↑"] == "17.50"
+
+
+@pytest.mark.parametrize("size", [(100, 128), (6473, 128), (6473, 256)])
+def test_numbers_of_scenes_and_resolutions_of_the_paper_are_let_in(runs, run, size) -> None:
+    run("a", 20.0, **(ROOMS | {"scenes": size[0], "resolution": size[1]}))
+    (row,) = ours(made(runs)["realestate10k"])
+    assert (row["scenes"], row["pixels"], row["PSNR ↑"]) == (*map(str, size), "20.00")
+
+
+@pytest.mark.parametrize(("samples", "table"), [(20, "full_images"), (8, "own_1")])
+def test_an_oracle_stands_beside_one_of_as_many_samples_only(runs, run, samples, table) -> None:
+    several = {"samples": samples, "sampler": "DDIMScheduler", "method": "LatentDiffusion"}
+    run("a", 17.0, {"best_of_k": entry(18.0)}, **HYDRANTS, **several)
+    found = made(runs)
+    labels = [row["method"] for row in ours(found[table])]
+    assert f"completesplat: LatentDiffusion, {samples}-best oracle [1]" in labels
+    assert ours(found["full_images"])[0]["method"] == "completesplat: LatentDiffusion, single sample [1]"
+    assert ("own_1" in found) == (samples != 20)
+
+
+def test_what_has_seen_its_views_is_not_beside_the_paper(runs, run) -> None:
+    path = run("a", 30.0, **HYDRANTS)
+    results = json.loads(path.read_text())
+    results["model"]["upper_bound"] = True
+    path.write_text(json.dumps(results))
+    run("b", 20.0, **HYDRANTS | {"skipped": 0})
+    found = made(runs)
+    assert [row["Hydrants PSNR ↑"] for row in ours(found["full_images"])] == ["20.00"]
+    assert "(upper bound)" in ours(found["own_1"])[0]["method"]
+
+
+def test_a_fit_says_beside_its_test_that_its_model_has_seen_the_views(runs, run) -> None:
+    path = run("a", 30.0)
+    path.write_text(json.dumps({"upper_bound": True, "test": json.loads(path.read_text())}))
+    assert "(upper bound)" in ours(made(runs)["own_1"])[0]["method"]
+
+
+def test_own_tables_hold_only_what_was_measured_alike(runs, run) -> None:
+    changes = [{}, {"name": "other"}, {"scenes": 19}, {"views": 79}, {"data_fingerprint": "x"}, {"crop": "y"}]
+    for index, change in enumerate([{}, *changes]):
+        run(f"run{index}", 20.0 + index, **change)
+    rows = [len(ours(table)) for name, table in made(runs).items() if name.startswith("own_")]
+    assert sorted(rows) == [1] * 5 + [2]
+
+
+def test_best_and_second_of_our_own_are_marked_and_naive_predictors_are_not(runs, run) -> None:
+    for name, psnr in {"a": 20.0, "b": 22.0, "c": 21.0}.items():
+        run(name, psnr, {"mean_image": entry(99.0)})
+    table = made(runs)["own_1"]
+    column = [heading.text for heading in table.headings].index("PSNR ↑")
+    cells = [(row.cells[column].text, row.cells[column].mark) for row in table.rows]
+    assert cells == [("20.00", ""), ("22.00", "best"), ("21.00", "second"), ("99.00", "")]  # and once only
+
+
+def test_what_is_missing_says_why_below_the_table(runs, run) -> None:
+    run("a", 17.5, **HYDRANTS, missing={"lpips": "missing: no weights of VGG", "fid": "missing: no Inception"})
+    table = made(runs)["full_images"]
+    (row,) = ours(table)
+    for column, reason in (
+        ("LPIPS ↓", "lpips: missing: no weights of VGG"),
+        ("FID ↓", "fid: missing: no Inception"),
+        ("KID ↓", "kid: not measured for model"),
+    ):
+        text = row[f"Hydrants {column}"]
+        assert text.startswith("missing: note ")
+        assert f"[{text.removeprefix('missing: note ')}] {reason}" in table.below()
+
+
+def test_a_fit_with_its_test_is_a_run(runs, run) -> None:
+    path = run("a", 20.0)
+    path.write_text(json.dumps({"steps": 9, "test": json.loads(path.read_text())}))
+    assert ours(made(runs)["own_1"])[0]["all pixels, novel views PSNR ↑"] == "20.00"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[1]", "holds no mapping"),
+        ('{"steps": 9}', "does not say how it was measured"),
+        ('{"test": {"model": {}}}', "does not say how it was measured"),
+        ('{"protocol": 3, "model": {}}', "its protocol is no mapping"),
+        ('{"protocol": {"data_set": "x", "scenes": 1}, "model": {}}', "its protocol does not say resolution"),
+        ('{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2}}', "no scores by predictor"),
+        ('{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2}, "model": {"full": [1]}}', "no scores"),
+        ('{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2}, "model": {"full": {"novel": 1}}}', "no scores"),
+    ],
+)
+def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, said) -> None:
+    run("good", 20.0)
+    (runs / "bad").mkdir()
+    (runs / "bad/metrics.json").write_text(content)
+    found, (warning,) = tables(runs)
+    assert warning.startswith(f"{runs / 'bad/metrics.json'}: left out, ")
+    assert said in warning
+    assert "\n" not in warning
+    assert len(found) == len(PAPERS) + 1
+
+
+def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
+    with pytest.raises(CompleteSplatError, match="completesplat test"):
+        tables(runs)
+    with pytest.raises(CompleteSplatError, match="no such folder"):
+        tables(runs / "nowhere")
+
+
+def test_hidden_modes_have_a_table_of_their_own(runs) -> None:
+    scores = {"coverage": 0.5, "total_variation": 0.25, "sharpness": 1.0, "rejected": 0.125, "scenes": 4, "samples": 32}
+    for name in ("a", "b"):
+        (runs / name).mkdir()
+        modes = {"true_sampler": scores, "model": scores | {"coverage": 0.75}}
+        (runs / name / "hidden_modes.json").write_text(json.dumps(modes))
+        protocol = {"scenes": ["x", "y"], "method": "LatentDiffusion", "samples": 32, "data_fingerprint": "f00d"}
+        (runs / name / "protocol.json").write_text(json.dumps(protocol))
+    table = made(runs)["hidden_modes_1"]
+    rows = ours(table)
+    assert table.title == "Hidden modes, data f00d"
+    assert "[1] a: scenes 2, samples 32, data f00d." in table.below()
+    assert [row["method"] for row in rows] == ["LatentDiffusion [1]", "LatentDiffusion [2]", "true sampler [1]"]
+    assert [row["coverage ↑"] for row in rows] == ["0.750", "0.750", "0.500"]
+    assert (rows[0]["samples"], rows[0]["total variation ↓"]) == ("32", "0.250")
+
+
+def test_hidden_modes_without_a_protocol_are_left_out(runs, run) -> None:
+    run("good", 20.0)
+    (runs / "good/hidden_modes.json").write_text('{"model": {"coverage": 1}}')
+    assert "protocol.json is missing beside it" in tables(runs)[1][0]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.0157, "15.7 ms"), (2.7, "2.7 sec"), (54, "54.0 sec"), (246, "4.1 min")]
+)
+def test_times_are_written_as_in_the_paper(seconds, text) -> None:
+    assert duration(seconds) == text

@@ -1,0 +1,135 @@
+"""Disagreement of samples in depth, on scenes whose depth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support import some_gaussians
+
+from completesplat.export.depth_colors import NOTHING, ramp
+from completesplat.generation import CompleteSplat
+from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.reports.sampling.depth import color_deviation, deviation, deviations, rows, strips
+from completesplat.reports.sampling.drawing import Artist
+from completesplat.scene import SceneBatch, Views
+from completesplat.tensors import stack
+
+SIZE, AWAY = 16, 3.0
+CENTER = torch.tensor([0.0, 0, AWAY])
+SETTINGS = [(0.0, 0.5), (1.0, 0.2)]
+
+
+def cameras(*eyes: tuple[float, float, float]) -> Cameras:
+    poses = look_at(torch.tensor(eyes), CENTER, torch.tensor([0.0, -1, 0]))
+    return Cameras(poses, pinhole(40, SIZE).expand(len(eyes), 3, 3), (SIZE, SIZE))
+
+
+def scene() -> SceneBatch:
+    """Seen from the front; targets are the left, the back and almost the front. The object: the middle column."""
+    masks = torch.zeros(4, 1, SIZE, SIZE)
+    masks[..., SIZE // 2] = 1
+    views = Views(torch.rand(4, 3, SIZE, SIZE), cameras((0, 0, 0), (-AWAY, 0, AWAY), (0, 0, 6), (0.1, 0, 0)), masks)
+    visible = torch.ones(1, SIZE, SIZE)
+    return stack([SceneBatch(views[0], views[1:], torch.tensor([1.0, 5]), visible, torch.tensor(0), "a")])
+
+
+class Splats(CompleteSplat):
+    """A generator whose samples are one large flat splat each, pushed back by `shift` times their number."""
+
+    def __init__(self, shift: float) -> None:
+        torch.nn.Module.__init__(self)
+        self.shift = shift
+
+    def generate(self, *_, samples=1, skip_weight=1.0, **__):
+        splats = some_gaussians(samples, scale=2.0, opacity=0.9)
+        depth = AWAY + (1 - skip_weight) * self.shift * torch.arange(samples)[:, None, None]
+        thin = splats.scales * torch.tensor([1, 1, 1e-3])
+        return replace(splats, means=depth * torch.tensor([0.0, 0, 1]).expand(samples, 2, 3), scales=thin)
+
+
+def artist(shift: float = 0.5, samples: int = 3) -> Artist:
+    return Artist(Splats(shift), ReferenceRasterizer(), 0.5, samples, 0)
+
+
+def test_deviation_is_numpys_over_the_samples_that_see_something():
+    torch.manual_seed(0)
+    depth = torch.rand(5, 2, 1, 4, 4, dtype=torch.float64) + 1
+    depth[torch.rand_like(depth) < 0.4] = 0
+    expected = torch.full((2, 1, 4, 4), torch.nan, dtype=torch.float64)
+    for place in np.ndindex(2, 1, 4, 4):
+        known = [value for value in depth[:, *place].tolist() if value > 0]
+        if len(known) > 1:
+            expected[place] = np.std(known, ddof=1)
+    assert expected.isnan().any()
+    assert not expected.isnan().all()
+    torch.testing.assert_close(deviation(depth), expected, equal_nan=True)
+
+
+def test_a_shift_in_depth_is_its_deviation_in_the_reference_view():
+    """Depths 3, 3.5 and 4: the deviation is 0.5. With skips of weight 1 these samples are the same."""
+    free, faithful = rows(artist(), SETTINGS, [scene()], 90, lambda _: None)
+    for name in ("reference", "reference_object"):
+        assert free[f"{name}_deviation"] == pytest.approx(0.5, abs=1e-3)
+        assert faithful[f"{name}_deviation"] == pytest.approx(0, abs=1e-5)
+    assert free["reference_measured"] == 1
+    assert (free["skip_weight"], free["guidance_weight"], free["paper"]) == (0, 0.5, True)
+
+
+def depths() -> torch.Tensor:
+    """Two samples, that differ by the view's number, and on the object by twice that."""
+    depth = torch.ones(2, 4, 1, SIZE, SIZE)
+    depth[1] += torch.arange(4.0)[:, None, None, None]
+    depth[1, ..., SIZE // 2] += torch.arange(4.0)[:, None, None]
+    return depth
+
+
+@pytest.mark.parametrize(("far_degrees", "views"), [(89, [1, 2]), (91, [2]), (1, [1, 2, 3])])
+def test_far_is_an_angle_and_the_object_is_its_mask(far_degrees, views):
+    found = deviations(depths(), scene(), far_degrees)
+    mean = np.mean(views) / np.sqrt(2)
+    assert found["far_object_deviation"] == pytest.approx(2 * mean)
+    assert found["far_deviation"] == pytest.approx(mean * (1 + 1 / SIZE))
+    assert (found["reference_deviation"], found["far_measured"]) == (0, 1)
+
+
+def test_what_is_not_seen_is_not_measured():
+    depth = depths()
+    depth[0, 2, :, : SIZE // 2] = 0
+    assert deviations(depth, scene(), 91)["far_measured"] == 0.5
+    depth[0, 2] = 0
+    found = deviations(depth, scene(), 91)
+    assert (found["far_deviation"], found["far_object_deviation"], found["far_measured"]) == (None, None, 0)
+
+
+def test_without_far_views_there_are_no_figures_for_them():
+    found = rows(artist(), SETTINGS, [scene()], 180, lambda _: None)[0]
+    assert {found[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
+
+
+def test_a_row_shows_the_truth_some_samples_from_behind_and_where_all_disagree():
+    own = scene()
+    (row,) = strips(artist(samples=3), [own], 0.0, 0.5, shown=2)
+    truth, first, second, where = row
+    back = own.all_views().images[0, 2]
+    assert torch.equal(truth.images, torch.stack([own.reference.images[0], back]))
+    assert len(row) == 4
+    # From behind, the second sample is nearer: brighter on the scale that both share.
+    assert first.label.removeprefix("sample 0") == second.label.removeprefix("sample 1") == ": depth 2.50 to 3.00"
+    torch.testing.assert_close(first.images[1], ramp(torch.zeros(1, SIZE, SIZE)))
+    torch.testing.assert_close(second.images[1], ramp(torch.ones(1, SIZE, SIZE)))
+    # All face the camera.
+    torch.testing.assert_close(first.images[2, :, 8, 8], torch.tensor([0.5, 0.5, 1]), atol=0.01, rtol=0)
+    assert where.images.shape == (2, 3, SIZE, SIZE)
+    assert where.label == "deviation 0 to 0.5"
+
+
+def test_disagreement_is_bright_and_what_cannot_be_compared_grey():
+    maps = torch.tensor([[0.0, 1, 2, torch.nan]]).view(1, 1, 2, 2)
+    colors, end = color_deviation(maps)
+    assert end == pytest.approx(2, abs=0.05)
+    lightness = colors.mean(1).flatten().tolist()
+    assert lightness[0] < lightness[1] < lightness[2]
+    assert (colors[..., 1, 1] == NOTHING).all()
+    assert (color_deviation(torch.full((1, 1, 2, 2), torch.nan))[0] == NOTHING).all()
