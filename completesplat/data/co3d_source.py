@@ -13,6 +13,7 @@ from torch import Tensor
 from completesplat.data.checks import BadCamera, at
 from completesplat.data.co3d_annotations import CO3DFrame
 from completesplat.data.co3d_category import SplitMembers
+from completesplat.data.co3d_depth import square_depth
 from completesplat.data.co3d_placement import object_placement
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.data.transforms import Square, principal_square, read_square
@@ -94,6 +95,7 @@ class CO3DSource:
             cameras,
             self._depth_ranges(depths).to(torch.float32),
             partial(_read, name, frames, size),
+            partial(_read_depth, name, frames, size, factor) if any(frame.depth for frame in frames) else None,
         )
 
     def _depth_ranges(self, depths: Float[Tensor, " view"]) -> Float[Tensor, "view 2"]:
@@ -118,3 +120,8 @@ def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> Picture:
     with at(sequence=name, frame=frame.number):
         image = read_square(frame.image, image_size, square, size, "RGB")
         return Picture(image, read_square(frame.mask, image_size, square, size, "L"))
+
+
+def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:
+    with at(sequence=name):
+        return square_depth(frames[index], _square(frames[index]), size, factor)

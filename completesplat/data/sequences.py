@@ -29,6 +29,8 @@ class PosedSequence:
         cameras: [view], float64, of the square pictures; the world is the sequence's own.
         depth_ranges: (near, far) with each of the frames as the reference, float32, in units of the cameras.
         read: index of a frame (not its number) -> its picture. Raises `DataError` if it cannot be read.
+        read_depth: index of a frame -> depth along the optical axis in units of the cameras, 0 where it is unknown;
+            None: there is no depth. Raises `DataError` if it cannot be read.
     """
 
     name: str
@@ -36,6 +38,7 @@ class PosedSequence:
     cameras: Cameras
     depth_ranges: Float[Tensor, "view 2"]
     read: Callable[[int], Picture]
+    read_depth: Callable[[int], Float[Tensor, "1 size size"]] | None = None
 
 
 @runtime_checkable

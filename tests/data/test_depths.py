@@ -1,0 +1,65 @@
+"""True depth in the square pictures, against the point cloud and in closed form."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from plyfile import PlyData
+
+from completesplat.data import co3d_depth
+from completesplat.data.co3d_annotations import CO3DFrame, DepthMap
+from completesplat.data.co3d_placement import from_point_cloud
+from completesplat.data.co3d_source import OBJECT_HALF_SIZE
+from completesplat.data.depths import evaluation_depths
+from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.data.transforms import Square
+from completesplat.geometry.cameras import Cameras, pinhole, project
+
+
+@pytest.fixture(scope="module")
+def data(toy_root) -> ToyObjectsDataModule:
+    module = ToyObjectsDataModule(str(toy_root), image_size=32)
+    module.setup("test")
+    return module
+
+
+def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
+    (name,) = data.store("test").names
+    sequence, depths = data.source("test").read(name), evaluation_depths(data, "test", name)
+    assert depths.shape == (4, 1, 32, 32)
+    file = toy_root / "toy_objects" / name / "pointcloud.ply"
+    vertices = PlyData.read(str(file))["vertex"]
+    points = torch.stack([torch.from_numpy(vertices[axis].copy()).double() for axis in "xyz"], dim=-1)
+    points = points * OBJECT_HALF_SIZE / from_point_cloud(file).half_size
+    for view in range(4):
+        pixels, z = project(sequence.cameras[view], points)
+        columns, rows = pixels.long().clamp(0, 31).unbind(-1)
+        seen = depths[view, 0][rows, columns]
+        # At silhouettes the surface may be in a neighbouring pixel's centre only.
+        nearest = -torch.nn.functional.max_pool2d(-depths[view], 3, stride=1, padding=1)[0][rows, columns]
+        assert (z > 0.97 * nearest).all()
+        assert ((z - seen).abs() < 0.03 * seen).double().mean() > 0.2
+
+
+def test_data_without_depth_have_none(data, monkeypatch):
+    (name,) = data.store("test").names
+    sequence = replace(data.source("test").read(name), read_depth=None)
+    monkeypatch.setattr(type(data.source("test")), "read", lambda *_: sequence)
+    assert evaluation_depths(data, "test", name) is None
+
+
+@pytest.mark.parametrize("shape", [(8, 12), (4, 6), (16, 24)])
+def test_maps_of_any_size_are_cut_as_the_picture_is(monkeypatch, shape):
+    """A picture of 8 x 12; the square of 4 x 4 at (left 6, top 2), in 2 x 2 pixels, has centres at columns 7 and 9."""
+    columns = (torch.arange(shape[1]) + 0.5) * 12 / shape[1]
+    depth = columns.expand(1, *shape)
+    monkeypatch.setattr(co3d_depth, "read_depth", lambda *_: depth)
+    camera = Cameras(torch.eye(4), pinhole(50.0, 8), (8, 12))
+    frame = CO3DFrame(1, Path("image"), Path("mask"), DepthMap(Path("depth"), 1.0), camera)
+    found = co3d_depth.square_depth(frame, Square(6, 2, 4), 2, factor=10.0)
+    half_pixel = 12 / shape[1] / 2
+    assert found.shape == (1, 2, 2)
+    assert found[0].flatten().tolist() == pytest.approx([70, 90, 70, 90], abs=10 * half_pixel)
+    unknown = co3d_depth.square_depth(replace(frame, depth=None), Square(6, 2, 4), 2, factor=10.0)
+    assert not unknown.any()
