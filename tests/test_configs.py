@@ -32,12 +32,20 @@ def test_nothing_in_the_tree_is_forgotten_here():
     assert len(EVERY_OPTION) > 20
 
 
+FILES_OF_PROTOCOLS = {
+    "realestate10k_100": "scene_list",
+    "realestate10k_128": "evaluation_index",
+    "realestate10k_256": "evaluation_index",
+}
+
+
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
     needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
     stage2 = group == "experiment" and option.endswith("_diffusion")
+    needed += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
     needed += NEEDED if stage2 or option == "latent_diffusion" else []
     config = compose_config("fit", f"{group}={option}", *needed)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)

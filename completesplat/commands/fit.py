@@ -15,9 +15,10 @@ def run(config: Any, out: Path) -> None:
 
     from completesplat.commands import quieten
     from completesplat.commands.protocol import protocol
-    from completesplat.export.atomic import atomic_path
+    from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
+    from completesplat.training.wandb_run import finished
 
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
@@ -30,23 +31,31 @@ def run(config: Any, out: Path) -> None:
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     if trainer.is_global_zero:
         show(parameter_table(module))
-    try:
+    with finished(loggers):
+        shown = begin(module, trainer, config, out)
         metrics = _train_and_test(trainer, module, data, checkpoint, config.test)
         for logger in loggers:  # a run shorter than the logging interval leaves its figures too
             logger.log_metrics(metrics, step=trainer.global_step)
             logger.save()
-    finally:
-        _finish(loggers)
-    scores = module.test_results() if config.test else None
-    if not trainer.is_global_zero:
-        return
-    results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
-    if scores is not None:
-        show(evaluation_table(scores))
-        ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)
-        described = protocol(config.evaluation.name, module, data, scores) | {"ema": ema}
-        results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-    with atomic_path(out / "metrics.json") as temporary:  # which also tells that the job is done
+        scores = module.test_results() if config.test else None
+        if not trainer.is_global_zero:
+            return
+        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
+        if scores is not None:
+            show(evaluation_table(scores))
+            ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)
+            described = protocol(config.evaluation.name, module, data, scores) | {"ema": ema}
+            results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
+        _write(results, out / "metrics.json")
+        if scores is not None:
+            log_test(scores, shown, trainer, out)
+
+
+def _write(results: dict[str, Any], path: Path) -> None:
+    """At once, since the file also tells that the job is done."""
+    from completesplat.export.atomic import atomic_path
+
+    with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(results, indent=2) + "\n")
 
 
@@ -84,12 +93,3 @@ def _train_and_test(trainer: Any, module: Any, data: Any, checkpoint: str | None
         metrics |= trainer.callback_metrics
     assert trainer.global_step == steps
     return {name: value.item() for name, value in metrics.items()}
-
-
-def _finish(loggers: list[Any]) -> None:
-    """Close what outlives a job: a sweep's next job must not log into this one's W&B run."""
-    from lightning.pytorch.loggers import WandbLogger
-
-    for logger in loggers:
-        if isinstance(logger, WandbLogger):
-            logger.experiment.finish()

@@ -16,8 +16,10 @@ def run(config: Any, out: Path) -> None:
     from completesplat.commands import quieten
     from completesplat.commands.protocol import checkpoint_facts, protocol
     from completesplat.commands.test import config_of_run, diffusion_of
+    from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.training.checkpoints import load_part
+    from completesplat.training.wandb_run import finished
 
     run_config = config_of_run(Path(config.ckpt), list(config.overrides))
     model_size = set_up_data(run_config, config.evaluation)
@@ -30,13 +32,18 @@ def run(config: Any, out: Path) -> None:
     if config.get("sampler") is not None:
         diffusion_of(module).replace_sampler(OmegaConf.to_container(config.sampler))
     module.evaluation = instantiate(config.evaluation.scoring, model_size=model_size, _convert_="all")
-    trainer = instantiate(config.trainer, logger=False, _convert_="all")
-    trainer.test(module, datamodule=data, verbose=False)
-    results = module.test_results()
-    if not trainer.is_global_zero:
-        return
-    described = protocol(config.evaluation.name, module, data, results) | checkpoint_facts(Path(config.ckpt))
-    (out / "metrics.json").write_text(json.dumps({"protocol": described} | results, indent=2, allow_nan=False) + "\n")
+    loggers = list(instantiate(config.get("logger", {}), _convert_="all").values())
+    trainer = instantiate(config.trainer, logger=loggers, _convert_="all")
+    with finished(loggers):
+        shown = begin(module, trainer, config, out)
+        trainer.test(module, datamodule=data, verbose=False)
+        results = module.test_results()
+        if not trainer.is_global_zero:
+            return
+        described = protocol(config.evaluation.name, module, data, results) | checkpoint_facts(Path(config.ckpt))
+        text = json.dumps({"protocol": described} | results, indent=2, allow_nan=False)
+        (out / "metrics.json").write_text(text + "\n")
+        log_test(results, shown, trainer, out)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")

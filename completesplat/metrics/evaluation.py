@@ -3,7 +3,7 @@
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from torch import Tensor
 from completesplat.data.processes import gathered
 from completesplat.errors import CompleteSplatError
 from completesplat.metrics.best_of import best, expected_best_curve
+from completesplat.metrics.depth import depth_errors
 from completesplat.metrics.diversity import diversity
 from completesplat.metrics.image_sets import ImageSets, SetMetric
 from completesplat.metrics.images import object_only, psnr, ssim
@@ -23,6 +24,13 @@ Scores = dict[tuple[str, str, str], float]
 REGIONS = ("full", "object")
 MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
+
+
+class DepthViews(NamedTuple):
+    """True depth of the reference and the targets (0: unknown), and their masks."""
+
+    depth: Float[Tensor, "view 1 height width"]
+    masks: Float[Tensor, "view 1 height width"]
 
 
 class Evaluation:
@@ -115,6 +123,21 @@ class Evaluation:
                 scores[region, "novel", name] = values[1:].mean().item()
         return scores
 
+    @torch.no_grad()
+    def update_depth(self, name: str, predicted: Float[Tensor, "view 1 height width"], true: DepthViews) -> None:
+        """Errors of the model's depth along the optical axes (its first sample's), where the truth is known.
+
+        They are called `depth_abs_rel`, `depth_rmse` (in the scene's units) and `depth_delta1`: see `depth_errors`.
+        """
+        for region in REGIONS:
+            valid = true.depth > 0
+            errors = depth_errors(predicted, true.depth, valid & (true.masks > 0.5) if region == "object" else valid)
+            for kind, views in (("reference", errors[:1]), ("novel", errors[1:])):
+                known = [found for found in views if found is not None]
+                for metric in known[0] if known else ():
+                    mean = sum(found[metric] for found in known) / len(known)
+                    self.scores[MODEL][name][region, kind, f"depth_{metric}"] = mean
+
     def _add(self, predictor: str, name: str, images: Float[Tensor, "view 3 height width"], truth: Views) -> None:
         self.scores[predictor][name] = self.score(images, truth)
         self.views[name] = len(images) - 1
@@ -142,8 +165,10 @@ class Evaluation:
         for predictor, scenes in self.scores.items():
             names = sorted(scenes)
             entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
-            for region, view, metric in scenes[names[0]]:
-                values = [scenes[name][region, view, metric] for name in names]
+            for region, view, metric in dict.fromkeys(key for name in names for key in scenes[name]):
+                values = [
+                    scenes[name][region, view, metric] for name in names if (region, view, metric) in scenes[name]
+                ]
                 entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
             for region in REGIONS:
                 entry[region]["novel"] |= self.sets.results(predictor, region)

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -13,13 +14,14 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
-from completesplat.errors import CompleteSplatError
+from completesplat.data.depths import evaluation_depths
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import Evaluation
+from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.images import psnr
-from completesplat.rasterizers import Rasterizer
-from completesplat.scene import SceneBatch
+from completesplat.rasterizers import Rasterizer, Rendering
+from completesplat.scene import SceneBatch, Views
 from completesplat.training.timing import Timings
 
 
@@ -34,6 +36,21 @@ def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> N
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if compile:
         network.compile()
+
+
+@dataclass(frozen=True)
+class ScoredScene:
+    """What a test makes of one scene: Gaussians, and their images as they are scored, the reference view first.
+
+    The input is as the model sees it. The cameras are those of the renders, whose pictures may be smaller.
+    """
+
+    name: str
+    input: Float[Tensor, "3 _ _"]
+    gaussians: Gaussians
+    cameras: Cameras
+    images: Float[Tensor, "sample view 3 height width"]
+    truth: Views
 
 
 class SceneModule(LightningModule):
@@ -66,6 +83,7 @@ class SceneModule(LightningModule):
         self.background = background
         self.evaluation = Evaluation()
         self.timings = Timings()
+        self.on_scene_scored: Callable[[ScoredScene], None] | None = None
         # Lightning's name: of several processes that test, some may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
 
@@ -86,12 +104,12 @@ class SceneModule(LightningModule):
         """What it is called in tables."""
         return type(self).__name__
 
-    def render_from(self, gaussians: Gaussians, cameras: Cameras) -> Float[Tensor, "sample view 3 height width"]:
-        """Several sets of Gaussians [sample], each from the same cameras [view]."""
+    def render_from(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Several sets of Gaussians [sample], each from the same cameras [view]: [sample view]."""
         count = len(gaussians.means)
         everywhere = cameras.map(lambda tensor: tensor.expand(count, *tensor.shape))
         with torch.autocast(self.device.type, enabled=False):
-            return self.rasterizer(gaussians, everywhere).over(self.background)
+            return self.rasterizer(gaussians, everywhere)
 
     def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
         """The reference view and all targets, in full precision even where the network runs in less."""
@@ -118,10 +136,26 @@ class SceneModule(LightningModule):
         truth, cameras = scenes.all_views(), seen.all_views().cameras
         for b, name in enumerate(names):
             own = gaussians[b * evaluation.samples : (b + 1) * evaluation.samples]
-            images = self.timings.of("rendering", partial(self.render_from, own, cameras[b]), evaluation.samples)
-            evaluation.update_samples(name, upsampled(images, truth.cameras.image_size), truth[b])
+            rendered = self.timings.of("rendering", partial(self.render_from, own, cameras[b]), evaluation.samples)
+            images = upsampled(rendered.over(self.background), truth.cameras.image_size)
+            evaluation.update_samples(name, images, truth[b])
+            self._score_depth(name, rendered[0].expected_depth(), truth[b])
+            if self.on_scene_scored is not None:
+                shown = seen.reference.images[b] * seen.visible[b]
+                self.on_scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
         evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
+
+    def _score_depth(self, name: str, predicted: Float[Tensor, "view 1 _ _"], truth: Views) -> None:
+        """Where the truth is known, at the size of the renders."""
+        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+        try:
+            true = evaluation_depths(data, "test", name)
+        except DataError as error:
+            self.evaluation.missing["depth"] = f"missing: {error}"
+            return
+        if true is not None and true.shape == predicted.shape:
+            self.evaluation.update_depth(name, predicted, DepthViews(true.to(predicted), truth.masks))
 
     def on_test_end(self) -> None:
         self.evaluation.skipped = len(self.trainer.test_dataloaders.refused)  # type: ignore[union-attr]

@@ -90,6 +90,9 @@ def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path
     assert described["metrics"]["ssim"]["window"] == 11
     assert model["seconds"].keys() == {"inference", "rendering"}
     assert model["full"]["novel"]["swd"] > 0
+    # Toy objects have true depth; predictors that are pictures alone have none to compare.
+    assert 0 < model["object"]["novel"]["depth_abs_rel"] < 10
+    assert "depth_abs_rel" not in metrics["mean_image"]["full"]["novel"]
     for name, reason in described["missing"].items():
         assert f"{name}: missing: give " in finished.out
         assert reason.startswith("missing: ")

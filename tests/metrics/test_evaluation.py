@@ -5,7 +5,7 @@ import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import Evaluation
+from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.missing import Missing
 from completesplat.metrics.set_metrics import Patches
 from completesplat.scene import SceneBatch, Views
@@ -150,3 +150,22 @@ def test_what_is_missing_is_named_and_has_no_figure():
 def test_settings_without_a_meaning_are_refused(settings, said):
     with pytest.raises(CompleteSplatError, match=said):
         Evaluation(**settings)
+
+
+def test_depth_is_scored_where_the_truth_is_known():
+    evaluation = Evaluation()
+    true = torch.full((3, 1, 16, 16), 2.0)
+    true[1, :, :, 8:] = 0  # unknown
+    true[2] = 0
+    masks = torch.zeros(3, 1, 16, 16)
+    masks[..., :8, :] = 1
+    predicted = torch.full((3, 1, 16, 16), 2.2)
+    predicted[:, :, 8:] = 4.0
+    predicted[1, :, :, 8:] = 99.0
+    evaluation.update("model", torch.full((1, 3, 3, 16, 16), 0.5), scenes(1, 2))
+    evaluation.update_depth("scene 0", predicted, DepthViews(true, masks))
+    full, of_object = (evaluation.results()["model"][region]["novel"] for region in ("full", "object"))
+    assert full["depth_abs_rel"] == pytest.approx((0.1 + 1) / 2)
+    assert of_object["depth_abs_rel"] == pytest.approx(0.1)
+    assert (full["depth_delta1"], of_object["depth_delta1"]) == (pytest.approx(0.5), pytest.approx(1))
+    assert evaluation.results()["model"]["object"]["reference"]["depth_rmse"] == pytest.approx(0.2)

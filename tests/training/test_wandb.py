@@ -1,80 +1,159 @@
-"""What a run leaves for Weights & Biases, without a network."""
+"""What runs leave for Weights & Biases, without a network."""
 
-import json
-import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
-from support import SMALL
+from support import SMALL, call, strict_json
+from wandb_files import offline_runs, shown_by
 
-wandb = pytest.importorskip("wandb")
+from completesplat.reports.dashboard.panels import FIT, PANELS, STAGE1, STAGE2, TEST
+from completesplat.training.reconstruction import ReconstructionModule
 
+pytest.importorskip("wandb")
 
-BLOCK, FILE_HEADER, CHUNK_HEADER = 2**15, 7, 7
-
-
-def records(data: bytes) -> Iterator[bytes]:
-    """The records of a run's own file: LevelDB's log format (blocks of chunks with checksum, length, kind)."""
-    position, record = FILE_HEADER, b""
-    while position + CHUNK_HEADER <= len(data):
-        if BLOCK - position % BLOCK < CHUNK_HEADER:  # The rest of a block is filled up.
-            position += BLOCK - position % BLOCK
-            continue
-        _, length, kind = struct.unpack_from("<IHB", data, position)
-        record += data[position + CHUNK_HEADER : position + CHUNK_HEADER + length]
-        position += CHUNK_HEADER + length
-        if kind in (1, 4):  # The whole of a record, or the last part of it.
-            yield record
-            record = b""
+UNNAMED = {"train/scale", "train/opacity"}  # regularisers, off by default
+SETTINGS = [*SMALL, "trainer.log_every_n_steps=1", "logger=wandb"]
 
 
-def history(path: Path) -> list[dict]:
-    """The rows that were logged."""
-    from wandb.proto.wandb_internal_pb2 import Record
-
-    found = [Record.FromString(record) for record in records(path.read_bytes())]
-    rows = [record.history.item for record in found if record.WhichOneof("record_type") == "history"]
-    return [{"/".join(i.nested_key) or i.key: json.loads(i.value_json) for i in items} for items in rows]
+def fit_settings(pipeline, stage: str) -> list[str]:
+    stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
+    own = ["experiment=toy_diffusion", stage1, "sampler.steps=2"] if stage == STAGE2 else ["experiment=toy_var"]
+    return [*own, f"data.root={pipeline.toy}", *SETTINGS]
 
 
-def test_an_offline_run_holds_pictures_histograms_and_rows(command, pipeline, tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def no_settings_from_outside(monkeypatch):
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "test=false"]
-    finished = command("fit", *settings, "logger=wandb", "wandb.project=some", f"out={tmp_path / 'run'}")
-    assert finished.status == 0, finished.err
-    (folder,) = (tmp_path / "run/wandb").glob("offline-run-*")
-    (picture,) = folder.glob("files/media/images/pictures_*.png")
-    drawn = tmp_path / "run/pictures/step_000002.png"
-    assert list(Image.open(picture).getdata()) == list(Image.open(drawn).getdata())
-    (file,) = folder.glob("run-*.wandb")
-    rows = history(file)
-    (shown,) = [row for row in rows if "pictures/path" in row]
+    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+
+
+@pytest.fixture(scope="module")
+def run(pipeline, tmp_path_factory):
+    """One W&B run, and its directory, for each kind; made when first asked for."""
+    made: dict[str, tuple] = {}
+
+    def make(kind: str):
+        if kind not in made:
+            out = tmp_path_factory.mktemp("wandb") / "run"
+            checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
+            several = ["evaluation.scoring.samples=2", "trainer.accelerator=cpu", "logger=wandb"]
+            arguments = ["test", f"ckpt={checkpoint}", *several] if kind == TEST else None
+            with pytest.MonkeyPatch.context() as monkeypatch:
+                monkeypatch.delenv("WANDB_MODE", raising=False)
+                monkeypatch.chdir(out.parent)
+                assert call(monkeypatch, *(arguments or ["fit", *fit_settings(pipeline, kind)]), f"out={out}") == 0
+            made[kind] = (*offline_runs(out), out)
+        return made[kind]
+
+    return make
+
+
+def same(one: Image.Image, other: Image.Image) -> bool:
+    return one.size == other.size and one.convert("RGB").tobytes() == other.convert("RGB").tobytes()
+
+
+def lacking(kind: str, panel) -> bool:
+    """Whether the runs of these tests have not got what a panel needs."""
+    if panel.needs == "a GPU":
+        return not torch.cuda.is_available()
+    if panel.needs == "Linux":
+        return not Path("/proc/self/status").exists()
+    return panel.needs == "loss=stage2" or (panel.needs == "several samples" and kind in FIT)
+
+
+@pytest.mark.parametrize("kind", [STAGE1, pytest.param(STAGE2, marks=pytest.mark.slow), TEST])
+def test_a_run_has_the_panels_of_the_layout_and_logs_nothing_else(run, kind):
+    values = run(kind)[0].merged()
+    shown = {panel.keys: shown_by(values, panel) for panel in PANELS if kind in panel.runs}
+    absent = [panel.keys for panel in PANELS if kind in panel.runs and not shown[panel.keys]]
+    assert absent == [panel.keys for panel in PANELS if kind in panel.runs and lacking(kind, panel)]
+    media = [key.removesuffix("_type") for key in values if key.endswith("/_type")]
+    rest = {key for key in values if not key.startswith(("_", *media))}
+    assert rest - set().union(*shown.values()) <= {"epoch", "trainer/global_step", *UNNAMED}
+
+
+def test_pictures_and_histograms_are_those_of_the_run_directory(run):
+    wandb_run, out = run(STAGE1)
+    (picture,) = wandb_run.folder.glob("files/media/images/pictures_*.png")
+    drawn = out / "pictures/step_000002.png"
+    assert same(Image.open(picture), Image.open(drawn))
+    (shown,) = [row for row in wandb_run.history if "pictures/path" in row]
     assert (shown["trainer/global_step"], shown["pictures/path"]) == (1, f"media/images/{picture.name}")
     for name in ("opacity", "log10_scale", "depth"):
-        assert shown[f"histograms/{name}/_type"] == "histogram"
         # One validation scene of 32 x 32 pixels in two layers; scales have three axes.
         assert sum(shown[f"histograms/{name}/values"]) == 32 * 32 * 2 * (3 if name == "log10_scale" else 1)
-    (scalars,) = [row for row in rows if "gaussians/depth_p50" in row]
-    assert {f"kl/channel_{i}" for i in range(4)} <= scalars.keys()
+    assert {f"kl/channel_{i}" for i in range(4)} <= wandb_run.merged().keys()
 
 
-def test_stage_two_adds_its_samples(command, pipeline, tmp_path, monkeypatch):
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
-    settings = ["experiment=toy_diffusion", stage1, "sampler.steps=2", f"data.root={pipeline.toy}", *SMALL]
-    finished = command("fit", *settings, "test=false", "logger=wandb", f"out={tmp_path / 'run'}")
-    assert finished.status == 0, finished.err
-    (folder,) = (tmp_path / "run/wandb").glob("offline-run-*")
+@pytest.mark.slow
+def test_the_pictures_of_samples_are_those_of_the_run_directory(run):
+    wandb_run, out = run(STAGE2)
     for name, kind in (("samples", "step"), ("denoising", "strip")):
-        (picture,) = folder.glob(f"files/media/images/{name}_*.png")
-        drawn = tmp_path / f"run/samples/{kind}_000002.png"
-        assert list(Image.open(picture).getdata()) == list(Image.open(drawn).getdata())
-    (file,) = folder.glob("run-*.wandb")
-    rows = history(file)
-    (shown,) = [row for row in rows if "samples/path" in row]
-    assert shown["denoising/_type"] == "image-file"
-    assert shown["trainer/global_step"] == 1
-    (scalars,) = [row for row in rows if "samples/diversity" in row]
-    assert {"samples/psnr", "samples/psnr_of_mean"} <= scalars.keys()
+        (picture,) = wandb_run.folder.glob(f"files/media/images/{name}_*.png")
+        drawn = out / f"samples/{kind}_000002.png"
+        assert same(Image.open(picture), Image.open(drawn))
+
+
+def test_a_test_tells_each_scene_by_pictures_and_scores(run):
+    import imageio.v3 as imageio
+
+    wandb_run, out = run(TEST)
+    results = strict_json(out / "metrics.json")
+    (row,), files = wandb_run.table("test/scenes")
+    assert list(row)[:7] == ["scene", "input", "truth", "sample 1", "sample 2", "depth", "turntable"]
+    for predictor, prefix in (("model", ""), ("best_of_k", "best_of_k/")):  # means over one scene are its own scores
+        for region in ("full", "object"):
+            for view in ("novel", "reference"):
+                expected = results[predictor][region][view]["psnr"]
+                assert row[f"{prefix}{region}_{view}_psnr"] == pytest.approx(expected)
+    pictures = {name: Image.open(files[row[name]["path"]]) for name in list(row)[1:6]}
+    # 32 px four times enlarged; the reference view and its two targets.
+    assert {name: picture.size for name, picture in pictures.items()} == {
+        name: (128, 128) if name == "input" else (3 * 128, 128) for name in pictures
+    }
+    reference = pictures["truth"].crop((0, 0, 128, 128))
+    assert same(reference, pictures["input"])
+    assert not same(pictures["sample 1"], pictures["sample 2"])
+    assert len(imageio.imread(files[row["turntable"]["path"]], extension=".mp4")) == 48
+    assert all(path.is_relative_to(out) for path in files.values())
+
+
+def test_the_tables_of_a_test_are_those_of_the_report(run):
+    wandb_run, out = run(TEST)
+    results = strict_json(out / "metrics.json")
+    predictors, _ = wandb_run.table("test/predictors")
+    assert [row["predictor"] for row in predictors] == [name for name in results if name != "protocol"]
+    for row in predictors:
+        assert row["full_novel_psnr"] == pytest.approx(results[row["predictor"]]["full"]["novel"]["psnr"])
+    rows, _ = wandb_run.table("report/own_1")
+    shown = [row["all pixels, novel views: PSNR ↑"] for row in rows]
+    assert f"{results['best_of_k']['full']['novel']['psnr']:.2f}" in shown
+
+
+@pytest.mark.slow
+def test_jobs_of_a_sweep_are_a_group_and_a_continued_job_is_the_same_run(command, pipeline, tmp_path, monkeypatch):
+    step, failed = ReconstructionModule.training_step, []
+
+    def failing(self, scenes, index):
+        if self.global_step == 1 and not failed:
+            failed.append(index)
+            raise RuntimeError("the first job, in its second step")
+        return step(self, scenes, index)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", failing)
+    sweep = ["-m", *fit_settings(pipeline, STAGE1), "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
+    sweep += ["test=false", "callbacks.checkpoint.every_n_train_steps=1", "callbacks.pictures=null"]
+    with pytest.raises(RuntimeError, match="the first job"):
+        command("fit", *sweep)
+    assert command("fit", *sweep).status == 0
+    first, second = (offline_runs(tmp_path / "some_sweep" / f"seed-{seed}") for seed in (0, 1))
+    assert [[one.only("exit").exit_code for one in job] for job in (first, second)] == [[1, 0], [0]]
+    told = [[(one.only("run").run_group, one.only("run").display_name) for one in job] for job in (first, second)]
+    assert told == [[("some_sweep", "seed-0")] * 2, [("some_sweep", "seed-1")]]
+    ids = [[one.only("run").run_id for one in job] for job in (first, second)]
+    assert ids[0][0] == ids[0][1] != ids[1][0]
+    steps = [[row["trainer/global_step"] for row in one.history if "train/mse" in row] for one in first]
+    assert steps[0] == [0]
+    assert set(steps[1]) == {1, 2}  # and behind the end the last figures again

@@ -63,4 +63,4 @@ def _decoded(
 
 
 def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
-    return module.render_from(gaussians, scene.targets.cameras[0]).clamp(0, 1)
+    return module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)

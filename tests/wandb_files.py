@@ -1,0 +1,84 @@
+"""Reading back what an offline run left for Weights & Biases."""
+
+import json
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+BLOCK, FILE_HEADER, CHUNK_HEADER = 2**15, 7, 7
+TYPES = {"image": "image-file", "histogram": "histogram", "table": "table-file", "video": "videos"}
+
+
+@dataclass(frozen=True)
+class OfflineRun:
+    """A run's own file, and the folder that it is in."""
+
+    folder: Path
+    records: list[Any]
+
+    def only(self, kind: str) -> Any:
+        """The one record of a kind (`run`, `exit`)."""
+        (found,) = (getattr(record, kind) for record in self.records if record.WhichOneof("record_type") == kind)
+        return found
+
+    @property
+    def history(self) -> list[dict[str, Any]]:
+        """The rows that were logged."""
+        rows = [record.history.item for record in self.records if record.WhichOneof("record_type") == "history"]
+        return [{"/".join(i.nested_key) or i.key: json.loads(i.value_json) for i in items} for items in rows]
+
+    def merged(self) -> dict[str, Any]:
+        """The last value of each key."""
+        return {key: value for row in self.history for key, value in row.items()}
+
+    def table(self, name: str) -> tuple[list[dict[str, Any]], dict[str, Path]]:
+        """The rows of a table, and the files that they show by their paths in it."""
+        artifacts = [r.artifact for r in self.records if r.WhichOneof("record_type") == "artifact"]
+        contents = [{c.path: Path(c.local_path) for c in artifact.manifest.contents} for artifact in artifacts]
+        (files,) = (paths for paths in contents if f"{name}.table.json" in paths)
+        content = json.loads(files[f"{name}.table.json"].read_text())
+        return [dict(zip(content["columns"], row, strict=True)) for row in content["data"]], files
+
+
+def offline_runs(out: Path) -> list[OfflineRun]:
+    """The runs of a run directory in their order; one that was continued has several."""
+    return [_finished(path) for path in sorted(out.glob("wandb/offline-run-*/run-*.wandb"))]
+
+
+def _finished(path: Path) -> OfflineRun:
+    """W&B's process may write the file a moment after the run was closed."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    for _ in range(300):
+        records = [Record.FromString(record) for record in raw_records(path.read_bytes())]
+        if any(record.WhichOneof("record_type") == "exit" for record in records):
+            return OfflineRun(path.parent, records)
+        time.sleep(0.1)
+    raise AssertionError(f"{path}: never finished")
+
+
+def raw_records(data: bytes) -> Iterator[bytes]:
+    """LevelDB's log format (blocks of chunks with checksum, length, kind)."""
+    position, record = FILE_HEADER, b""
+    while position + CHUNK_HEADER <= len(data):
+        if BLOCK - position % BLOCK < CHUNK_HEADER:  # The rest of a block is filled up.
+            position += BLOCK - position % BLOCK
+            continue
+        _, length, kind = struct.unpack_from("<IHB", data, position)
+        record += data[position + CHUNK_HEADER : position + CHUNK_HEADER + length]
+        position += CHUNK_HEADER + length
+        if kind in (1, 4):  # The whole of a record, or the last part of it.
+            yield record
+            record = b""
+
+
+def shown_by(values: dict[str, Any], panel: Any) -> set[str]:
+    """The keys of those values that a panel shows."""
+    if panel.kind == "line":
+        return {key for key, x in values.items() if fnmatchcase(key, panel.keys) and isinstance(x, float | int)}
+    types = {key.removesuffix("/_type"): x for key, x in values.items() if key.endswith("/_type")}
+    return {key for key, x in types.items() if fnmatchcase(key, panel.keys) and x == TYPES[panel.kind]}
