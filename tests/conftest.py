@@ -1,5 +1,6 @@
 """Fixtures that several folders of tests use."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,6 +8,9 @@ import pytest
 from support import SMALL, call
 
 from completesplat.data.toy import write_objects
+
+# W&B would go on reading what later tests of the process print, and complain in their logs that its run has ended.
+os.environ.setdefault("WANDB_CONSOLE", "off")
 
 
 @pytest.fixture(scope="session")

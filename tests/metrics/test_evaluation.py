@@ -132,6 +132,16 @@ def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, 
     assert first.skipped == 1
 
 
+def test_the_same_pictures_have_the_same_scores_whatever_the_seed():
+    images = torch.rand(1, 3, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    found = []
+    for seed in (0, 1):
+        evaluation = Evaluation(seed=seed, sets={"swd": Patches(patches=2)})
+        evaluation.update("copy_reference", images, scenes(1, 2))
+        found.append(evaluation.results())
+    assert found[0] == found[1]
+
+
 def test_what_is_missing_is_named_and_has_no_figure():
     evaluation = Evaluation(perceptual=Missing("no weights"), sets={"inception": Missing("none here")})
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
