@@ -79,6 +79,7 @@ CONTROLS = {
 }
 
 
+@pytest.mark.slow
 def test_each_control_writes_its_files_and_changes_the_scenes(predict, runs):
     made = {}
     for name, settings in {"none": [], **CONTROLS}.items():

@@ -182,6 +182,7 @@ class Note(Callback):
 '''
 
 
+@pytest.mark.slow
 def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(toy_root, tmp_path):
     (tmp_path / "process_notes.py").write_text(NOTE)
     sweep = tmp_path / "sweep"

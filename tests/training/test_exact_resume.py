@@ -76,7 +76,7 @@ def rows(run) -> pandas.DataFrame:
     [
         ("var", ReconstructionModule, 3),
         pytest.param("var", ReconstructionModule, 4, marks=pytest.mark.slow),
-        ("diffusion", LatentDiffusion, 3),
+        pytest.param("diffusion", LatentDiffusion, 3, marks=pytest.mark.slow),
         pytest.param("encoded", LatentDiffusion, 3, marks=pytest.mark.slow),
     ],
 )

@@ -81,7 +81,8 @@ def test_who_is_waited_for():
         assert 0 < model["speed/scenes_per_second"] < 2 / NAP
 
 
-@pytest.mark.parametrize("interval", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("interval", [1, 2])
 def test_validation_is_not_counted(interval):
     """Five times as long as training, and in the midst of an interval as well as between two."""
     validated = speeds(Sleeper(NAP, validation=5 * NAP), SleepingLoader(), val_check_interval=interval)
