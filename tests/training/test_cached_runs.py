@@ -50,7 +50,7 @@ def logged(run: Path, pattern: str) -> pandas.DataFrame:
 @pytest.mark.parametrize(
     "settings",
     [
-        [],
+        pytest.param([], marks=pytest.mark.slow),
         # The loss of a prediction of the latent itself tells more of errors in the latent.
         [
             "sampler.scheduler.prediction_type=sample",

@@ -32,6 +32,7 @@ def read_depth(root: Path, annotation: dict) -> np.ndarray:
         return bits.astype(np.float32).reshape(png.size[::-1]) * annotation["depth"]["scale_adjustment"]
 
 
+@pytest.mark.slow
 def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     trees = {}
     for name, seed, workers in (("one", 3, 1), ("two", 3, 2), ("other", 4, 1)):

@@ -39,6 +39,7 @@ def read_text(path: Path) -> tuple[str, list[int], np.ndarray]:
     return url, [int(row[0]) for row in columns], np.array([[float(number) for number in row[1:]] for row in columns])
 
 
+@pytest.mark.slow
 def test_bytes_depend_on_the_seed_and_not_on_the_workers(rooms, tmp_path):
     again, other = tmp_path / "again", tmp_path / "other"
     write_rooms(again, scenes=3, frames=FRAMES, size=18, seed=0, workers=2, progress=False)

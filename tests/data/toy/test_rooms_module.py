@@ -1,5 +1,6 @@
 """Toy rooms as a data module."""
 
+import pytest
 import torch
 
 from completesplat.data.toy.module import ToyRoomsDataModule
@@ -19,6 +20,7 @@ def test_rooms_are_made_on_first_use_and_kept(tmp_path):
     assert batch.targets.images.shape == (2, 2, 3, 16, 16)
 
 
+@pytest.mark.slow
 def test_both_forms_hold_the_same_scenes(tmp_path):
     scenes = []
     for form in ("text", "chunks"):
