@@ -26,6 +26,12 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monke
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
 
 
+def test_what_a_killed_run_left_unfinished_is_replaced(tmp_path):
+    (tmp_path / ".last.ckpt.unfinished").write_bytes(b"half")
+    CheckpointFiles().save_checkpoint({"weights": torch.ones(3)}, tmp_path / "last.ckpt")
+    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
+
+
 def test_training_writes_its_checkpoints_so_and_not_into_memory_first(tmp_path, monkeypatch):
     trainer = instantiate(compose_config("fit").trainer, accelerator="cpu", logger=False, _convert_="all")
     assert isinstance(trainer.strategy.checkpoint_io, CheckpointFiles)
