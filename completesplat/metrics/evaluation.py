@@ -62,11 +62,11 @@ class Evaluation:
     ) -> None:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
         self.missing: dict[str, str] = {}
-        if isinstance(perceptual, Missing):
-            self.missing["lpips"] = str(perceptual)
-        elif perceptual is not None:
+        if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
-        self.missing |= {name: str(metric) for name, metric in (sets or {}).items() if isinstance(metric, Missing)}
+        for absent in [perceptual, *(sets or {}).values()]:
+            if isinstance(absent, Missing):
+                self.missing |= dict.fromkeys(absent.names, str(absent))
         present = [metric for metric in (sets or {}).values() if metric is not None and not isinstance(metric, Missing)]
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")

@@ -29,4 +29,4 @@ def perceptual_metric(
 ) -> Callable[[Tensor, Tensor], Tensor] | Missing:
     """LPIPS, or why there is none; see `load_vgg16` for the weights."""
     load = lambda weights: PerceptualMetric(PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads()))  # noqa: E731
-    return unless_missing(vgg_weights, load, ADVICE)
+    return unless_missing(vgg_weights, load, ADVICE, ("lpips",))

@@ -71,4 +71,5 @@ class Inception:
 
 def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | Missing:
     """FID and KID, or why there are none; see `load_inception` for the weights."""
-    return unless_missing(weights, lambda given: Inception(load_inception(given, sha256), subset_size), ADVICE)
+    load = lambda given: Inception(load_inception(given, sha256), subset_size)  # noqa: E731
+    return unless_missing(weights, load, ADVICE, ("fid", "kid"))

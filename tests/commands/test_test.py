@@ -18,7 +18,7 @@ def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, s
     described = metrics.pop("protocol")
     assert list(metrics) == ["model", "mean_image", "copy_reference"]
     assert described["data_set"] == "toy_objects"
-    assert described["missing"].keys() == {"lpips", "inception"}
+    assert described["missing"].keys() == {"lpips", "fid", "kid"}
     for scores in metrics.values():
         for region in ("full", "object"):
             for view in ("novel", "reference"):

@@ -143,9 +143,11 @@ def test_the_same_pictures_have_the_same_scores_whatever_the_seed():
 
 
 def test_what_is_missing_is_named_and_has_no_figure():
-    evaluation = Evaluation(perceptual=Missing("no weights"), sets={"inception": Missing("none here")})
+    evaluation = Evaluation(
+        perceptual=Missing("no weights", ("lpips",)), sets={"inception": Missing("none here", ("fid", "kid"))}
+    )
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
-    assert evaluation.missing == {"lpips": "missing: no weights", "inception": "missing: none here"}
+    assert evaluation.missing == {"lpips": "missing: no weights"} | dict.fromkeys(("fid", "kid"), "missing: none here")
     assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim"}
 
 
@@ -154,7 +156,10 @@ def test_what_is_missing_is_named_and_has_no_figure():
     [
         ({"samples": 0}, "samples=0: must be at least 1"),
         ({"criterion": "beauty"}, "criterion=beauty: choose one of psnr, ssim"),
-        ({"criterion": "lpips", "perceptual": Missing("no weights")}, "criterion=lpips: missing: no weights"),
+        (
+            {"criterion": "lpips", "perceptual": Missing("no weights", ("lpips",))},
+            "criterion=lpips: missing: no weights",
+        ),
     ],
 )
 def test_settings_without_a_meaning_are_refused(settings, said):
