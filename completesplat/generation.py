@@ -1,6 +1,6 @@
 """From one image to complete scenes. No Lightning here: this is the part that other programs use.
 
-model = CompleteSplat.from_pretrained("outputs/demo/weights")
+model = CompleteSplat.from_pretrained("toy_objects")
 scenes = model("photo.jpg", samples=4, seed=0)
 """
 
@@ -23,8 +23,8 @@ from completesplat.diffusion.splitting import in_parts, joined
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
 
-CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 TRUSTED_PACKAGES = ("completesplat.", "diffusers.")
 
 
@@ -192,23 +192,24 @@ class CompleteSplat(nn.Module):
         return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
 
     def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json` and `model.safetensors` into a folder."""
+        """Write `config.json`, `model.safetensors` and their checksums into a folder: one for the Hugging Face hub too."""
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
         save_file({key: value.contiguous().cpu() for key, value in self.state_dict().items()}, folder / WEIGHTS_FILE)
         (folder / CONFIG_FILE).write_text(json.dumps(self.architecture, indent=2) + "\n")
+        write_sums(folder)
 
     @classmethod
     def from_pretrained(cls, path: Path | str) -> "CompleteSplat":
         """Build the model that `save_pretrained` wrote, in evaluation mode on the CPU.
 
+        Args:
+            path: a folder, a name of the weights in the package, or an id of the Hugging Face hub (`weights_folder`).
+
         Raises:
-            WeightsError: files are missing, unreadable, or do not belong together.
+            WeightsError: files are missing, unreadable, changed, or do not belong together.
         """
-        folder = Path(path)
-        for name in (CONFIG_FILE, WEIGHTS_FILE):
-            if not (folder / name).is_file():
-                raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
+        folder = weights_folder(path)
         try:
             model = cls(**json.loads((folder / CONFIG_FILE).read_text()))
             model.load_state_dict(load_file(folder / WEIGHTS_FILE))

@@ -18,6 +18,7 @@ TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(), str(path
 FLOORS = [
     "errors",
     "weights_files",
+    "weights",
     "tensors",
     "geometry",
     "gaussians",

@@ -9,7 +9,8 @@ from safetensors.torch import load_file, save_file
 from support import compose_config, tiny_generator
 
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.generation import CONFIG_FILE, WEIGHTS_FILE, CompleteSplat
+from completesplat.generation import CompleteSplat
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +22,13 @@ def model():
 def folder(model, tmp_path):
     model.save_pretrained(tmp_path / "weights")
     return tmp_path / "weights"
+
+
+@pytest.fixture
+def unsealed(folder):
+    """A folder that anything may be changed in: without checksums."""
+    (folder / SUMS_FILE).unlink()
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -181,19 +189,19 @@ def test_missing_files_are_named(folder, name):
         CompleteSplat.from_pretrained(folder)
 
 
-def test_a_damaged_file_is_refused(folder):
-    path = folder / WEIGHTS_FILE
+def test_a_damaged_file_is_refused(unsealed):
+    path = unsealed / WEIGHTS_FILE
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(WeightsError, match="cannot be loaded"):
-        CompleteSplat.from_pretrained(folder)
+        CompleteSplat.from_pretrained(unsealed)
 
 
-def test_weights_of_another_model_are_refused(folder):
-    weights = load_file(folder / WEIGHTS_FILE)
+def test_weights_of_another_model_are_refused(unsealed):
+    weights = load_file(unsealed / WEIGHTS_FILE)
     weights.pop("latent_scale")
-    save_file(weights, folder / WEIGHTS_FILE)
+    save_file(weights, unsealed / WEIGHTS_FILE)
     with pytest.raises(WeightsError, match="cannot be loaded"):
-        CompleteSplat.from_pretrained(folder)
+        CompleteSplat.from_pretrained(unsealed)
 
 
 @pytest.mark.parametrize(
@@ -206,12 +214,12 @@ def test_weights_of_another_model_are_refused(folder):
         "completesplat.generation.json.loads",
     ],
 )
-def test_a_configuration_cannot_name_foreign_code(folder, target, tmp_path):
-    config = json.loads((folder / CONFIG_FILE).read_text())
+def test_a_configuration_cannot_name_foreign_code(unsealed, target, tmp_path):
+    config = json.loads((unsealed / CONFIG_FILE).read_text())
     config["sampler"]["scheduler"] = {"_target_": target, "f": str(tmp_path / "canary")}
-    (folder / CONFIG_FILE).write_text(json.dumps(config))
+    (unsealed / CONFIG_FILE).write_text(json.dumps(config))
     with pytest.raises(WeightsError, match="no part of a model"):
-        CompleteSplat.from_pretrained(folder)
+        CompleteSplat.from_pretrained(unsealed)
 
 
 def test_the_architecture_is_plain_data(model):

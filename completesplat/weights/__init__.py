@@ -1,0 +1,83 @@
+"""Folders of trained weights: those that come with the package, a user's own, or a repository of the Hugging Face hub.
+
+A folder holds `config.json`, `model.safetensors` and `SHA256SUMS` (as `sha256sum -c` reads it); the ones in this folder
+have a model card too, `README.md`.
+"""
+
+import hashlib
+import re
+from pathlib import Path
+
+from completesplat.errors import WeightsError
+
+BOX = Path(__file__).parent
+CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+def in_the_box() -> list[str]:
+    """Names of the weights that come with the package."""
+    return sorted(path.parent.name for path in BOX.glob(f"*/{WEIGHTS_FILE}"))
+
+
+def weights_folder(weights: Path | str) -> Path:
+    """The folder that is meant, complete, with every file that has a checksum as it was written.
+
+    Args:
+        weights: a folder; else a name of `in_the_box`; else an id of the Hugging Face hub, whose files are downloaded once
+            (a token, a mirror, work without a network: by the hub's own environment variables).
+
+    Raises:
+        WeightsError: there are none, files are missing, or one has another checksum.
+    """
+    folder = _locate(str(weights))
+    for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if not (folder / name).is_file():
+            raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
+    _check_sums(folder)
+    return folder
+
+
+def write_sums(folder: Path) -> None:
+    """Write the checksums of the two files that a model is read from."""
+    lines = [f"{_sha256(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
+    (folder / SUMS_FILE).write_text("".join(lines))
+
+
+def _locate(weights: str) -> Path:
+    local = Path(weights).expanduser()
+    if local.exists():
+        return local
+    if weights in in_the_box():
+        return BOX / weights
+    if HUB_ID.fullmatch(weights):
+        return _download(weights)
+    raise WeightsError(f"{weights}: no such folder; with the package come {', '.join(in_the_box()) or 'no weights'}")
+
+
+def _download(hub_id: str) -> Path:
+    from huggingface_hub import snapshot_download
+
+    try:
+        return Path(snapshot_download(hub_id, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE]))
+    except Exception as error:  # of the hub, of its HTTP library and of the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise WeightsError(f"{hub_id}: no folder here, and not to be had from the hub ({reason})") from error
+
+
+def _check_sums(folder: Path) -> None:
+    sums = folder / SUMS_FILE
+    if not sums.is_file():
+        return
+    for line in sums.read_text(errors="replace").splitlines():
+        expected, _, name = line.partition("  ")
+        if name in (CONFIG_FILE, WEIGHTS_FILE) and _sha256(folder / name) != expected:
+            raise WeightsError(
+                f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
+                f"if the change is meant, remove {SUMS_FILE}"
+            )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,80 @@
+"""Folders of weights: which one is meant, and whether it is whole."""
+
+import json
+import shutil
+import subprocess
+
+import pytest
+from support import tiny_generator
+
+from completesplat import weights
+from completesplat.errors import WeightsError
+from completesplat.generation import CompleteSplat
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, in_the_box, weights_folder, write_sums
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("weights")
+    tiny_generator().save_pretrained(path)
+    return path
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "copy")
+
+
+def test_the_sums_are_those_of_sha256sum(written):
+    checked = subprocess.run(["sha256sum", "--check", SUMS_FILE], cwd=written, capture_output=True, text=True)
+    assert checked.returncode == 0
+    assert checked.stdout.splitlines() == [f"{CONFIG_FILE}: OK", f"{WEIGHTS_FILE}: OK"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
+def test_one_flipped_bit_is_refused(folder, share):
+    content = bytearray((folder / WEIGHTS_FILE).read_bytes())
+    content[int(share * len(content))] ^= 1
+    (folder / WEIGHTS_FILE).write_bytes(bytes(content))
+    with pytest.raises(WeightsError, match=rf"{WEIGHTS_FILE}: damaged or changed"):
+        CompleteSplat.from_pretrained(folder)
+
+
+def test_a_changed_configuration_is_refused_until_the_sums_are_gone(folder):
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
+    with pytest.raises(WeightsError, match=f"remove {SUMS_FILE}"):
+        weights_folder(folder)
+    (folder / SUMS_FILE).unlink()
+    assert weights_folder(folder) == folder
+
+
+def test_names_of_the_box_are_found_and_listed(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "BOX", tmp_path)
+    assert in_the_box() == ["copy"]
+    assert weights_folder("copy") == tmp_path / "copy"
+    with pytest.raises(WeightsError, match="nothing_of_this_name: no such folder; with the package come copy"):
+        weights_folder("nothing_of_this_name")
+
+
+def test_a_hub_repository_in_the_cache_needs_no_network(written, tmp_path, monkeypatch):
+    import huggingface_hub.constants
+
+    repository = tmp_path / "hub" / "models--some--splats"
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    (repository / "refs").mkdir(parents=True)
+    (repository / "refs" / "main").write_text(commit)
+    shutil.copytree(written, repository / "snapshots" / commit)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    assert weights_folder("some/splats") == repository / "snapshots" / commit
+    with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
+        weights_folder("other/splats")
+
+
+def test_sums_follow_what_is_written(folder):
+    before = (folder / SUMS_FILE).read_text()
+    (folder / WEIGHTS_FILE).write_bytes(b"something else")
+    write_sums(folder)
+    assert (folder / SUMS_FILE).read_text() != before
+    assert weights_folder(folder) == folder
