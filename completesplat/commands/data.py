@@ -82,7 +82,7 @@ def latents(ckpt: str | Path, overrides: Sequence[str], conditioning: Any, out: 
     from hydra.utils import instantiate
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-    from completesplat.commands.test import config_of_run
+    from completesplat.commands.trained import config_of_run
     from completesplat.training.checkpoints import load_part
     from completesplat.training.encoding import encode_training_set
 

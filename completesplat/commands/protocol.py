@@ -71,3 +71,12 @@ def checkpoint_facts(path: Path) -> dict[str, Any]:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     facts = {"path": str(path), "sha256": digest, "step": contents.get("global_step")}
     return {"checkpoint": facts, "ema": "averaging_state" in contents}
+
+
+def weights_facts(weights: str) -> dict[str, Any]:
+    """The same for a folder of weights (`completesplat.weights`), which does not say how training ended."""
+    from completesplat.weights import WEIGHTS_FILE, weights_folder
+
+    with (weights_folder(weights) / WEIGHTS_FILE).open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"checkpoint": {"path": weights, "sha256": digest, "step": None}, "ema": None}

@@ -110,7 +110,7 @@ def open_run(config: Any) -> tuple[Any, list[Any]]:
     from hydra.utils import instantiate
 
     from completesplat.commands import quieten
-    from completesplat.commands.test import config_of_run, diffusion_of
+    from completesplat.commands.trained import config_of_run, diffusion_of
     from completesplat.reports.sampling.drawing import Artist, first_scenes
     from completesplat.training.checkpoints import load_part
 

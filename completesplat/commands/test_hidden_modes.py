@@ -58,8 +58,9 @@ def run(config: Any, out: Path) -> None:
 def protocol(config: Any, module: Any, data: Any, measured: Any) -> dict[str, Any]:
     """What was measured and how, as beside the results of other tests, with the scenes by name."""
     from completesplat import __version__
-    from completesplat.commands.protocol import checkpoint_facts, drawing
+    from completesplat.commands.protocol import drawing
     from completesplat.commands.source import git_commit
+    from completesplat.commands.trained import facts
     from completesplat.reports.machine import machine
 
     asked = config.evaluation
@@ -75,30 +76,25 @@ def protocol(config: Any, module: Any, data: Any, measured: Any) -> dict[str, An
         "data_fingerprint": data.source("test").fingerprint(),
         **{"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)},
         "machine": machine(),
-        **checkpoint_facts(Path(config.ckpt)),
+        **facts(config),
     }
 
 
 def open_run(config: Any) -> tuple[Any, Any]:
-    """Model and data of a checkpoint's run, the data made and set up for the test.
+    """Model and data, the data made and set up for the test; see `completesplat.commands.trained`.
 
     Raises:
         WeightsError: the checkpoint or its run's configuration is missing or does not fit.
     """
     from hydra.utils import instantiate
-    from omegaconf import OmegaConf
 
     from completesplat.commands import quieten
-    from completesplat.commands.test import config_of_run, diffusion_of
-    from completesplat.training.checkpoints import load_part
+    from completesplat.commands.trained import configuration, open_module
 
-    run_config = config_of_run(Path(config.ckpt), list(config.overrides))
+    run_config = configuration(config)
     quieten()
     data = instantiate(run_config.data, _convert_="all")
-    module = instantiate(run_config.model, _convert_="all")
-    load_part(module, config.ckpt, prefix="")
-    if config.get("sampler") is not None:
-        diffusion_of(module).replace_sampler(OmegaConf.to_container(config.sampler))
+    module = open_module(config, run_config)
     data.prepare_data()
     data.setup("test")
     return module, data

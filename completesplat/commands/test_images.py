@@ -11,26 +11,21 @@ def run(config: Any, out: Path) -> None:
     """Write `metrics.json` and print the table."""
     from hydra.utils import instantiate
     from lightning import seed_everything
-    from omegaconf import OmegaConf
 
     from completesplat.commands import quieten
-    from completesplat.commands.protocol import checkpoint_facts, protocol
-    from completesplat.commands.test import config_of_run, diffusion_of
+    from completesplat.commands.protocol import protocol
+    from completesplat.commands.trained import configuration, facts, open_module
     from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
-    from completesplat.training.checkpoints import load_part
     from completesplat.training.wandb_run import finished
 
-    run_config = config_of_run(Path(config.ckpt), list(config.overrides))
+    run_config = configuration(config)
     model_size = set_up_data(run_config, config.evaluation)
     quieten()
     seed_everything(config.seed, verbose=False)
     data = instantiate(run_config.data, _convert_="all")
     check_data(data, config.evaluation)
-    module = instantiate(run_config.model, _convert_="all")
-    load_part(module, config.ckpt, prefix="")
-    if config.get("sampler") is not None:
-        diffusion_of(module).replace_sampler(OmegaConf.to_container(config.sampler))
+    module = open_module(config, run_config)
     module.evaluation = instantiate(config.evaluation.scoring, model_size=model_size, _convert_="all")
     loggers = list(instantiate(config.get("logger", {}), _convert_="all").values())
     trainer = instantiate(config.trainer, logger=loggers, _convert_="all")
@@ -40,7 +35,7 @@ def run(config: Any, out: Path) -> None:
         results = module.test_results()
         if not trainer.is_global_zero:
             return
-        described = protocol(config.evaluation.name, module, data, results) | checkpoint_facts(Path(config.ckpt))
+        described = protocol(config.evaluation.name, module, data, results) | facts(config)
         text = json.dumps({"protocol": described} | results, indent=2, allow_nan=False)
         (out / "metrics.json").write_text(text + "\n")
         log_test(results, shown, trainer, out)

@@ -132,3 +132,30 @@ def test_protocols_that_do_not_fit_are_refused(command, pipeline, tmp_path, argu
     finished = command("test", f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", *arguments, f"out={tmp_path / 'out'}")
     assert finished.status == 2
     assert said in finished.err.splitlines()[-1]
+
+
+def test_weights_score_as_the_checkpoint_they_were_saved_with(command, pipeline, tmp_path):
+    data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.evaluation_targets=2"]
+    assert command("test", f"weights={pipeline.weights}", *data, f"out={tmp_path / 'a'}").status == 0
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
+    assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'b'}").status == 0
+    first, second = (strict_json(tmp_path / name / "metrics.json") for name in "ab")
+    for predictor in ("model", "copy_reference"):
+        for views in ("novel", "reference"):
+            assert first[predictor]["full"][views] == pytest.approx(second[predictor]["full"][views], rel=1e-6)
+    assert first["protocol"]["checkpoint"]["path"] == str(pipeline.weights)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
+        (["ckpt=a", "weights=b"], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
+        (["weights=b"], "weights know no data"),
+        (["ckpt=a", "data=toy_objects"], "a checkpoint's data are its run's"),
+    ],
+)
+def test_what_is_to_be_scored_is_said_once(command, arguments, said):
+    finished = command("test", *arguments)
+    assert finished.status == 2
+    assert said in finished.err
