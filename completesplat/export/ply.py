@@ -8,7 +8,6 @@ The file keeps the coordinates as they are given; nothing is turned. In this pro
 (OpenCV), and the caller chooses the frame.
 """
 
-import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from completesplat.errors import PlyError
 from completesplat.export.atomic import atomic_path
+from completesplat.export.cleaning import cleaned
 from completesplat.export.ply_header import Element, read_header
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
@@ -32,15 +32,13 @@ SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot
 WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 
-log = logging.getLogger(__name__)
-
 
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
     """Write one unbatched set of Gaussians; the file appears whole or not at all.
 
-    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians with a value that is not finite (also
-    when it overflows float32) or with a scale that is not positive are left out, with a line in the log.
-    Reading the file with `read_ply` and writing it again gives the same bytes, except for clamped opacities.
+    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians that cannot be stored are left out, see
+    `completesplat.export.cleaning`. Reading the file with `read_ply` and writing it again gives the same bytes, except
+    for clamped opacities.
 
     Args:
         path: the file.
@@ -49,17 +47,15 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
     Returns:
         How many Gaussians the file holds.
+
+    Raises:
+        CompleteSplatError: none of the Gaussians can be stored.
     """
-    table = _table(gaussians)
-    # The logarithm of a scale that is not positive is not finite either.
-    kept = table[gaussians.finite().cpu() & table.isfinite().all(-1)]
-    left_out = len(table) - len(kept)
-    if left_out:
-        log.warning("%s: left out %d of %d Gaussians (not finite, or no extent)", path, left_out, len(table))
+    table = _table(cleaned(gaussians, path))
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(kept), comments))
-        file.write(kept.numpy().astype("<f4").tobytes())
-    return len(kept)
+        file.write(_header(len(table), comments))
+        file.write(table.numpy().astype("<f4").tobytes())
+    return len(table)
 
 
 def read_ply(path: str | Path) -> Gaussians:

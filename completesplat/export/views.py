@@ -10,7 +10,6 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers.protocol import Rasterizer
 
 
-@torch.no_grad()
 def orbit_views(
     rasterizer: Rasterizer,
     gaussians: Gaussians,
@@ -39,11 +38,26 @@ def orbit_views(
     """
     if up is None:
         up = -reference.world_to_camera[1, :3]
-    cameras = orbit(reference, pivot, up, frames)
+    return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background, chunk)
+
+
+@torch.no_grad()
+def render_views(
+    rasterizer: Rasterizer,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    background: Float[Tensor, "3"] | float = 1.0,
+    chunk: int = 8,
+) -> tuple[Float[Tensor, "frame 3 height width"], Float[Tensor, "frame 1 height width"]]:
+    """Render one unbatched scene from several cameras, `chunk` at a time.
+
+    Returns:
+        Images over the background, and expected depths (0 where nothing is seen).
+    """
     if isinstance(background, Tensor):
         background = background[:, None, None]
     images, depths = [], []
-    for start in range(0, frames, chunk):
+    for start in range(0, len(cameras.world_to_camera), chunk):
         rendering = rasterizer(gaussians[None], cameras[start : start + chunk][None])
         images.append(rendering.over(background)[0])
         depths.append(rendering.expected_depth()[0])

@@ -23,11 +23,66 @@ def orbit(
         runs counter-clockwise as seen from above.
     """
     axis = torch.nn.functional.normalize(up, dim=-1)
-    angles = torch.arange(frames, dtype=up.dtype, device=up.device) / frames * math.radians(degrees)
+    angles = _full_turn(frames, up) * (degrees / 360)
     arm = reference.centers - pivot
     cos, sin = angles.cos()[:, None], angles.sin()[:, None]
     # Rodrigues' formula for the rotation of the arm about the axis.
     eyes = arm * cos + torch.linalg.cross(axis, arm) * sin + axis * (axis @ arm) * (1 - cos) + pivot
-    world_to_camera = look_at(eyes, pivot.expand_as(eyes), axis.expand_as(eyes))
-    intrinsics = reference.intrinsics.expand(frames, 3, 3)
-    return replace(reference, world_to_camera=world_to_camera, intrinsics=intrinsics)
+    return _looking_at(reference, eyes, pivot, axis)
+
+
+def swipe(
+    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int, reach: float = 0.3
+) -> Cameras:
+    """Cameras that go to the left, to the right and back on a level straight line, looking at `pivot`.
+
+    They start at the reference camera (unbatched), slow down towards both ends, and stop one step before the start, so
+    that the video loops smoothly.
+
+    Args:
+        up: the line is at right angles to it and to the direction of `pivot`.
+        reach: greatest distance to either side, as a share of the distance of `pivot`.
+    """
+    angles = _full_turn(frames, up)
+    right, _ = _sideways(reference, pivot, up)
+    return _looking_at(reference, reference.centers - reach * angles.sin()[:, None] * right, pivot, up)
+
+
+def wobble(
+    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int, radius: float = 0.1
+) -> Cameras:
+    """Cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
+
+    The circle lies across the direction of `pivot`, begins on the right and goes up first; the last frame stops one
+    step before the start.
+
+    Args:
+        radius: of the circle, as a share of the distance of `pivot`.
+    """
+    angles = _full_turn(frames, up)
+    right, above = _sideways(reference, pivot, up)
+    eyes = reference.centers + radius * (angles.cos()[:, None] * right + angles.sin()[:, None] * above)
+    return _looking_at(reference, eyes, pivot, up)
+
+
+PATHS = {"orbit": orbit, "swipe": swipe, "wobble": wobble}
+
+
+def _full_turn(frames: int, like: Tensor) -> Float[Tensor, " frame"]:
+    return torch.arange(frames, dtype=like.dtype, device=like.device) / frames * (2 * math.pi)
+
+
+def _sideways(
+    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Right and up across the direction of the pivot, as long as the pivot is away."""
+    forward = pivot - reference.centers
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    return right * forward.norm(), torch.linalg.cross(right, forward)
+
+
+def _looking_at(
+    reference: Cameras, eyes: Float[Tensor, "frame 3"], pivot: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Cameras:
+    world_to_camera = look_at(eyes, pivot, up)
+    return replace(reference, world_to_camera=world_to_camera, intrinsics=reference.intrinsics.expand(len(eyes), 3, 3))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
-from completesplat.geometry.trajectories import orbit
+from completesplat.geometry.trajectories import PATHS, orbit, swipe, wobble
 
 PIVOT = torch.tensor([0.3, -0.2, 2.5], dtype=torch.float64)
 UP = torch.tensor([0.1, -2.0, 0.2], dtype=torch.float64)  # neither of unit length nor along an axis
@@ -65,3 +65,51 @@ def test_orbit_keeps_the_intrinsics_and_the_image_size() -> None:
     cameras = orbit(reference, PIVOT, UP, frames=4)
     assert cameras.image_size == (64, 64)
     assert torch.equal(cameras.intrinsics, reference.intrinsics.expand(4, 3, 3))
+
+
+@pytest.mark.parametrize("name", sorted(PATHS))
+def test_every_camera_of_every_path_sees_the_pivot_in_its_centre_and_up_above_it(name: str) -> None:
+    cameras = PATHS[name](reference_camera(), PIVOT, UP, 12)
+    pixels, depths = project(cameras, torch.stack([PIVOT, PIVOT + 0.1 * UP]).expand(12, 2, 3))
+    torch.testing.assert_close(pixels[:, 0], torch.full((12, 2), 32.0, dtype=torch.float64))
+    assert (depths > 0).all()
+    assert (pixels[:, 1, 1] < 32).all()
+    assert cameras.image_size == (64, 64)
+    assert torch.equal(cameras.intrinsics, reference_camera().intrinsics.expand(12, 3, 3))
+
+
+@pytest.mark.parametrize("name", sorted(PATHS))
+def test_every_path_loops_smoothly(name: str) -> None:
+    """Also over the seam, no step and no change of step is larger than on a smooth curve of so many frames."""
+    frames = 240
+    centers = PATHS[name](reference_camera(), PIVOT, UP, frames).centers
+    speed = centers.roll(-1, 0) - centers
+    size = (centers - centers.mean(0)).norm(dim=-1).max()
+    turn = 2 * math.pi / frames
+    assert speed.norm(dim=-1).max() < 1.01 * turn * size
+    assert (speed.roll(-1, 0) - speed).norm(dim=-1).max() < 1.01 * turn**2 * size
+
+
+def test_swipe_goes_left_then_right_on_a_level_line_and_comes_back() -> None:
+    reference = reference_camera()
+    offsets = swipe(reference, PIVOT, UP, frames=16, reach=0.25).centers - reference.centers
+    distance = (reference.centers - PIVOT).norm()
+    right = swipe(reference, PIVOT, UP, frames=1).world_to_camera[0, 0, :3]
+    along = offsets @ right
+    torch.testing.assert_close(offsets, along[:, None] * right)
+    torch.testing.assert_close(right @ UP, torch.zeros((), dtype=torch.float64))
+    assert along.argmin() == 4
+    assert along.argmax() == 12
+    torch.testing.assert_close(along[[0, 4, 8, 12]] / distance, torch.tensor([0, -0.25, 0, 0.25], dtype=torch.float64))
+
+
+def test_wobble_circles_the_reference_camera_across_the_line_of_sight() -> None:
+    reference = reference_camera()
+    offsets = wobble(reference, PIVOT, UP, frames=8, radius=0.05).centers - reference.centers
+    sight = PIVOT - reference.centers
+    torch.testing.assert_close(offsets.norm(dim=-1), (0.05 * sight.norm()).expand(8))
+    torch.testing.assert_close(offsets @ sight, torch.zeros(8, dtype=torch.float64))
+    angles = torch.cosine_similarity(offsets, offsets.roll(-1, 0), dim=-1)
+    torch.testing.assert_close(angles, torch.full((8,), math.cos(math.pi / 4), dtype=torch.float64))
+    assert (offsets[2] @ UP) > 0
+    assert (offsets[0] @ UP).abs() < 1e-12

@@ -1,0 +1,103 @@
+"""The real converter: what it writes is read back by itself and compared; needs Node.js."""
+
+import dataclasses
+import gzip
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import write_formats
+from completesplat.export.page import PageView
+from completesplat.export.ply import read_ply
+from completesplat.export.splat_transform import SplatTransform, find_splat_transform
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("npx") is None and shutil.which("splat-transform") is None, reason="no Node.js"),
+]
+VIEW = PageView(
+    Cameras(torch.eye(4), pinhole(50, 64), (64, 64)), torch.tensor([0.0, 0, 3]), torch.tensor([0.0, -1, 0]), 0.5
+)
+# Largest errors: positions (units), logarithms of scales, opacities and colours, and of the rotation's entries.
+PRECISION = {
+    "splat": (1e-6, 1e-5, 0.5 / 255, 0.02),
+    "spz": (1 / 4096, 1 / 32 + 1e-4, 1 / 255, 0.005),
+    "sog": (1e-3, 0.02, 1 / 255, 0.03),
+}
+
+
+@pytest.fixture(scope="module")
+def converter() -> SplatTransform:
+    try:
+        return find_splat_transform()
+    except CompleteSplatError as error:
+        pytest.skip(str(error))
+
+
+def some(count: int = 400) -> Gaussians:
+    """Splats in front of the camera, more to the right than to the left and more below than above."""
+    generator = torch.Generator().manual_seed(0)
+
+    def rand(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    return Gaussians(
+        means=rand(count, 3) * torch.tensor([2.0, 3, 4]) + torch.tensor([-0.5, -0.5, 2]),
+        quaternions=rand(count, 4) * 2 - 1,
+        scales=10 ** (rand(count, 3) * 2 - 2.5),
+        opacities=rand(count) * 0.95 + 0.02,
+        colors=rand(count, 3),
+    )
+
+
+@pytest.fixture(scope="module")
+def written(converter, tmp_path_factory):
+    """A folder with the scene in all formats, and each of them converted back."""
+    folder = tmp_path_factory.mktemp("formats")
+    write_formats(folder, "a", some(), ["ply", "splat", "spz", "sog"], VIEW, converter)
+    for kind in PRECISION:
+        converter.convert(folder / f"a.{kind}", folder / f"{kind}.ply")
+    return folder
+
+
+@pytest.mark.parametrize("kind", PRECISION)
+def test_every_format_reads_back_as_the_same_gaussians_on_the_same_axes(written, kind):
+    own, back = read_ply(written / "a.ply"), read_ply(written / f"{kind}.ply")
+    distances = torch.cdist(own.means.double(), back.means.double())
+    nearest = distances.argmin(1)
+    assert sorted(nearest.tolist()) == list(range(own.count))  # each Gaussian is there once
+    if kind != "sog":  # which sorts by place
+        assert nearest.tolist() == list(range(own.count))
+    back = back[nearest]
+    place, scale, byte, rotation = PRECISION[kind]
+    assert (own.means - back.means).abs().max() <= place
+    assert (own.scales.log() - back.scales.log()).abs().max() <= scale
+    assert (own.opacities - back.opacities).abs().max() <= byte + 1e-5
+    assert (own.colors - back.colors).abs().max() <= byte * (1.5 if kind == "sog" else 1) + 1e-5
+    unit = [dataclasses.replace(g, scales=torch.tensor([3.0, 2, 1]).expand(400, 3)) for g in (own, back)]
+    turns = [g.covariances() for g in unit]  # free of the sign of quaternions
+    assert (turns[0] - turns[1]).abs().max() <= rotation * 9
+
+
+def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter):
+    """Read without the converter: version 3 is gzip, and positions are 24 bits with 12 behind the point."""
+    converter.convert(written / "a.ply", written / "three.spz", ["--spz-version", "3"])
+    data = gzip.decompress((written / "three.spz").read_bytes())
+    raw = np.frombuffer(data[16 : 16 + 400 * 9], np.uint8).reshape(400, 3, 3).astype(np.int32)
+    fixed = raw[..., 0] | raw[..., 1] << 8 | raw[..., 2] << 16
+    means = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 4096
+    expected = read_ply(written / "a.ply").means.numpy() * [1, -1, -1]
+    assert np.abs(means - expected).max() <= 1 / 4096
+
+
+def test_a_file_that_is_none_is_refused_in_its_words(converter, tmp_path):
+    (tmp_path / "bad.ply").write_text("no splats")
+    with pytest.raises(CompleteSplatError, match=r"failed with status 1: .+") as caught:
+        converter.convert(tmp_path / "bad.ply", tmp_path / "bad.spz")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "bad.spz").exists()

@@ -1,0 +1,88 @@
+"""Which files are written of a scene, by a stand-in for the converter; what a page begins with."""
+
+import json
+
+import pytest
+import torch
+from fake_converter import COPY, calls, install
+from support import some_gaussians
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import FORMATS, write_formats
+from completesplat.export.page import PageView, upright, viewer_settings
+from completesplat.export.ply import read_ply, write_ply
+from completesplat.export.splat_transform import SplatTransform
+from completesplat.geometry.cameras import Cameras, pinhole
+
+UP = torch.tensor([0.1, -0.9, -0.4])
+PIVOT = torch.tensor([0.0, 0.0, 2.5])
+VIEW = PageView(Cameras(torch.eye(4), pinhole(50, 64), (64, 64)), PIVOT, UP, 0.25)
+# Also keeps the settings of a page, whose folder is gone afterwards.
+KEEP_SETTINGS = f'{COPY}[ "$3" = --viewer-settings ] && cp "$4" "$0.settings" || true\n'
+
+
+@pytest.fixture
+def program(tmp_path):
+    return install(tmp_path / "bin", "splat-transform", KEEP_SETTINGS)
+
+
+@pytest.mark.parametrize("formats", [["ply"], ["splat"], ["spz", "sog"], ["html"], list(FORMATS)])
+def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program, formats):
+    out = tmp_path / "out"
+    out.mkdir()
+    converter = SplatTransform(str(program))
+    files = write_formats(out, "sample_00", some_gaussians(1)[0], formats, VIEW, converter)
+    assert sorted(files.values()) == sorted(path.name for path in out.iterdir())
+    assert set(files) == {"sample_00" if kind == "ply" else f"sample_00_{kind}" for kind in formats}
+    assert len(calls(program)) == len(set(formats) - {"ply", "splat"})
+
+
+def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, program):
+    scene = some_gaussians(1)[0]
+    scene.means[:] = torch.tensor([[1.0, 2, 3], [4, 5, 6]])
+    write_formats(tmp_path, "a", scene, ["ply", "spz", "sog", "html"], VIEW, SplatTransform(str(program)))
+    ply = (tmp_path / "a.ply").read_bytes()
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "a.sog").read_bytes() == ply
+    write_ply(tmp_path / "turned.ply", scene.transform(upright(UP)))
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "turned.ply").read_bytes() != ply
+
+
+def test_without_a_converter_only_what_needs_none_is_written(tmp_path):
+    scene = some_gaussians(1)[0]
+    write_formats(tmp_path, "a", scene, ["ply", "splat"], VIEW, None)
+    assert read_ply(tmp_path / "a.ply").count == 2
+    with pytest.raises(CompleteSplatError, match="a converter is needed for spz"):
+        write_formats(tmp_path, "a", scene, ["ply", "spz"], VIEW, None)
+
+
+@pytest.mark.parametrize(
+    "up", [[0.1, -0.9, -0.4], [0.0, -2.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]]
+)
+def test_a_scene_is_turned_until_up_points_to_minus_y(up):
+    turn = upright(torch.tensor(up))
+    torch.testing.assert_close(turn[:3, :3] @ turn[:3, :3].mT, torch.eye(3), rtol=0, atol=1e-6)
+    torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0))
+    direction = torch.tensor(up) / torch.tensor(up).norm()
+    torch.testing.assert_close(turn[:3, :3] @ direction, torch.tensor([0.0, -1, 0]), rtol=0, atol=1e-6)
+    ahead = turn[:3, :3] @ torch.tensor([0.0, 0, 1])
+    assert abs(ahead[0]) < 1e-6  # what is in front stays in front
+    assert ahead[2] > -1e-6
+
+
+def test_a_page_begins_at_the_reference_camera_and_looks_at_the_pivot(tmp_path, program):
+    write_formats(tmp_path, "a", some_gaussians(1)[0], ["html"], VIEW, SplatTransform(str(program)))
+    settings = json.loads((tmp_path / "bin/splat-transform.settings").read_text())
+    assert settings == json.loads(json.dumps(viewer_settings(VIEW, upright(UP))))
+    initial = settings["cameras"][0]["initial"]
+    # The viewer's +y points up: the pivot is as much below the camera as the scene's up leans to the viewer.
+    position, target = torch.tensor(initial["position"]), torch.tensor(initial["target"])
+    assert position.abs().max() == 0
+    torch.testing.assert_close(target.norm(), PIVOT.norm())
+    torch.testing.assert_close(target[1], PIVOT @ UP / UP.norm())
+    assert settings["background"] == {"color": [0.25] * 3}
+
+
+def test_a_page_shows_all_of_the_photograph_in_a_wide_window():
+    fov = viewer_settings(VIEW, upright(UP))["cameras"][0]["initial"]["fov"]  # of the longer side
+    half_of_short_side = torch.tensor(fov).div(2).deg2rad().tan() * 9 / 16
+    torch.testing.assert_close(half_of_short_side, torch.tensor(25.0).deg2rad().tan())

@@ -1,0 +1,82 @@
+"""What the page draws, in headless Chromium without a network, against our own rasterizer; needs Node.js too."""
+
+import io
+import math
+import shutil
+
+import pytest
+import torch
+from PIL import Image
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.page import LARGEST_FOV, PageView, upright, viewer_settings, write_page
+from completesplat.export.pixels import to_bytes
+from completesplat.export.splat_transform import find_splat_transform
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+playwright = pytest.importorskip("playwright.sync_api", reason="no playwright")
+CHROMIUM = shutil.which("chromium")
+NODE = shutil.which("npx") or shutil.which("splat-transform")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium"),
+    pytest.mark.skipif(NODE is None, reason="no Node.js"),
+]
+WIDTH, HEIGHT = 320, 180
+UP = torch.tensor([0.05, -0.92, -0.38])
+PIVOT = torch.tensor([0.1, 0.1, 3.0])
+REFERENCE = Cameras(torch.eye(4), pinhole(50, 64), (64, 64))
+
+
+def scene() -> Gaussians:
+    """Balls of different colours to the right, to the left, above, and one half hidden by the one on the right."""
+    means = torch.tensor([[0.7, 0.0, 3.0], [-0.7, 0.1, 3.0], [0.0, -0.7, 3.0], [0.9, 0.2, 4.0]])
+    colors = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]])
+    quaternions = torch.tensor([1.0, 0, 0, 0]).expand(4, 4)
+    return Gaussians(means, quaternions, torch.full((4, 3), 0.15), torch.full((4,), 0.99), colors)
+
+
+def our_picture(view: PageView) -> torch.Tensor:
+    fov = viewer_settings(view, upright(UP))["cameras"][0]["initial"]["fov"]
+    assert fov < LARGEST_FOV
+    focal = WIDTH / 2 / math.tan(math.radians(fov) / 2)
+    intrinsics = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    camera = Cameras(look_at(torch.zeros(3), PIVOT, UP), intrinsics, (HEIGHT, WIDTH))
+    image = ReferenceRasterizer()(scene()[None], camera[None, None]).over(view.background)[0, 0]
+    return torch.from_numpy(to_bytes(image).copy()).float() / 255
+
+
+def screenshot(path, requests: list[str]) -> torch.Tensor:
+    with playwright.sync_playwright() as started:
+        options = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=options)
+        page = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT}, offline=True).new_page()
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(f"{path.as_uri()}?noanim&webgl&noui")
+        picture = torch.zeros(HEIGHT, WIDTH, 3)
+        for _ in range(60):
+            page.wait_for_timeout(1000)
+            data = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+            earlier, picture = picture, torch.tensor(list(data.getdata())).view(HEIGHT, WIDTH, 3) / 255
+            if picture.std() > 0.05 and torch.equal(picture, earlier):  # something is drawn, and has come to rest
+                break
+        browser.close()
+    return picture
+
+
+def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
+    try:
+        converter = find_splat_transform()
+    except CompleteSplatError as error:
+        pytest.skip(str(error))
+    view = PageView(REFERENCE, PIVOT, UP, 0.25)
+    write_page(tmp_path / "scene.html", scene(), view, converter)
+    requests: list[str] = []
+    theirs, ours = screenshot(tmp_path / "scene.html", requests), our_picture(view)
+    assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert (theirs - ours).abs().mean() < 0.003
+    # So does no other way up, nor the mirror image.
+    for other in (theirs.flip(0), theirs.flip(1), theirs.flip(0, 1)):
+        assert (other - ours).abs().mean() > 0.01

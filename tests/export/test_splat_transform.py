@@ -1,0 +1,100 @@
+"""How the converter is found and run, with stand-ins for it."""
+
+import os
+
+import pytest
+from fake_converter import calls, install
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export import splat_transform
+from completesplat.export.splat_transform import PACKAGE, SplatTransform, find_splat_transform
+
+SYSTEM = "/usr/bin:/bin"
+
+
+@pytest.fixture
+def bin_folder(tmp_path, monkeypatch):
+    """A folder that comes first on PATH, before a system without node."""
+    folder = tmp_path / "bin"
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for name in ("sh", "cp", "sleep", "cat", "touch"):
+        (tools / name).symlink_to(
+            next(f"{place}/{name}" for place in SYSTEM.split(":") if os.path.exists(f"{place}/{name}"))
+        )
+    monkeypatch.setenv("PATH", f"{folder}:{tools}")
+    return folder
+
+
+def test_without_node_it_is_said_what_to_install_and_what_needs_nothing(bin_folder):
+    with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply and splat need nothing"):
+        find_splat_transform()
+
+
+def test_the_program_on_path_comes_first(bin_folder):
+    program = install(bin_folder, "splat-transform")
+    npx = install(bin_folder, "npx")
+    assert find_splat_transform() == SplatTransform(str(program))
+    assert calls(program) == ["--version"]
+    assert calls(npx) == []
+
+
+def test_else_npx_provides_the_pinned_package(bin_folder, tmp_path):
+    program = install(tmp_path / "npm", "splat-transform")
+    npx = install(bin_folder, "npx", f'echo "$@" >> "$0.log"\necho {program}')
+    assert find_splat_transform() == SplatTransform(str(program))
+    assert calls(npx) == [f"--yes --package={PACKAGE} -c command -v splat-transform"]
+    assert PACKAGE.endswith("@2.7.1")
+
+
+def test_npx_without_a_network_is_told_with_its_own_words(bin_folder):
+    install(bin_folder, "npx", "echo npm warn a hint >&2; echo npm error network ENOTFOUND >&2; exit 1")
+    with pytest.raises(CompleteSplatError, match=r"^npx failed with status 1: npm error network ENOTFOUND$"):
+        find_splat_transform()
+
+
+def test_a_program_that_does_not_start_is_found_out_before_it_is_needed(bin_folder):
+    install(bin_folder, "splat-transform", "echo node is too old >&2; exit 3")
+    with pytest.raises(CompleteSplatError, match="splat-transform failed with status 3: node is too old"):
+        find_splat_transform()
+    (bin_folder / "splat-transform").write_text("#!/no/such/interpreter\n")
+    with pytest.raises(CompleteSplatError, match="splat-transform does not start"):
+        find_splat_transform()
+
+
+def test_a_file_is_converted_in_place_of_an_older_one(bin_folder, tmp_path):
+    program = install(bin_folder, "splat-transform")
+    (tmp_path / "a.ply").write_text("splats")
+    (tmp_path / "a.spz").write_text("older")
+    SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz", ["--rotate", "0,0,180"])
+    assert (tmp_path / "a.spz").read_text() == "splats"
+    (call,) = calls(program)
+    assert call.startswith(f"--quiet --overwrite --rotate 0,0,180 {tmp_path / 'a.ply'} ")
+    assert call.endswith(".spz")  # by which it knows the format
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("echo '    at main (x.js:1)' >&2; echo 'no GPU\nat all' >&2; exit 1", "failed with status 1: no GPU at all$"),
+        ("exit 9", "failed with status 9: it does not say why"),
+        ("exit 0", "has not written a.spz"),
+    ],
+)
+def test_a_failure_is_one_line_and_leaves_the_older_file(bin_folder, tmp_path, script, said):
+    program = install(bin_folder, "splat-transform", script)
+    (tmp_path / "a.ply").write_text("splats")
+    (tmp_path / "a.spz").write_text("older")
+    with pytest.raises(CompleteSplatError, match=said) as caught:
+        SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "a.spz").read_text() == "older"
+
+
+def test_what_takes_too_long_is_ended_with_all_that_it_started(bin_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(splat_transform, "LIMIT_SECONDS", 0.3)
+    # Would write the file after a second, and holds the pipes open until then.
+    program = install(bin_folder, "splat-transform", f"(sleep 1; touch {tmp_path / 'late'}) & sleep 100")
+    with pytest.raises(CompleteSplatError, match=r"splat-transform has not finished within 0\.3 seconds"):
+        SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
+    assert not (tmp_path / "late").exists()
