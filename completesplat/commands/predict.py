@@ -28,7 +28,10 @@ def _model(config: Any) -> Any:
     from omegaconf import OmegaConf
 
     from completesplat.generation import CompleteSplat
+    from completesplat.weights import in_the_box
 
+    if config.weights in in_the_box():
+        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
     model = CompleteSplat.from_pretrained(config.weights)
     if config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)

@@ -75,6 +75,7 @@ def _predict(
         **settings,
         "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
         "image": image.name,
+        "widened": config.widen,
         "mask": None if config.mask is None else Path(config.mask).name,
         "box": None if config.box is None else list(config.box),
         "fov_degrees": photograph.fov_degrees,

@@ -42,6 +42,7 @@ def wanted_files(config: Any) -> Wanted:
         frames=config.frames,
         background=config.background,
         maps=config.maps,
+        widen=config.widen,
         converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
     )
 

@@ -18,6 +18,7 @@ from completesplat.export.scene_json import write_scene_json
 from completesplat.export.splat_transform import SplatTransform
 from completesplat.export.video import write_video
 from completesplat.export.views import orbit_views, render_views
+from completesplat.export.widening import widened
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.trajectories import PATHS
@@ -37,6 +38,7 @@ class Wanted:
         background: grey value where a scene leaves a pixel open.
         maps: depth, normals and opacity of the reference view, see `completesplat.export.maps`.
         converter: writes the formats that need one.
+        widen: store Gaussians `widened` for viewers, which draw larger pictures than training.
     """
 
     formats: Sequence[str] = ("ply",)
@@ -45,6 +47,7 @@ class Wanted:
     background: float = 0.5
     maps: bool = False
     converter: SplatTransform | None = None
+    widen: bool = True
 
 
 def write_prediction(
@@ -108,7 +111,8 @@ def _write_sample(
     """A sample's splats and videos, and its row of the contact sheet; the files' names by purpose."""
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
-    files = write_formats(folder, f"sample_{index:02}", scene, wanted.formats, view, wanted.converter, comments)
+    stored = widened(scene, reference) if wanted.widen else scene
+    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
     for kind in wanted.videos:
         files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
         cameras = PATHS[kind](reference, pivot, up, wanted.frames)

@@ -1,0 +1,36 @@
+"""HTML from elements: text is text."""
+
+from html.parser import HTMLParser
+
+import pytest
+
+from completesplat.reports.html.markup import Html, element, joined
+
+
+def parsed(text: str) -> list:
+    events: list = []
+    parser = HTMLParser()
+    parser.handle_starttag = lambda tag, attributes: events.append((tag, dict(attributes)))
+    parser.handle_endtag = lambda tag: events.append(f"/{tag}")
+    parser.handle_data = lambda data: events.append(data)
+    parser.feed(text)
+    parser.close()
+    return events
+
+
+@pytest.mark.parametrize("text", ["<b>", "&amp;", "\"'", "</p><script>", "ä €"])
+def test_text_and_attributes_come_back_as_they_were(text):
+    assert parsed(element("p", text, title=text)) == [("p", {"title": text}), text, "/p"]
+
+
+def test_elements_nest_and_only_they_are_not_escaped():
+    inner = element("b", "x")
+    assert isinstance(inner, Html)
+    assert parsed(element("p", inner, str.__str__("<b>"))) == [("p", {}), ("b", {}), "x", "/b", "<b>", "/p"]
+    assert joined(inner, "<") == "<b>x</b>&lt;"
+
+
+def test_attributes_of_words_that_python_keeps_and_without_values():
+    assert parsed(element("img", class_="a", aria_label="b", open=True, hidden=False)) == [
+        ("img", {"class": "a", "aria-label": "b", "open": None})
+    ]

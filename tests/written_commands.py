@@ -1,0 +1,54 @@
+"""The commands that the README and the verbs' `--help` print: found, and composed as the command line would."""
+
+import re
+import shlex
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from support import compose_config
+
+from completesplat.cli import VERBS
+from completesplat.commands import TASKS, conf_folder
+
+README = Path(__file__).parents[1] / "README.md"
+BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+
+def readme_commands() -> list[str]:
+    """Lines of the README's code blocks that start with `completesplat`, without their comments."""
+    lines = [line for block in BLOCK.findall(README.read_text()) for line in block.splitlines()]
+    return [line.strip() for line in lines if line.startswith("completesplat ")]
+
+
+def help_commands() -> list[str]:
+    """The examples of every verb's configuration."""
+    lines = [line.strip() for verb in VERBS for line in (conf_folder() / f"{verb}.yaml").read_text().splitlines()]
+    return [line for line in lines if line.startswith("completesplat ") and "${" not in line]
+
+
+def arguments_of(command: str) -> list[str]:
+    """Verb and arguments; what follows a # is a comment."""
+    return shlex.split(command, comments=True)[1:]
+
+
+def composed(command: str):
+    """The configuration of a written command; of a sweep, that of its first job.
+
+    Raises:
+        hydra.errors.HydraException: the command would be refused.
+    """
+    verb, *arguments = arguments_of(command)
+    arguments = [argument for argument in arguments if argument not in ("-m", "--multirun")]
+    if verb in TASKS and arguments and "=" not in arguments[0]:
+        arguments[0] = f"{verb}_task={arguments[0]}"
+    if verb == "view" and arguments and "=" not in arguments[0]:
+        arguments[0] = f"path={arguments[0]}"
+    return compose_config(verb, *map(_first_job, arguments))
+
+
+def _first_job(argument: str) -> str:
+    override = OverridesParser.create().parse_override(argument)
+    if not override.is_sweep_override():
+        return argument
+    value = "full" if "glob(" in argument else str(next(override.sweep_string_iterator()))
+    return f"{override.get_key_element()}={value}"
