@@ -1,16 +1,17 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow check bench notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser check bench notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/installed
 DEMO := outputs/demo
-DEMO_SCENES := 240
-DEMO_LAST := 00239
+DEMO_SCENES := 80
+DEMO_LAST := 00079
+TRAINED := outputs/demo_train
 
 help: ## List the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 $(READY): pyproject.toml
 	@echo "Installing into .venv: a few minutes, once"
@@ -18,29 +19,34 @@ $(READY): pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $(READY)
 
-# The held-out picture is the first frame of the last scene, which is always in the test split.
-demo: $(READY) ## Make toy scenes, train both stages, evaluate, complete two pictures (CPU, under 15 minutes)
+# The scenes have another seed than those of the weights' training. The held-out picture is the first frame of the last one.
+demo: $(READY) ## Complete two pictures with the weights in the package, and score them (CPU, minutes)
 	rm -rf $(DEMO)
-	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) out=$(DEMO)/data
-	$(BIN)/completesplat fit experiment=toy_var data.root=$(DEMO)/data trainer.max_steps=2200 data.color_jitter=null test=false out=$(DEMO)/var
-	$(BIN)/completesplat fit experiment=toy_diffusion data.root=$(DEMO)/data trainer.max_steps=700 \
-	  model.autoreconstructor_checkpoint=$(DEMO)/var/checkpoints/last.ckpt test=false out=$(DEMO)/diffusion
-	$(BIN)/completesplat test ckpt=$(DEMO)/var/checkpoints/last.ckpt out=$(DEMO)/test_var
-	$(BIN)/completesplat test ckpt=$(DEMO)/diffusion/checkpoints/last.ckpt out=$(DEMO)/test
-	cp -r $(DEMO)/diffusion/weights $(DEMO)/weights
-	cp $(DEMO)/test/metrics.json $(DEMO)/metrics.json
+	$(BIN)/completesplat data toy kind=objects scenes=$(DEMO_SCENES) seed=1000 out=$(DEMO)/data
 	cp $(DEMO)/data/toy_objects/*$(DEMO_LAST)_*/images/frame000001.jpg $(DEMO)/held_out.jpg
 	cp `$(BIN)/python -c "import skimage; print(skimage.__path__[0])"`/data/coffee.png $(DEMO)/photograph.png
-	$(BIN)/completesplat predict image=$(DEMO)/held_out.jpg weights=$(DEMO)/weights out=$(DEMO)
-	$(BIN)/completesplat predict image=$(DEMO)/photograph.png weights=$(DEMO)/weights out=$(DEMO)
+	$(BIN)/completesplat predict 'image=[$(DEMO)/held_out.jpg,$(DEMO)/photograph.png]' out=$(DEMO)
+	$(BIN)/completesplat test weights=toy_objects data=toy_objects data.root=$(DEMO)/data out=$(DEMO)/test
 	@echo
 	@echo "In $(DEMO):"
-	@echo "  held_out/     4 completions of a scene that training never saw: look at sheet.png first;"
+	@echo "  held_out/     4 completions of a toy scene that training never saw: look at sheet.png first;"
 	@echo "                sample_0*.ply open in any splat viewer, orbit_0*.mp4 in any player"
 	@echo "  photograph/   the same for a real photograph, which these toy weights do not understand"
-	@echo "  metrics.json  scores of the latent diffusion's samples on held-out scenes (test_var/: of the VAR)"
-	@echo "  weights/      for completesplat predict image=FILE weights=$(DEMO)/weights"
-	@echo "  data/ var/ diffusion/   the toy scenes and the two training runs"
+	@echo "  test/         metrics.json: scores of one sample for each held-out scene, beside two naive predictors"
+	@echo "Next: $(BIN)/completesplat predict image=FILE, and make demo-train for both stages of training"
+
+demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, complete a picture (CPU, under 15 minutes)
+	rm -rf $(TRAINED)
+	$(BIN)/completesplat data toy kind=objects scenes=240 out=$(TRAINED)/data
+	$(BIN)/completesplat fit experiment=toy_var data.root=$(TRAINED)/data trainer.max_steps=2200 data.color_jitter=null test=false out=$(TRAINED)/var
+	$(BIN)/completesplat fit experiment=toy_diffusion data.root=$(TRAINED)/data trainer.max_steps=700 \
+	  model.autoreconstructor_checkpoint=$(TRAINED)/var/checkpoints/last.ckpt test=false out=$(TRAINED)/diffusion
+	$(BIN)/completesplat test ckpt=$(TRAINED)/var/checkpoints/last.ckpt out=$(TRAINED)/test_var
+	$(BIN)/completesplat test ckpt=$(TRAINED)/diffusion/checkpoints/last.ckpt out=$(TRAINED)/test
+	cp $(TRAINED)/data/toy_objects/*00239_*/images/frame000001.jpg $(TRAINED)/held_out.jpg
+	$(BIN)/completesplat predict image=$(TRAINED)/held_out.jpg weights=$(TRAINED)/diffusion/weights out=$(TRAINED)
+	@echo
+	@echo "In $(TRAINED): data/ var/ diffusion/ (its weights/ are for predict weights=DIR), test_var/ and test/ with scores, held_out/"
 
 # Threads that wait at full speed, as GNU OpenMP's do by default, would keep the other test process off the cores.
 test: check ## Lint, types and the tests (CPU, under 8 minutes)
@@ -48,6 +54,9 @@ test: check ## Lint, types and the tests (CPU, under 8 minutes)
 
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
+
+test-browser: $(READY) ## The viewer in Chromium (apt-get install chromium); skipped where it is missing
+	$(BIN)/python -m pytest -q -m browser -rs tests/viewer
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check

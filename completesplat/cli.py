@@ -6,10 +6,12 @@ import sys
 VERBS = {
     "data": "make, check, look at, import and prepare data sets",
     "fit": "train a model, one stage at a time",
-    "test": "score a checkpoint on held-out scenes",
-    "predict": "draw complete scenes from one photograph",
-    "report": "tables of results beside the paper's (report runs=DIR); samplers, controls, masks, depth (report NAME)",
+    "test": "score a trained model on held-out scenes",
+    "predict": "draw complete scenes from photographs",
+    "view": "a page in the browser: look at scenes, draw new ones from a photograph (view PATH)",
+    "report": "tables beside the paper's (report runs=DIR), a page with all (report html), samplers, ... (report NAME)",
     "bench": "time what takes time (bench rasterizers, bench data, bench diffusion, bench paper)",
+    "doctor": "what this machine has and lacks, and whether completing a photograph can work",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
     f"  {verb:9} {description}" for verb, description in VERBS.items()

@@ -11,6 +11,7 @@ from typing import Any
 
 from completesplat.commands.jobs import PROCESS_OF_JOB, run_job, run_process_of_job
 from completesplat.commands.sweeps import is_sweep, job_name, sweep_arguments
+from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
@@ -28,7 +29,8 @@ UNHELPFUL_WARNINGS = (
 def launch(verb: str, arguments: list[str]) -> None:
     """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
-    `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`.
+    `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`. `view PATH` is short
+    for `view path=PATH`.
     """
     import hydra
     from hydra.core.hydra_config import HydraConfig
@@ -40,6 +42,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
+    if verb == "view":
+        arguments = overrides(arguments)
     program, given = sys.argv[0], arguments
     if is_sweep(arguments):
         arguments = [*arguments, *sweep_arguments(verb, arguments, RUN_NAME)]

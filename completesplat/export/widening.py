@@ -14,9 +14,9 @@ from completesplat.rasterizers.protocol import RenderingConstants
 def widened(gaussians: Gaussians, reference: Cameras, blur: float = RenderingConstants().blur) -> Gaussians:
     """Gaussians that hold the rasterizer's blur, as it is in the reference view.
 
-    A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and makes
-    Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian at depth z
-    gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes as they are.
+    A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
+    makes Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian
+    at depth z gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes.
 
     Args:
         gaussians: [gaussian], in the world of the camera.

@@ -24,8 +24,8 @@ def weights_folder(weights: Path | str) -> Path:
     """The folder that is meant, complete, with every file that has a checksum as it was written.
 
     Args:
-        weights: a folder; else a name of `in_the_box`; else an id of the Hugging Face hub, whose files are downloaded once
-            (a token, a mirror, work without a network: by the hub's own environment variables).
+        weights: a folder; else a name of `in_the_box`; else an id of the Hugging Face hub, whose files are downloaded
+            once (a token, a mirror, work without a network: by the hub's own environment variables).
 
     Raises:
         WeightsError: there are none, files are missing, or one has another checksum.
