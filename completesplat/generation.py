@@ -192,7 +192,7 @@ class CompleteSplat(nn.Module):
         return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
 
     def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json`, `model.safetensors` and their checksums into a folder, as the Hugging Face hub has them."""
+        """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub."""
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
         save_file({key: value.contiguous().cpu() for key, value in self.state_dict().items()}, folder / WEIGHTS_FILE)
