@@ -12,7 +12,7 @@ from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
 
 CONF = conf_folder()
-VERBS = ["fit", "test", "predict", "data", "bench", "report"]
+VERBS = ["fit", "test", "predict", "view", "data", "bench", "report", "doctor"]
 NEEDED = ["model.autoreconstructor_checkpoint=null"]
 
 
@@ -44,7 +44,7 @@ def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
     needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
-    stage2 = group == "experiment" and option.endswith("_diffusion")
+    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small"))
     needed += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
     needed += NEEDED if stage2 or option == "latent_diffusion" else []
     config = compose_config("fit", f"{group}={option}", *needed)
@@ -150,6 +150,12 @@ def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, mo
     settings += {
         "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
         "toy_diffusion_masked": [f"model.checkpoint={diffusion}", "sampler.steps=2"],
+        # Of the pipeline's stage 1, which has four levels.
+        "toy_diffusion_small": [
+            f"model.autoreconstructor_checkpoint={var}",
+            "conditioning.channels=[8,8,16,16]",
+            "sampler.steps=2",
+        ],
         "toy_var_stage2": [f"model.checkpoint={var}", "ablation=no_lpips"],
         "toy_var_masked": [f"model.checkpoint={var}"],
     }.get(experiment, [])
