@@ -1,0 +1,202 @@
+"""`completesplat view`: a page on which to look at scenes and to draw new ones."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from completesplat.errors import CompleteSplatError, DataError
+
+EXPORT = "--export"
+WEIGHTS = ("config.json", "model.safetensors")
+MOST_CAMERAS = 24
+
+
+def overrides(arguments: Sequence[str]) -> list[str]:
+    """Hydra's form of what people type: `PATH` is `path=PATH`, `--export FILE` is `export=FILE`."""
+    given = [part for argument in arguments for part in _parted(argument)]
+    found = []
+    while given:
+        argument = given.pop(0)
+        if argument == EXPORT:
+            if not given:
+                raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
+            found.append(_setting("export", given.pop(0)))
+        elif argument.startswith("-") or "=" in argument:
+            found.append(argument)
+        else:
+            found.append(_setting("path", argument))
+    return found
+
+
+def run(config: Any, out: Path) -> None:
+    """Open the page and stay until Ctrl-C; with `export`, write it as a file instead."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
+    check_settings(config)
+    config.update(settings_of(Path(config.path)) if config.path is not None else {})
+    page = make_page(config, out)
+    try:
+        if config.export is not None:
+            return export(page, Path(config.export))
+        print(f"http://{page.server.get_host()}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        page.close()
+
+
+def settings_of(path: Path) -> dict[str, str]:
+    """The setting that a path stands for: `scene`, `image` or `weights`.
+
+    Raises:
+        CompleteSplatError: nothing there, or a folder with nothing to show.
+    """
+    if path.is_file():
+        return {"scene" if path.suffix.lower() == ".ply" else "image": str(path)}
+    if not path.is_dir():
+        raise CompleteSplatError(f"{path}: no such file or folder")
+    for folder in (path, path / "weights"):
+        if all((folder / name).is_file() for name in WEIGHTS):
+            return {"weights": str(folder)}
+    folders = [folder for folder in (path, *sorted(path.iterdir())) if any(folder.glob("sample_*.ply"))]
+    if len(folders) == 1 or path in folders:
+        return {"scene": str(folders[0])}
+    if folders:
+        raise CompleteSplatError(f"{path} holds {len(folders)} predictions: give one of them, {folders[0]} for example")
+    raise CompleteSplatError(
+        f"{path}: neither weights ({', '.join(WEIGHTS)}, here or in weights/) nor a prediction (sample_*.ply)"
+    )
+
+
+def make_page(config: Any, out: Path) -> Any:
+    """The page with what the settings name, on a port of its own."""
+    from hydra.utils import instantiate
+
+    from completesplat.viewer.completion import Completion
+    from completesplat.viewer.page import Page
+    from completesplat.viewer.samples import read_scene
+    from completesplat.viewer.saving import Saver
+    from completesplat.viewer.server import start_server, stop_server
+    from completesplat.viewer.stage import Stage
+
+    model = load_model(config) if config.scene is None else None
+    samples, up = ([], tuple(model.up.tolist())) if model is not None else read_scene(Path(config.scene))
+    photograph = None if model is None or config.image is None else model.read(Path(config.image), config.fov)
+    cameras = None if config.get("data") is None else data_cameras(config.data)
+    server = start_server(0 if config.export is not None else config.port, config.background)
+    try:
+        stage = Stage(server, up, cameras)
+        stage.show(samples)
+        rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
+        saver = Saver(out, stage, rasterizer, config.frames, config.background)
+        if model is None:
+            return Page(server, stage, saver, stage.layers)
+        page = Page(server, stage, saver, model.autoreconstructor.reconstructor.parameterization.layers)
+        completion = Completion(page, model, start_settings(config, model))
+        if photograph is not None:
+            completion.load(Path(config.image).name, photograph)
+        return page
+    except BaseException:
+        stop_server(server)
+        raise
+
+
+def load_model(config: Any) -> Any:
+    """The model with the sampler that is wanted, on a GPU where there is one.
+
+    Raises:
+        WeightsError: no weights, or not readable.
+    """
+    import torch
+    from omegaconf import OmegaConf
+
+    from completesplat.generation import CompleteSplat
+    from completesplat.weights import in_the_box
+
+    if config.weights in in_the_box():
+        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
+    model = CompleteSplat.from_pretrained(config.weights)
+    if config.get("sampler") is not None:
+        sampler: Any = OmegaConf.to_container(config.sampler)
+        model.replace_sampler(sampler)
+    return model.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def start_settings(config: Any, model: Any) -> dict[str, Any]:
+    """Where the sliders stand at first."""
+    settings = {name: config[name] for name in ("samples", "skip_weight", "guidance_weight", "steps", "seed")}
+    return settings | ({"steps": model.sampler.steps} if settings["steps"] is None else {})
+
+
+def data_cameras(config: Any) -> Any:
+    """Cameras of the first training sequence that can be read, in the frame of its first one: at most 24, evenly.
+
+    Raises:
+        DataError: no sequence can be read.
+    """
+    import torch
+    from hydra.utils import instantiate
+
+    data = instantiate(config, _convert_="all")
+    data.prepare_data()
+    source = data.source("train")
+    for name in source.names:
+        try:
+            cameras = source.read(name).cameras.to(dtype=torch.float32)
+        except DataError:
+            continue
+        count = len(cameras.world_to_camera)
+        return cameras.relative_to(cameras[0])[:: -(-count // MOST_CAMERAS)]
+    raise DataError("no training sequence can be read", str(config.root))
+
+
+def export(page: Any, path: Path) -> None:
+    """Write what the page shows when its work is done.
+
+    Raises:
+        CompleteSplatError: it shows nothing.
+    """
+    from completesplat.viewer.saving import write_page
+
+    page.worker.wait()
+    if not page.stage.samples:
+        raise CompleteSplatError("there is nothing to export: give a scene, or a picture and weights")
+    print(write_page(page.server, path))
+
+
+def check_settings(config: Any) -> None:
+    """Refuse settings without a meaning.
+
+    Raises:
+        CompleteSplatError: names the setting and its range.
+    """
+    ranges = {
+        "samples": (1, 8),
+        "skip_weight": (0, 1),
+        "guidance_weight": (0, 1),
+        "steps": (1, 1000),
+        "seed": (0, 2**31),
+        "port": (1, 65535),
+        "frames": (1, 1000),
+        "background": (0, 1),
+    }
+    for name, (least, most) in ranges.items():
+        if config[name] is not None and not least <= config[name] <= most:
+            raise CompleteSplatError(f"{name}={config[name]}: must lie between {least} and {most}")
+
+
+def _parted(argument: str) -> list[str]:
+    """`--export=FILE` as two arguments."""
+    return argument.split("=", 1) if argument.startswith(f"{EXPORT}=") else [argument]
+
+
+def _setting(name: str, value: str) -> str:
+    """Quoted, so that hydra takes every character as it is."""
+    escaped = value.replace("'", "\\'")
+    return f"{name}='{escaped}'"

@@ -1,0 +1,110 @@
+"""The page's controls of drawing: a photograph in, samples out, again and again."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import viser
+
+from completesplat.data.photograph import Photograph
+from completesplat.errors import CompleteSplatError
+from completesplat.export.pixels import to_bytes
+from completesplat.gaussians import Gaussians
+from completesplat.generation import CompleteSplat
+from completesplat.geometry.cameras import Cameras
+from completesplat.viewer.controls import MOST_SAMPLES, add_drawing
+from completesplat.viewer.page import Page
+from completesplat.viewer.samples import Sample
+from completesplat.viewer.steps import nearest_steps
+from completesplat.viewer.uploads import read_upload
+
+PAUSE = 0.2  # seconds between two pictures of a scene that forms
+
+
+class Completion:
+    """Adds the controls to a page.
+
+    Args:
+        model: completes the photographs, in the page's worker only.
+        start: where the sliders stand at first (`samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`).
+    """
+
+    def __init__(self, page: Page, model: CompleteSplat, start: dict[str, Any]) -> None:
+        self.page, self.model = page, model
+        self.photograph: tuple[str, Photograph] | None = None
+        self.controls = add_drawing(page.server.gui, model, start)
+        self.controls.upload.on_upload(self._upload)
+        self.controls.draw.on_click(lambda event: self.request(event.client))
+        for slider in self.controls.sliders():
+            slider.on_update(self._moved)
+
+    def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
+        """Complete this picture from now on."""
+        self.photograph = name, photograph
+        preview = self.controls.preview
+        preview.image = to_bytes(photograph.image)
+        preview.label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
+        self.request(client)
+
+    def request(self, client: viser.ClientHandle | None = None) -> None:
+        """Draw with the settings of this moment, when what is being done is done."""
+        if self.photograph is None:
+            return self.page.tell(CompleteSplatError("load a picture first"), client)
+        job = partial(self._draw, *self.photograph, self.controls.settings(), client)
+        self.page.worker.submit("draw", job)
+
+    def _upload(self, event: viser.GuiEvent) -> None:
+        file = self.controls.upload.value
+        try:
+            self.load(file.name, read_upload(self.model, file.name, file.content), event.client)
+        except CompleteSplatError as error:
+            self.page.tell(error, event.client)
+
+    def _moved(self, event: viser.GuiEvent) -> None:
+        steps: Any = self.controls.steps
+        nearest = nearest_steps(self.model.sampler, steps.value)
+        if nearest != steps.value:
+            steps.value = nearest  # calls this again
+        elif self.controls.live.value and self.photograph is not None:
+            self.request(event.client)
+
+    def _draw(
+        self, name: str, photograph: Photograph, settings: dict[str, Any], client: viser.ClientHandle | None
+    ) -> None:
+        """In the worker's thread: the samples, and before them what they look like on the way."""
+        began = time.monotonic()
+        progress, forming = self.controls.progress, self.controls.forming.value
+        earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
+        arranged = partial(self._arranged, earlier, self.model.camera(photograph), {**settings, "image": name})
+        last_shown = 0.0
+
+        def formed(step: int, level: int, estimate: Gaussians) -> None:
+            nonlocal last_shown
+            progress.value = min(100.0, 100 * (step + 1) / settings["steps"])
+            # A model that works in parts does not say which of the samples these are.
+            if len(estimate.means) == settings["samples"] and time.monotonic() - last_shown > PAUSE:
+                self.page.show(arranged([estimate[i] for i in range(settings["samples"])], finished=False), "drawing")
+                last_shown = time.monotonic()
+
+        progress.animated, progress.visible, progress.value = not forming, True, 0.0 if forming else 100.0
+        try:
+            scenes = self.model(photograph, on_step=formed if forming else None, **settings)
+            self.page.show(arranged(scenes, finished=True), f"{len(scenes)} drawn in {time.monotonic() - began:.1f} s")
+        except CompleteSplatError as error:
+            self.page.tell(error, client)
+        finally:
+            progress.visible = False
+
+    def _arranged(
+        self,
+        earlier: Sequence[Sample],
+        reference: Cameras,
+        settings: dict[str, Any],
+        scenes: Sequence[Gaussians],
+        finished: bool,
+    ) -> list[Sample]:
+        """The new samples behind the earlier ones, as many as there is room for."""
+        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
+        new = [Sample(scene, layers, reference, {**settings, "sample": i}, finished) for i, scene in enumerate(scenes)]
+        return [*earlier, *new][-MOST_SAMPLES:]

@@ -1,0 +1,101 @@
+"""The panel beside the scene: viser's handles, by purpose."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+
+from completesplat.generation import CompleteSplat
+from completesplat.viewer.steps import nearest_steps, possible_steps
+
+MOST_SAMPLES, MOST_SEED = 8, 99
+SIDE_BY_SIDE = "all, side by side"
+KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What a photograph is completed with."""
+
+    upload: viser.GuiUploadButtonHandle
+    preview: viser.GuiImageHandle
+    samples: viser.GuiSliderHandle[int]
+    skip_weight: viser.GuiSliderHandle[float]
+    guidance_weight: viser.GuiSliderHandle[float]
+    steps: viser.GuiSliderHandle[int]
+    seed: viser.GuiSliderHandle[int]
+    live: viser.GuiCheckboxHandle
+    forming: viser.GuiCheckboxHandle
+    keep: viser.GuiCheckboxHandle
+    draw: viser.GuiButtonHandle
+    progress: Any
+
+    def settings(self) -> dict[str, Any]:
+        """Arguments of the model."""
+        names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
+        return {name: getattr(self, name).value for name in names}
+
+    def sliders(self) -> list[Any]:
+        """What makes another drawing when it is moved."""
+        return [self.samples, self.skip_weight, self.guidance_weight, self.steps, self.seed]
+
+
+def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> Drawing:
+    """The folders `Photograph` and `Completion`.
+
+    Args:
+        start: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`: where the sliders stand at first.
+    """
+    blank = np.full((model.image_size, model.image_size, 3), 230, np.uint8)
+    steps = possible_steps(model.sampler)
+    with gui.add_folder("Photograph", order=1):
+        upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
+        preview = gui.add_image(blank, label="none yet", format="png")
+    with gui.add_folder("Completion", order=2):
+        return Drawing(
+            upload,
+            preview,
+            gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
+            gui.add_slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint="1: most faithful, 0: most free"),
+            gui.add_slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint="more: more diverse"),
+            gui.add_slider(
+                "Steps", 1, steps[-1], 1, nearest_steps(model.sampler, start["steps"]), hint="denoising steps"
+            ),
+            gui.add_slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
+            gui.add_checkbox("Draw when a slider moves", True),
+            gui.add_checkbox("Show it forming", True, hint="costs a little time at each step"),
+            gui.add_checkbox("Keep earlier samples", False, hint="to compare settings, up to 8 samples"),
+            gui.add_button("Draw samples", color="blue"),
+            gui.add_progress_bar(0.0, visible=False),
+        )
+
+
+@dataclass(frozen=True)
+class Looking:
+    """What is shown of the samples."""
+
+    chosen: viser.GuiDropdownHandle[str]
+    layers: list[viser.GuiCheckboxHandle]
+    depth: viser.GuiCheckboxHandle
+    cameras: dict[str, viser.GuiCheckboxHandle]
+    front: viser.GuiButtonHandle
+
+
+def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> Looking:
+    """The folder `View`."""
+    names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
+    with gui.add_folder("View", order=3):
+        return Looking(
+            gui.add_dropdown("Show", (SIDE_BY_SIDE,)),
+            [gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
+            gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
+            {name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
+            gui.add_button("Look from the front"),
+        )
+
+
+def add_saving(gui: viser.GuiApi) -> dict[str, viser.GuiButtonHandle]:
+    """The folder `Save`: buttons by the kind of file."""
+    with gui.add_folder("Save", order=4):
+        return {kind: gui.add_button(name) for kind, name in KINDS.items()}

@@ -1,0 +1,107 @@
+"""What the page shows: scenes with the camera that they belong to."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import read_ply
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+
+UP = (0.0, -1.0, 0.0)
+FRAMING_FOV, FRAMING_SIZE = 50.0, 512
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One scene, unbatched.
+
+    Attributes:
+        layers: M of the splatter image that it was, or 1.
+        reference: the camera of its photograph, or one that sees all of it.
+        settings: what it was drawn with, for the files that are saved.
+        finished: or an estimate on the way.
+    """
+
+    gaussians: Gaussians
+    layers: int
+    reference: Cameras
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    finished: bool = True
+
+    def pivot(self) -> Float[Tensor, "3"]:
+        """On the optical axis, at the median depth (by opacity) of the Gaussians in the picture's central ninth."""
+        kept = self.gaussians.keep(self.gaussians.finite())
+        pixels, depths = project(self.reference, kept.means)
+        height, width = self.reference.image_size
+        offset = pixels / torch.tensor([width, height], device=pixels.device) - 0.5
+        seen = (depths > 0) & (offset.abs() < 1 / 6).all(-1)
+        if not seen.any():
+            seen = depths > 0
+        ordered, order = depths[seen].sort()
+        weights = kept.opacities[seen][order].cumsum(0)
+        depth = ordered[(weights < weights[-1] / 2).sum()].item() if len(ordered) else 1.0
+        return self.reference.centers + self.reference.camera_to_world[:3, 2] * depth
+
+
+def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
+    """A `.ply`, or the folder of a prediction with all its samples; and where up is.
+
+    Without the prediction's `scene.json` beside it, a file is looked at along +z from where nine tenths of it are seen.
+
+    Raises:
+        CompleteSplatError: nothing there that can be shown.
+    """
+    files = [path] if path.is_file() else sorted(path.glob("sample_*.ply"))
+    if not files:
+        raise CompleteSplatError(f"{path}: no sample_*.ply in this folder")
+    scenes = [read_ply(file) for file in files]
+    description = (path.parent if path.is_file() else path) / "scene.json"
+    if not description.is_file() or not all(file.name.startswith("sample_") for file in files):
+        return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
+    reference, settings = _read_description(description)
+    return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], _up(settings)
+
+
+def framing_camera(gaussians: Gaussians) -> Cameras:
+    """A camera that looks along +z at nine tenths of the Gaussians."""
+    means = gaussians.means if gaussians.count else torch.zeros(1, 3)
+    center = means.median(dim=0).values
+    # Sorted, as `torch.quantile` refuses more than 16 million values.
+    distances = (means - center).norm(dim=-1).sort().values
+    radius = distances[int(0.9 * (len(distances) - 1))].clamp(min=1e-3)
+    back = 1.1 * radius / torch.tensor(FRAMING_FOV / 2).deg2rad().sin()
+    eye = center - torch.tensor([0.0, 0.0, 1.0]) * back
+    intrinsics = pinhole(FRAMING_FOV, FRAMING_SIZE)
+    return Cameras(look_at(eye, center, torch.tensor(UP)), intrinsics, (FRAMING_SIZE, FRAMING_SIZE))
+
+
+def _layers(gaussians: Gaussians, reference: Cameras) -> int:
+    """Gaussians that could not be written are missing from a file: then its layers are not known."""
+    height, width = reference.image_size
+    layers, rest = divmod(gaussians.count, height * width)
+    return layers if layers and not rest else 1
+
+
+def _up(settings: Mapping[str, Any]) -> tuple[float, ...]:
+    return tuple(float(x) for x in settings.get("up", UP))
+
+
+def _read_description(path: Path) -> tuple[Cameras, dict[str, Any]]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        camera, settings = found["reference_camera"], dict(found["settings"])
+        pose, intrinsics = (torch.tensor(camera[name]).float() for name in ("world_to_camera", "intrinsics"))
+        height, width = camera["image_size"]
+        if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)) or len(_up(settings)) != 3:
+            raise ValueError("matrices of other sizes")
+        return Cameras(pose, intrinsics, (int(height), int(width))), settings
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CompleteSplatError(f"{path}: not the description of a prediction") from error

@@ -1,0 +1,154 @@
+"""The three-dimensional part of the page."""
+
+import math
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+
+from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.rotations import matrix_to_quaternion
+from completesplat.geometry.trajectories import orbit
+from completesplat.viewer.framing import Framing, framing_of
+from completesplat.viewer.samples import Sample
+from completesplat.viewer.splats import depth_colored, layer_of, to_splats
+
+ORBIT_CAMERAS = 12
+REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
+
+
+class Stage:
+    """Samples side by side or one of them, all layers or some, in their colours or those of their depths; cameras.
+
+    Everything is drawn anew from the attributes by `refresh`, under a lock: callbacks come from several threads.
+
+    Args:
+        up: where up is, in the reference cameras' frame.
+        data_cameras: of a data set, [view], relative to a reference camera.
+    """
+
+    def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
+        self.server = server
+        self.data_cameras = data_cameras
+        self.samples: list[Sample] = []
+        self.chosen: int | None = None
+        self.hidden_layers: set[int] = set()
+        self.depth = False
+        self.cameras: set[str] = set()
+        self._framing: Framing | None = None
+        self._splats: dict[str, viser.GaussianSplatHandle] = {}
+        self._frusta: list[viser.CameraFrustumHandle] = []
+        self._lock = threading.RLock()
+        self.set_up(up)
+
+    def set_up(self, up: Sequence[float]) -> None:
+        """Turn the page so that this direction is up."""
+        self.up = np.asarray(up, float)
+        self.server.scene.set_up_direction(self.up)
+
+    @property
+    def shown(self) -> list[Sample]:
+        """All samples, or the chosen one."""
+        samples, chosen = self.samples, self.chosen
+        return samples if chosen is None or chosen >= len(samples) else [samples[chosen]]
+
+    @property
+    def layers(self) -> int:
+        """Of the sample that has most."""
+        return max((sample.layers for sample in self.samples), default=0)
+
+    def show(self, samples: Sequence[Sample]) -> None:
+        """These samples from now on, and all of them if there is none with the chosen number."""
+        with self._lock:
+            self.samples = list(samples)
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Draw what the attributes say; cameras of browsers move only if the arrangement is another one."""
+        with self._lock, self.server.atomic():
+            shown = self.shown
+            if not shown:
+                return
+            framing = framing_of(shown)
+            self._draw_splats(shown, framing)
+            self._draw_cameras(shown, framing)
+            if self._framing is None or not framing.looks_like(self._framing):
+                self._framing = framing
+                self.look_from_the_front()
+
+    def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
+        """Put a browser's camera (all browsers', and those of browsers to come) where the photograph was taken."""
+        with self._lock:
+            if self._framing is None:
+                return
+            clients = list(self.server.get_clients().values()) if client is None else [client]
+            start = self.server.initial_camera
+            start.position, start.look_at = self._framing.position, self._framing.look_at
+            start.fov = self._framing.fov
+            for one in clients:
+                with one.atomic():
+                    one.camera.up_direction = self.up
+                    one.camera.position, one.camera.look_at = self._framing.position, self._framing.look_at
+                    one.camera.fov = self._framing.fov
+
+    def _draw_splats(self, shown: Sequence[Sample], framing: Framing) -> None:
+        scenes = [sample.gaussians for sample in shown]
+        if self.depth:
+            scenes = depth_colored(scenes)
+        wanted = {}
+        for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True)):
+            for layer in range(sample.layers):
+                wanted[f"/sample_{i}/layer_{layer}"] = layer_of(scene, layer, sample.layers), framing.shift(i), layer
+        for name in self._splats.keys() - wanted.keys():
+            self._splats.pop(name).remove()
+        for name, (gaussians, shift, layer) in wanted.items():
+            splats = to_splats(gaussians)
+            arrays = splats.centers, splats.covariances, splats.colors, splats.opacities
+            handle = self._splats.get(name)
+            if handle is None:
+                handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, *arrays)
+            else:
+                handle.set_gaussians(*arrays)
+            handle.scale, handle.position = splats.scale, shift
+            handle.visible = layer not in self.hidden_layers
+
+    def _draw_cameras(self, shown: Sequence[Sample], framing: Framing) -> None:
+        for frustum in self._frusta:
+            frustum.remove()
+        self._frusta = []
+        for i, sample in enumerate(shown):
+            reference = sample.reference
+            groups = {
+                "reference": (reference[None], REFERENCE_COLOR),
+                "orbit": (
+                    orbit(
+                        reference, framing.pivots[i], reference.intrinsics.new_tensor(self.up.tolist()), ORBIT_CAMERAS
+                    ),
+                    ORBIT_COLOR,
+                ),
+                "data set": (self.data_cameras, DATA_COLOR),
+            }
+            for name, (cameras, color) in groups.items():
+                if name in self.cameras and cameras is not None:
+                    self._add_frusta(f"/cameras/{i}/{name.replace(' ', '_')}", cameras, color, framing, i)
+
+    def _add_frusta(
+        self, name: str, cameras: Cameras, color: tuple[int, int, int], framing: Framing, index: int
+    ) -> None:
+        height, width = cameras.image_size
+        poses = cameras.camera_to_world
+        for i, (pose, intrinsics) in enumerate(zip(poses, cameras.intrinsics, strict=True)):
+            self._frusta.append(
+                self.server.scene.add_camera_frustum(
+                    f"{name}/{i}",
+                    fov=2 * math.atan(height / 2 / intrinsics[1, 1].item()),
+                    aspect=width / height,
+                    scale=0.08 * framing.distance,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    color=color,
+                    wxyz=matrix_to_quaternion(pose[:3, :3]).cpu().numpy(),
+                    position=(pose[:3, 3].cpu().numpy() + framing.shift(index)),
+                )
+            )

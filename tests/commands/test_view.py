@@ -1,0 +1,116 @@
+import sys
+
+import pytest
+from viewer_scenes import balls
+
+from completesplat.commands.view import overrides, settings_of
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import write_ply
+
+
+@pytest.mark.parametrize(
+    ("typed", "given"),
+    [
+        ([], []),
+        (["image=a.png", "weights=b"], ["image=a.png", "weights=b"]),
+        (["a b,c.ply"], ["path='a b,c.ply'"]),
+        (["it's.ply", "port=1"], ["path='it\\'s.ply'", "port=1"]),
+        (["--export", "page.html", "scene.ply"], ["export='page.html'", "path='scene.ply'"]),
+        (["scene.ply", "--export=a=b.html"], ["path='scene.ply'", "export='a=b.html'"]),
+        (["--help"], ["--help"]),
+    ],
+)
+def test_a_path_and_the_flag_become_settings(typed, given):
+    assert overrides(typed) == given
+
+
+def test_the_flag_without_a_file_is_refused(command):
+    finished = command("view", "scene.ply", "--export")
+    assert (finished.status, finished.err) == (2, "error: --export needs a file: --export page.html\n")
+
+
+def folder(path, *names: str):
+    path.mkdir()
+    for name in names:
+        (path / name).parent.mkdir(exist_ok=True)
+        (path / name).write_bytes(b"")
+    return path
+
+
+def test_what_a_path_stands_for(tmp_path):
+    weights = folder(tmp_path / "w", "config.json", "model.safetensors")
+    run = folder(tmp_path / "run", "weights/config.json", "weights/model.safetensors", "run.json")
+    prediction = folder(tmp_path / "p", "sample_00.ply", "scene.json")
+    outer = folder(tmp_path / "o", "photo/sample_00.ply", "run.json")
+    files = folder(tmp_path / "f", "A.PLY", "photo.jpg")
+    assert settings_of(weights) == {"weights": str(weights)}
+    assert settings_of(run) == {"weights": str(run / "weights")}
+    assert settings_of(prediction) == {"scene": str(prediction)}
+    assert settings_of(outer) == {"scene": str(outer / "photo")}
+    assert settings_of(files / "A.PLY") == {"scene": str(files / "A.PLY")}
+    assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
+
+
+def test_several_predictions_are_named_not_guessed(tmp_path):
+    outer = folder(tmp_path / "o", "a/sample_00.ply", "b/sample_00.ply")
+    with pytest.raises(CompleteSplatError, match=f"2 predictions: give one of them, {outer / 'a'}"):
+        settings_of(outer)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere.ply"], "nowhere.ply: no such file or folder"),
+        (["."], "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
+        (["samples=9"], "samples=9: must lie between 1 and 8"),
+        (["skip_weight=-1"], "skip_weight=-1: must lie between 0 and 1"),
+        (["port=99999"], "port=99999: must lie between 1 and 65535"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_one_line(command, tmp_path, arguments, said):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    finished = command("view", *arguments, f"out={tmp_path / 'other' / 'out'}")
+    assert finished.status == 2
+    assert said in finished.err
+    assert finished.err.count("\n") == 1
+
+
+def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    finished = command("view", f"out={tmp_path}")
+    assert finished.status == 2
+    assert finished.err == 'error: the viewer needs viser: pip install "completesplat[view]"\n'
+
+
+def test_an_offline_page_is_written_from_a_scene(command, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    write_ply(tmp_path / "my scene.ply", balls(points=5))
+    finished = command("view", "my scene.ply", "--export", "page.html", f"out={tmp_path / 'out'}")
+    assert finished.status == 0, finished.err
+    text = (tmp_path / "page.html").read_text()
+    assert text.startswith("<!doctype html>")
+    assert "__VISER_EMBED_DATA__" in text
+
+
+def test_an_offline_page_is_written_of_what_is_drawn(command, pipeline, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    given = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=2", "steps=2", f"out={tmp_path / 'out'}"]
+    assert command("view", *given, "export=page.html").status == 0
+    assert (tmp_path / "page.html").is_file()
+    finished = command("view", pipeline.weights, "export=other.html", f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert "there is nothing to export" in finished.err
+    assert not (tmp_path / "other.html").exists()
+
+
+def test_cameras_of_a_data_set_are_read(pipeline):
+    from support import compose_config
+
+    from completesplat.commands.view import data_cameras
+
+    cameras = data_cameras(
+        compose_config("view", "data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32").data
+    )
+    assert cameras.world_to_camera.shape == (4, 4, 4)  # four frames
+    assert cameras.centers[0].tolist() == pytest.approx([0, 0, 0], abs=1e-6)
+    assert (cameras.centers[1:].norm(dim=-1) > 0.1).all()

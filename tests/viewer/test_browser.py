@@ -1,0 +1,195 @@
+"""The page in a browser: Debian's Chromium without a screen, which draws WebGL on the CPU (SwiftShader)."""
+
+import io
+import os
+import shutil
+import time
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support import tiny_generator
+from viewer_scenes import BALLS, balls_sample
+
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+from completesplat.viewer.completion import Completion  # noqa: E402
+from completesplat.viewer.page import Page  # noqa: E402
+from completesplat.viewer.saving import Saver, write_page  # noqa: E402
+from completesplat.viewer.server import start_server  # noqa: E402
+from completesplat.viewer.stage import Stage  # noqa: E402
+
+CHROMIUM = shutil.which("chromium")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed (apt-get install chromium)"),
+]
+SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+WINDOW = {"width": 700, "height": 360}
+START = {"samples": 1, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+SECONDS = 90
+GREY = 128
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=[*SWIFTSHADER, *root])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    server = start_server(0)
+    stage = Stage(server, (0.0, -1.0, 0.0))
+    stage.show([balls_sample()])
+    saver = Saver(tmp_path_factory.mktemp("saved"), stage, ReferenceRasterizer, 2, 0.5)
+    made = Page(server, stage, saver, layers=4)
+    made.completion = Completion(made, tiny_generator(), START)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def tab(chromium, page):
+    tab = open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
+    yield tab
+    tab.close()
+
+
+def open_tab(chromium, address: str):
+    tab = chromium.new_page(viewport=WINDOW)
+    tab.goto(address)
+    until(lambda: abs(settled(tab)[-5, 5] - GREY).max() < 3, "the page does not appear")
+    # The notices (that there is no graphics card, and others) would cover the scene.
+    tab.add_style_tag(content=".mantine-Notification-root { visibility: hidden }")
+    return tab
+
+
+def pixels(tab) -> np.ndarray:
+    """The scene's part of the window, [height width 3]."""
+    canvas = max(tab.locator("canvas").all(), key=lambda c: c.bounding_box()["width"])
+    shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
+    return shot
+
+
+def until(true, what: str) -> None:
+    end = time.monotonic() + SECONDS
+    while not true():
+        assert time.monotonic() < end, what
+        time.sleep(0.1)
+
+
+def settled(tab) -> np.ndarray:
+    """The scene when the page has faded in from white, and nothing moves any more."""
+    shots = [pixels(tab)]
+
+    def still() -> bool:
+        shots.append(pixels(tab))
+        return shots[-1].mean() < 200 and abs(shots[-1] - shots[-2]).max() < 2
+
+    until(still, "the picture does not come to rest")
+    return shots[-1]
+
+
+def changed(tab, before: np.ndarray) -> np.ndarray:
+    until(lambda: abs(pixels(tab) - before).max() > 20, "the picture stays the same")
+    return settled(tab)
+
+
+def ours(height: int, width: int, shrink: int) -> np.ndarray:
+    """The balls by our own rasterizer, as the reference camera would see them in a window of this size."""
+    focal = height / 2 / np.tan(np.radians(25))
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]) / shrink
+    intrinsics[2, 2] = 1
+    camera = Cameras(torch.eye(4), intrinsics.float(), (height // shrink, width // shrink))
+    rendering = ReferenceRasterizer()(balls_sample().gaussians[None], camera[None][None])
+    return rendering.over(GREY / 255)[0, 0].permute(1, 2, 0).clamp(0, 1).numpy() * 255
+
+
+def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
+    height, width = (size // factor * factor for size in image.shape[:2])
+    return image[:height, :width].reshape(height // factor, factor, width // factor, factor, 3).mean((1, 3))
+
+
+def place(image: np.ndarray, color: tuple[float, float, float]) -> tuple[float, float]:
+    """The middle (row, column) of what is nearly of this colour."""
+    found = np.argwhere(abs(image - 255 * np.array(color)).max(-1) < 40)
+    assert len(found), f"nothing of the colour {color}"
+    return tuple(found.mean(axis=0))
+
+
+def test_the_page_draws_the_splats_as_our_rasterizer_does(tab):
+    seen = settled(tab)
+    expected, found = ours(*seen.shape[:2], shrink=3), shrunk(seen, 3)
+    assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.97
+    for _, color in BALLS.values():
+        assert place(found, color) == pytest.approx(place(expected, color), abs=1)
+
+
+def test_a_layer_disappears_when_it_is_switched_off(tab):
+    before = settled(tab)
+    tab.get_by_label("Layer 1", exact=True).click()
+    without = changed(tab, before)
+    assert not (abs(without - 255 * np.array(BALLS["red"][1])).max(-1) < 40).any()
+    place(without, BALLS["blue"][1])
+    tab.get_by_label("Layer 1", exact=True).click()
+    place(changed(tab, without), BALLS["red"][1])
+
+
+def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
+    """In two browsers: what one asks for appears in the other, without loading anything again."""
+    file = tmp_path / "photo.png"
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 256, (4, 4, 3), np.uint8)).resize((64, 64)).save(file)
+    before = settled(tab)
+    with tab.expect_file_chooser() as chooser:
+        tab.get_by_role("button", name="Load a picture").click()
+    chooser.value.set_files(file)
+    tab.get_by_text("1 drawn in").wait_for(timeout=1000 * SECONDS)
+    first = changed(tab, before)
+    assert page.stage.samples[0].settings["image"] == "photo.png"
+    seed = tab.locator(".mantine-NumberInput-input").nth(4)  # behind the fifth slider
+    seed.fill("9")
+    seed.press("Enter")
+    until(lambda: page.stage.samples[0].settings.get("seed") == 9, "no new sample")
+    changed(tab, first)
+
+
+def test_what_is_no_picture_is_refused_on_the_page(tab, page, tmp_path):
+    file = tmp_path / "notes.txt"
+    file.write_text("no picture")
+    before = page.stage.samples
+    with tab.expect_file_chooser() as chooser:
+        tab.get_by_role("button", name="Load a picture").click()
+    chooser.value.set_files(file)
+    tab.get_by_text("notes.txt: not an image").wait_for(state="attached", timeout=1000 * SECONDS)
+    assert page.stage.samples is before
+
+
+def test_a_second_browser_shows_the_same_scene(tab, page, chromium):
+    page.show([balls_sample()])
+    first = settled(tab)
+    other = open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
+    second = settled(other)
+    for _, color in BALLS.values():
+        assert place(second, color) == pytest.approx(place(first, color), abs=2)
+    other.close()
+
+
+def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
+    page.show([balls_sample()])
+    write_page(page.server, tmp_path / "page.html")
+    alone = open_tab(chromium, f"file://{tmp_path / 'page.html'}")
+    seen = settled(alone)
+    expected = ours(*seen.shape[:2], shrink=3)
+    for _, color in BALLS.values():
+        assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1)
+    alone.close()

@@ -1,0 +1,288 @@
+"""The page without a browser: what its controls do to the scene, and what is sent to those who look."""
+
+import io
+import logging
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support import tiny_generator
+from viewer_scenes import balls_sample
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import read_ply
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
+
+from completesplat.viewer.completion import Completion  # noqa: E402
+from completesplat.viewer.page import Page  # noqa: E402
+from completesplat.viewer.saving import Saver  # noqa: E402
+from completesplat.viewer.server import start_server  # noqa: E402
+from completesplat.viewer.stage import Stage  # noqa: E402
+
+START = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+SECONDS = 30
+
+
+class Browser(viser.ClientHandle):
+    """Stands in for one that is connected: keeps what it is sent."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.files: dict[str, bytes] = {}
+
+    def add_notification(self, title: str, body: str, **_: object) -> None:
+        self.messages.append(body)
+
+    def send_file_download(self, name: str, content: bytes) -> None:
+        self.files[name] = content
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_generator()
+
+
+@pytest.fixture(scope="module")
+def server():
+    made = start_server(0)
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def page(server, tmp_path):
+    server.scene.reset()
+    server.gui.reset()
+    stage = Stage(server, (0.0, -1.0, 0.0))
+    stage.show([balls_sample()])
+    made = Page(server, stage, Saver(tmp_path / "out", stage, ReferenceRasterizer, 2, 0.5), layers=4)
+    yield made
+    made.worker.close()
+
+
+@pytest.fixture
+def completion(page, model):
+    return Completion(page, model, START)
+
+
+def press(button, browser: Browser) -> None:
+    for callback in button._impl.update_cb:
+        callback(viser.GuiEvent(client=browser, client_id=0, target=button))
+
+
+def upload(completion: Completion, name: str, content: bytes, browser: Browser) -> None:
+    button = completion.controls.upload
+    button._impl.value = SimpleNamespace(name=name, content=content)
+    press(button, browser)
+    assert completion.page.worker.wait(SECONDS)
+
+
+def picture(level: int = 128) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (40, 40), (level, 50, 200)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def nodes(page: Page) -> dict[str, object]:
+    return page.stage._splats
+
+
+def test_each_layer_of_each_sample_is_a_node_of_its_own(page):
+    page.show([balls_sample(layers=4), balls_sample(layers=2)])
+    assert {name: len(node.centers) for name, node in nodes(page).items()} == {
+        **{f"/sample_0/layer_{i}": 150 for i in range(4)},
+        **{f"/sample_1/layer_{i}": 300 for i in range(2)},
+    }
+
+
+def test_a_layer_is_switched_off_and_on_in_all_samples(page):
+    page.show([balls_sample(), balls_sample()])
+    page.looking.layers[2].value = False
+    assert {name for name, node in nodes(page).items() if not node.visible} == {
+        "/sample_0/layer_2",
+        "/sample_1/layer_2",
+    }
+    page.looking.layers[2].value = True
+    assert all(node.visible for node in nodes(page).values())
+
+
+def test_one_sample_is_picked_and_stands_where_it_was_drawn(page):
+    page.show([balls_sample(), balls_sample(), balls_sample()])
+    assert len({tuple(node.position) for node in nodes(page).values()}) == 3
+    page.looking.chosen.value = "sample 2"
+    assert {name.split("/")[1] for name in nodes(page)} == {"sample_0"}
+    assert {tuple(node.position) for node in nodes(page).values()} == {(0.0, 0.0, 0.0)}
+
+
+def test_depth_takes_the_place_of_the_colours_and_gives_it_back(page):
+    red = nodes(page)["/sample_0/layer_0"].rgbs.copy()
+    page.looking.depth.value = True
+    assert (nodes(page)["/sample_0/layer_0"].rgbs != red).any()
+    page.looking.depth.value = False
+    assert (nodes(page)["/sample_0/layer_0"].rgbs == red).all()
+
+
+def test_frusta_stand_where_the_cameras_are(page):
+    page.looking.cameras["orbit"].value = True
+    frusta = page.stage._frusta
+    pivot = page.stage.samples[0].pivot().numpy()
+    assert frusta[0].position == pytest.approx(np.zeros(3), abs=1e-5)  # the orbit starts at the reference camera
+    assert np.stack([f.position for f in frusta]).mean(axis=0) == pytest.approx(pivot, abs=1e-4)
+    assert frusta[0].fov == pytest.approx(np.radians(50), abs=1e-5)
+    page.looking.cameras["orbit"].value = False
+    assert page.stage._frusta == []
+
+
+def test_a_picture_that_is_loaded_is_completed_as_the_model_does(completion, model):
+    upload(completion, "photo.png", picture(), Browser())
+    shown = completion.page.stage.samples
+    photograph = completion.photograph[1]
+    for sample, expected in zip(shown, model(photograph, **START), strict=True):
+        assert sample.finished
+        assert torch.equal(sample.gaussians.means, expected.means)
+    assert "photo.png" in completion.controls.preview.label
+    assert completion.page.looking.chosen.options == ("all, side by side", "sample 1", "sample 2")
+
+
+def test_a_slider_draws_anew_with_its_value(completion):
+    upload(completion, "photo.png", picture(), Browser())
+    before = completion.page.stage.samples[0].gaussians.means
+    completion.controls.skip_weight.value = 0.25
+    assert completion.page.worker.wait(SECONDS)
+    sample = completion.page.stage.samples[0]
+    assert sample.settings["skip_weight"] == 0.25
+    assert not torch.equal(sample.gaussians.means, before)
+
+
+def test_no_slider_draws_when_that_is_switched_off(completion):
+    upload(completion, "photo.png", picture(), Browser())
+    before = completion.page.stage.samples
+    completion.controls.live.value = False
+    completion.controls.seed.value = 7
+    assert completion.page.worker.wait(SECONDS)
+    assert completion.page.stage.samples is before
+    press(completion.controls.draw, Browser())
+    assert completion.page.worker.wait(SECONDS)
+    assert completion.page.stage.samples[0].settings["seed"] == 7
+
+
+def test_steps_move_to_a_number_that_the_sampler_can_make(completion):
+    upload(completion, "photo.png", picture(), Browser())
+    completion.controls.steps.value = 3
+    assert completion.controls.steps.value == 2
+    assert completion.page.worker.wait(SECONDS)
+    assert completion.page.stage.samples[0].settings["steps"] == 2
+
+
+def test_earlier_samples_stay_if_that_is_wanted(completion):
+    upload(completion, "photo.png", picture(), Browser())
+    completion.controls.keep.value = True
+    completion.controls.seed.value = 1
+    assert completion.page.worker.wait(SECONDS)
+    assert [sample.settings["seed"] for sample in completion.page.stage.samples] == [0, 0, 1, 1]
+    for seed in (2, 3):
+        completion.controls.seed.value = seed
+        assert completion.page.worker.wait(SECONDS)
+    assert [sample.settings["seed"] for sample in completion.page.stage.samples] == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_a_refused_upload_is_told_to_who_sent_it_and_changes_nothing(completion, monkeypatch):
+    before, browser, other = completion.page.stage.samples, Browser(), Browser()
+    monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser, 1: other})
+    upload(completion, "notes.txt", b"no picture", browser)
+    assert len(browser.messages) == 1
+    assert browser.messages[0].startswith("notes.txt: not an image")
+    assert other.messages == []
+    assert completion.page.stage.samples is before
+
+
+def test_drawing_without_a_picture_asks_for_one(completion):
+    browser = Browser()
+    press(completion.controls.draw, browser)
+    assert browser.messages == ["load a picture first"]
+
+
+def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
+    """Layers are switched while the denoiser stands still."""
+    entered, release = threading.Event(), threading.Event()
+    forward = model.denoiser.forward
+    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(SECONDS), forward(*a))[-1])
+    button = completion.controls.upload
+    button._impl.value = SimpleNamespace(name="photo.png", content=picture())
+    press(button, Browser())
+    assert entered.wait(SECONDS)
+    completion.page.looking.layers[0].value = False
+    assert not nodes(completion.page)["/sample_0/layer_0"].visible
+    assert completion.controls.progress.visible
+    release.set()
+    assert completion.page.worker.wait(SECONDS)
+    assert not completion.controls.progress.visible
+
+
+def test_the_scene_forms_in_sight(completion, monkeypatch):
+    monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
+    seen = []
+    show = completion.page.show
+    monkeypatch.setattr(
+        completion.page, "show", lambda samples, status: (seen.append(samples[0]), show(samples, status))
+    )
+    upload(completion, "photo.png", picture(), Browser())
+    assert [sample.finished for sample in seen] == [False, False, True]
+    assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
+
+
+def test_a_fault_is_told_and_the_page_goes_on(completion, model, monkeypatch, caplog):
+    browser = Browser()
+    with monkeypatch.context() as broken, caplog.at_level(logging.CRITICAL):
+        broken.setattr(completion.page.server, "get_clients", lambda: {0: browser})
+        broken.setattr(model, "forward", lambda *_, **__: 1 / 0)
+        upload(completion, "photo.png", picture(), browser)
+    assert browser.messages == ["ZeroDivisionError: division by zero"]
+    upload(completion, "photo.png", picture(), browser)
+    assert len(completion.page.stage.samples) == 2
+
+
+@pytest.mark.parametrize("kind", ["ply", "video", "html"])
+def test_files_are_written_and_sent_to_who_asked(page, kind):
+    browser = Browser()
+    page.show([balls_sample(), balls_sample()])
+    press(page.saving[kind], browser)
+    assert page.worker.wait(SECONDS)
+    names = {
+        "ply": ["sample_00.ply", "sample_01.ply"],
+        "video": ["orbit_00.mp4", "orbit_01.mp4"],
+        "html": ["page_00.html"],
+    }
+    assert sorted(browser.files) == names[kind]
+    for name, content in browser.files.items():
+        assert (page.saver.folder / name).read_bytes() == content
+    if kind == "ply":
+        found = read_ply(page.saver.folder / "sample_01.ply").means
+        assert torch.equal(found, balls_sample().gaussians.means)
+
+
+def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(page):
+    page.show([balls_sample(), balls_sample()])
+    page.looking.chosen.value = "sample 2"
+    for _ in range(2):
+        press(page.saving["ply"], Browser())
+        assert page.worker.wait(SECONDS)
+    assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
+
+
+def test_nothing_is_saved_of_an_empty_page(page):
+    page.show([])
+    with pytest.raises(CompleteSplatError, match="nothing to save"):
+        page.saver.save("ply", page.stage.shown)
+
+
+def test_a_port_that_is_taken_leads_to_the_next_one(server):
+    second = start_server(server.get_port())
+    assert second.get_port() > server.get_port()
+    assert second.get_host() == "127.0.0.1"
+    second.stop()

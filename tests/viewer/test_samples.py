@@ -1,0 +1,93 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from viewer_scenes import balls, balls_sample, reference_camera
+
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import write_ply
+from completesplat.export.scene_json import write_scene_json
+from completesplat.geometry.cameras import project
+from completesplat.viewer.samples import UP, Sample, framing_camera, read_scene
+
+
+def prediction(folder, count=2, points=1024):
+    """A prediction's folder as far as the viewer reads it."""
+    scene = balls(points=points // 4)
+    for i in range(count):
+        write_ply(folder / f"sample_{i:02}.ply", scene)
+    settings = {"up": [0.0, -0.8, -0.6], "seed": 0}
+    write_scene_json(folder / "scene.json", reference_camera(40.0, 16), settings, 0, {})
+    return folder
+
+
+def test_a_prediction_is_read_with_its_camera_layers_and_up(tmp_path):
+    samples, up = read_scene(prediction(tmp_path))
+    assert up == (0.0, -0.8, -0.6)
+    assert [sample.layers for sample in samples] == [4, 4]  # 1024 Gaussians of 16 x 16 pixels
+    assert torch.equal(samples[0].reference.intrinsics, reference_camera(40.0, 16).intrinsics)
+
+
+def test_one_sample_of_a_prediction_is_read_with_its_camera(tmp_path):
+    samples, up = read_scene(prediction(tmp_path) / "sample_01.ply")
+    assert (len(samples), samples[0].layers, up) == (1, 4, (0.0, -0.8, -0.6))
+
+
+def test_layers_are_unknown_where_gaussians_are_missing(tmp_path):
+    samples, _ = read_scene(prediction(tmp_path, points=1020))
+    assert samples[0].layers == 1
+
+
+def test_a_ply_alone_is_seen_as_a_whole(tmp_path):
+    write_ply(tmp_path / "scene.ply", balls())
+    samples, up = read_scene(tmp_path / "scene.ply")
+    assert up == UP
+    pixels, depths = project(samples[0].reference, balls().means)
+    height, width = samples[0].reference.image_size
+    assert (depths > 0).all()
+    assert ((pixels > 0) & (pixels < torch.tensor([width, height]))).all(-1).float().mean() > 0.85
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"settings": {}}', '{"reference_camera": 1, "settings": {}}'])
+def test_a_broken_description_is_refused(tmp_path, text):
+    (prediction(tmp_path) / "scene.json").write_text(text)
+    with pytest.raises(CompleteSplatError, match="not the description of a prediction"):
+        read_scene(tmp_path)
+
+
+def test_matrices_of_another_size_are_refused(tmp_path):
+    path = prediction(tmp_path) / "scene.json"
+    scene = json.loads(path.read_text())
+    scene["reference_camera"]["intrinsics"] = [[1.0]]
+    path.write_text(json.dumps(scene))
+    with pytest.raises(CompleteSplatError):
+        read_scene(tmp_path)
+
+
+def test_a_folder_without_samples_is_refused(tmp_path):
+    with pytest.raises(CompleteSplatError, match=r"no sample_\*\.ply"):
+        read_scene(tmp_path)
+
+
+def test_the_pivot_is_what_the_middle_of_the_picture_shows():
+    """A point within the red ball, which is 4 away."""
+    pivot = balls_sample().pivot()
+    assert pivot[:2].tolist() == [0, 0]
+    assert pivot[2] == pytest.approx(4, abs=0.25)
+
+
+def test_faint_gaussians_hardly_move_the_pivot():
+    scene = balls()
+    ghosts = replace(scene, means=scene.means + torch.tensor([0, 0, 20.0]), opacities=scene.opacities * 0.01)
+    both = [torch.cat(pair) for pair in zip(vars(scene).values(), vars(ghosts).values(), strict=True)]
+    pivot = Sample(type(scene)(*both), 1, reference_camera()).pivot()
+    assert pivot[2] == pytest.approx(balls_sample().pivot()[2].item(), abs=0.05)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_next_to_nothing_has_a_camera_and_a_pivot(count):
+    scene = balls()[:count]
+    camera = framing_camera(scene)
+    assert Sample(scene, 1, camera).pivot().isfinite().all()
+    assert camera.world_to_camera.isfinite().all()

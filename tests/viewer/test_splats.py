@@ -1,0 +1,75 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from viewer_scenes import balls
+
+from completesplat.gaussians import concatenate
+from completesplat.viewer.splats import depth_colored, layer_of, to_splats
+
+
+def test_covariances_stretch_directions_as_the_axes_say():
+    """The variance along each of a Gaussian's axes, found by rotating unit vectors one by one, is its scale squared."""
+    gaussians = balls(points=5)
+    splats = to_splats(gaussians)
+    for quaternion, scales, covariance in zip(
+        gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats.covariances, strict=True
+    ):
+        w, *xyz = (quaternion / np.linalg.norm(quaternion)).tolist()
+        for axis, scale in zip(np.eye(3), scales, strict=True):
+            turned = axis + 2 * np.cross(xyz, np.cross(xyz, axis) + w * axis)  # of the quaternion product q v q*
+            assert turned @ covariance @ turned * splats.scale**2 == pytest.approx(scale**2, rel=1e-4)
+            assert covariance @ turned == pytest.approx(turned * (scale / splats.scale) ** 2, rel=1e-3, abs=1e-1)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+def test_half_precision_keeps_the_shapes_at_every_size(size):
+    gaussians = balls(points=5)
+    scaled = to_splats(replace(gaussians, scales=gaussians.scales * size))
+    halves = scaled.covariances.astype(np.float16).astype(np.float64)
+    assert np.isfinite(halves).all()
+    for half, scales in zip(halves, gaussians.scales.numpy() * size, strict=True):
+        found = np.sqrt(np.linalg.eigvalsh(half)) * scaled.scale
+        assert found == pytest.approx(np.sort(scales), rel=0.01)
+
+
+def test_centers_and_bytes():
+    gaussians = balls(points=2)
+    gaussians.colors[0] = torch.tensor([2.0, 0.5, 0.0])
+    splats = to_splats(gaussians)
+    assert splats.centers * splats.scale == pytest.approx(gaussians.means.numpy(), rel=1e-5, abs=1e-5)
+    assert splats.colors[0].tolist() == [255, 128, 0]
+    assert splats.opacities.tolist() == [[204]] * gaussians.count
+
+
+def test_what_is_not_finite_is_left_out():
+    gaussians = balls(points=2)
+    gaussians.means[3, 1] = torch.nan
+    gaussians.scales[5, 0] = torch.inf
+    splats = to_splats(gaussians)
+    assert len(splats.centers) == gaussians.count - 2
+    assert all(np.isfinite(part).all() for part in splats[:4])
+
+
+def test_nothing_at_all_is_no_error():
+    assert to_splats(balls()[:0]).centers.shape == (0, 3)
+
+
+def test_the_layers_are_the_parts_in_order():
+    gaussians = balls(points=3)
+    parts = [layer_of(gaussians, layer, 4) for layer in range(4)]
+    assert [part.count for part in parts] == [3] * 4
+    for one, other in zip(vars(concatenate(parts)).values(), vars(gaussians).values(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_depth_colours_brighten_towards_the_camera_on_one_scale():
+    near, far = balls(points=50), balls(points=50)
+    far.means[:, 2] += 1
+    scenes = depth_colored([near, far])
+    depths = torch.cat([near.means[:, 2], far.means[:, 2]])
+    lightness = torch.cat([scene.colors.sum(-1) for scene in scenes])[depths.argsort()]
+    assert (lightness.diff() <= 1e-5).all()
+    assert lightness[0] > lightness[-1] + 1
+    assert torch.equal(scenes[1].means, far.means)

@@ -1,0 +1,78 @@
+import threading
+
+import pytest
+
+from completesplat.viewer.worker import Worker
+
+
+@pytest.fixture
+def failures() -> list[Exception]:
+    return []
+
+
+@pytest.fixture
+def worker(failures):
+    made = Worker(failures.append)
+    yield made
+    made.close()
+
+
+def blocked(worker: Worker) -> threading.Event:
+    """Keep the worker busy until the event is set."""
+    started, release = threading.Event(), threading.Event()
+    worker.submit("block", lambda: (started.set(), release.wait(5)))
+    assert started.wait(5)
+    return release
+
+
+def test_of_waiting_jobs_of_a_kind_the_newest_is_done(worker):
+    done: list[str] = []
+    release = blocked(worker)
+    for name in ("first", "second", "third"):
+        worker.submit("draw", lambda name=name: done.append(name))
+    worker.submit("save", lambda: done.append("saved"))
+    release.set()
+    assert worker.wait(5)
+    assert sorted(done) == ["saved", "third"]
+
+
+def test_submitting_does_not_wait_for_the_work(worker):
+    release = blocked(worker)
+    worker.submit("draw", lambda: None)
+    assert not worker.wait(0.01)
+    release.set()
+    assert worker.wait(5)
+
+
+def test_jobs_run_one_at_a_time_in_another_thread(worker):
+    threads = []
+    for kind in "abc":
+        worker.submit(kind, lambda: threads.append(threading.current_thread()))
+    assert worker.wait(5)
+    assert len(threads) == 3
+    assert len(set(threads)) == 1
+    assert threads[0] is not threading.current_thread()
+
+
+def test_an_error_is_reported_and_the_next_job_done(worker, failures):
+    done = []
+    error = ValueError("broken")
+
+    def fail() -> None:
+        raise error
+
+    worker.submit("fail", fail)
+    worker.submit("draw", lambda: done.append(True))
+    assert worker.wait(5)
+    assert failures == [error]
+    assert done == [True]
+
+
+def test_what_waits_is_forgotten_when_it_closes(worker):
+    done = []
+    release = blocked(worker)
+    worker.submit("draw", lambda: done.append(True))
+    worker.close()
+    release.set()
+    assert worker.wait(5)
+    assert done == []
