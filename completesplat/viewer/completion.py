@@ -10,6 +10,7 @@ import viser
 from completesplat.data.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.export.pixels import to_bytes
+from completesplat.export.widening import widened
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
@@ -104,7 +105,8 @@ class Completion:
         scenes: Sequence[Gaussians],
         finished: bool,
     ) -> list[Sample]:
-        """The new samples behind the earlier ones, as many as there is room for."""
+        """The new samples behind the earlier ones, as many as there is room for; `widened`, as the page is large."""
         layers = self.model.autoreconstructor.reconstructor.parameterization.layers
-        new = [Sample(scene, layers, reference, {**settings, "sample": i}, finished) for i, scene in enumerate(scenes)]
+        wide = [widened(scene, reference) for scene in scenes]
+        new = [Sample(scene, layers, reference, {**settings, "sample": i}, finished) for i, scene in enumerate(wide)]
         return [*earlier, *new][-MOST_SAMPLES:]
