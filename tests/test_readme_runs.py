@@ -1,4 +1,4 @@
-"""The README's commands, run as they are printed (and briefly), in one folder, each with what the ones before it left."""
+"""The README's commands, run as printed (and briefly), in one folder, each with what those before it left."""
 
 import json
 import os
@@ -15,7 +15,19 @@ from support import SMALL
 from written_commands import arguments_of, readme_commands
 
 # Later ones need what earlier ones make.
-ORDER = ["data toy", "fit experiment", "data latents", "fit", "predict", "data", "test", "view", "report", "bench", "doctor"]
+ORDER = [
+    "data toy",
+    "fit experiment",
+    "data latents",
+    "fit",
+    "predict",
+    "data",
+    "test",
+    "view",
+    "report",
+    "bench",
+    "doctor",
+]
 # Appended to make them short; everything else is as printed.
 BRIEF = {
     "data toy": ["scenes=20", "frames=4", "size=32", "workers=1"],
