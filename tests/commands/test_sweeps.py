@@ -91,6 +91,7 @@ def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root
     assert (sweep / "seed-2/metrics.json").is_file()
 
 
+@pytest.mark.slow
 def test_an_interrupted_job_goes_on_where_it_was_and_ends_as_if_nothing_had_happened(
     command, monkeypatch, toy_root, whole, tmp_path
 ):

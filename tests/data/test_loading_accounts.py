@@ -36,6 +36,7 @@ def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
     assert caught.value.sequence in ("c2", "c5")
 
 
+@pytest.mark.slow
 def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog):
     data = module(make_tree(tmp_path, ["c5"], ["c2"]), val_fraction=0.0, most_bad=1.0)
     loader = data.train_dataloader()

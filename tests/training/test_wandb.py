@@ -63,7 +63,8 @@ def lacking(kind: str, panel) -> bool:
     return panel.needs == "loss=stage2" or (panel.needs == "several samples" and kind in FIT)
 
 
-@pytest.mark.parametrize("kind", [STAGE1, pytest.param(STAGE2, marks=pytest.mark.slow), TEST])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [STAGE1, STAGE2, TEST])
 def test_a_run_has_the_panels_of_the_layout_and_logs_nothing_else(run, kind):
     values = run(kind)[0].merged()
     shown = {panel.keys: shown_by(values, panel) for panel in PANELS if kind in panel.runs}
