@@ -28,13 +28,16 @@ def run(config: Any, out: Path) -> None:
         CompleteSplatError: data whose hidden parts are not known, a number too small, or no scene that can be used.
     """
     import torch
+    from hydra.utils import instantiate
     from rich.console import Console
     from rich.progress import track
 
     from completesplat.data.hidden_modes import hidden_modes
+    from completesplat.reports.dashboard.logging import log_modes
     from completesplat.reports.hidden_modes.figure import draw
     from completesplat.reports.hidden_modes.measuring import measure, usable
     from completesplat.reports.hidden_modes.predictors import predictors
+    from completesplat.training.wandb_run import finished
 
     asked = config.evaluation
     _check(asked)
@@ -52,6 +55,9 @@ def run(config: Any, out: Path) -> None:
     _write(out / "calibration.json", calibration)
     _write(out / "protocol.json", protocol(config, module, data, measured))
     draw(measured.shown["model"], results, calibration, asked.samples, out / "hidden_modes.png")
+    loggers = list(instantiate(config.get("logger", {}), _convert_="all").values())
+    with finished(loggers):
+        log_modes(results, out / "hidden_modes.png", config, loggers)
     _print(results, measured.skipped)
 
 

@@ -8,12 +8,13 @@ from PIL import Image
 from support import SMALL, call, strict_json
 from wandb_files import offline_runs, shown_by
 
-from completesplat.reports.dashboard.panels import FIT, PANELS, STAGE1, STAGE2, TEST
+from completesplat.reports.dashboard.panels import FIT, MODES, PANELS, STAGE1, STAGE2, TEST
 from completesplat.training.reconstruction import ReconstructionModule
 
 pytest.importorskip("wandb")
 
 UNNAMED = {"train/scale", "train/opacity"}  # regularisers, off by default
+FEW_MODES = ["evaluation=hidden_modes", "evaluation.samples=2", "evaluation.views=1", "evaluation.spread_views=1"]
 SETTINGS = [*SMALL, "trainer.log_every_n_steps=1", "logger=wandb"]
 
 
@@ -39,7 +40,10 @@ def run(pipeline, tmp_path_factory):
             out = tmp_path_factory.mktemp("wandb") / "run"
             checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
             several = ["evaluation.scoring.samples=2", "trainer.accelerator=cpu", "logger=wandb"]
-            arguments = ["test", f"ckpt={checkpoint}", *several] if kind == TEST else None
+            arguments = {
+                TEST: ["test", f"ckpt={checkpoint}", *several],
+                MODES: ["test", f"ckpt={checkpoint}", *FEW_MODES, "logger=wandb"],
+            }.get(kind)
             with pytest.MonkeyPatch.context() as monkeypatch:
                 monkeypatch.delenv("WANDB_MODE", raising=False)
                 monkeypatch.chdir(out.parent)
@@ -64,7 +68,7 @@ def lacking(kind: str, panel) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [STAGE1, STAGE2, TEST])
+@pytest.mark.parametrize("kind", [STAGE1, STAGE2, TEST, MODES])
 def test_a_run_has_the_panels_of_the_layout_and_logs_nothing_else(run, kind):
     values = run(kind)[0].merged()
     shown = {panel.keys: shown_by(values, panel) for panel in PANELS if kind in panel.runs}

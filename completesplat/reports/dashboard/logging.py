@@ -1,9 +1,11 @@
 """The results of a test, for the loggers of a run."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lightning import Trainer
+from lightning.pytorch.loggers import Logger
 from omegaconf import OmegaConf
 
 from completesplat.metrics.evaluation import REGIONS
@@ -47,6 +49,19 @@ def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Traine
     media |= {f"report/{table.name}": as_wandb(table) for table in tables(out)[0] if holds_ours(table)}
     for run in runs:
         run.log_metrics(media, step=trainer.global_step)
+
+
+def log_modes(results: Mapping[str, Mapping[str, float]], figure: Path, config: Any, loggers: Sequence[Logger]) -> None:
+    """Log `hidden_modes/METHOD/FIGURE`; for W&B also the picture."""
+    numbers = {f"hidden_modes/{method}/{name}": x for method, found in results.items() for name, x in found.items()}
+    for logger in loggers:
+        logger.log_metrics(numbers, step=0)
+        logger.save()
+    for run in wandb_runs(loggers):
+        import wandb
+
+        run.log_hyperparams(OmegaConf.to_container(config, resolve=True))
+        run.log_metrics({"hidden_modes": wandb.Image(str(figure))}, step=0)
 
 
 def by_name(scores: dict[str, Any]) -> dict[str, float]:

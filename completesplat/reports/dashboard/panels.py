@@ -5,7 +5,7 @@ from itertools import groupby
 
 from rich.table import Table
 
-STAGE1, STAGE2, TEST = "stage 1", "stage 2", "test"
+STAGE1, STAGE2, TEST, MODES = "stage 1", "stage 2", "test", "hidden modes"
 FIT = (STAGE1, STAGE2)
 TESTED = (STAGE1, STAGE2, TEST)
 """`fit` ends with a test."""
@@ -64,6 +64,8 @@ PANELS = [
     Panel("Test", "test/turntables", "video", "the first sample of each scene", TESTED),
     Panel("Test", "test/predictors", "table", "scores of the model beside naive predictors", TESTED),
     Panel("Test", "report/*", "table", "the paper's tables with this run, or tables of its protocol", TESTED),
+    Panel("Hidden modes", "hidden_modes", "image", "the figure of test evaluation=hidden_modes", (MODES,)),
+    Panel("Hidden modes", "hidden_modes/*", "line", "coverage, total variation, ... of each method", (MODES,)),
 ]
 
 
