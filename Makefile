@@ -55,8 +55,8 @@ test: check ## Lint, types and the tests (CPU, under 8 minutes)
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
 
-test-browser: $(READY) ## The viewer in Chromium (apt-get install chromium); skipped where it is missing
-	$(BIN)/python -m pytest -q -m browser -rs tests/viewer
+test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
+	$(BIN)/python -m pytest -q -m browser -rs
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check

@@ -75,6 +75,7 @@ def open_tab(chromium, address: str):
 
 def pixels(tab) -> np.ndarray:
     """The scene's part of the window, [height width 3]."""
+    tab.locator("canvas").first.wait_for(timeout=1000 * SECONDS)
     canvas = max(tab.locator("canvas").all(), key=lambda c: c.bounding_box()["width"])
     shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
     return shot
