@@ -19,11 +19,21 @@ class ToyObjectsDataModule(CO3DDataModule):
     Args:
         root: where the scenes are, or will be.
         scenes, frames, data_seed: what to make where there is nothing yet.
+        depth_before: see `CO3DDataModule`; closer than there, as in `conf/data/toy_objects.yaml`: a model knows the
+            depth range that it was trained with.
         **reading: settings of `CO3DDataModule`.
     """
 
-    def __init__(self, root: str, scenes: int = 400, frames: int = 24, data_seed: int = 0, **reading: Any) -> None:
-        super().__init__(root, CATEGORY, **reading)
+    def __init__(
+        self,
+        root: str,
+        scenes: int = 400,
+        frames: int = 24,
+        data_seed: int = 0,
+        depth_before: float = 1.0,
+        **reading: Any,
+    ) -> None:
+        super().__init__(root, CATEGORY, depth_before=depth_before, **reading)
         self.scenes = scenes
         self.frames = frames
         self.data_seed = data_seed
