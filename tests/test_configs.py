@@ -142,6 +142,7 @@ def test_the_papers_diffusion(data):
     assert masked.model.autoreconstructor_checkpoint is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", [option for option in options("experiment") if option.startswith("toy_")])
 def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)

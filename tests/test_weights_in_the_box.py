@@ -31,7 +31,7 @@ def test_the_card_says_what_they_are_and_what_they_are_not():
 def test_samples_fit_the_picture_they_are_drawn_for(tmp_path):
     """Two scenes of another seed than training's: the reference view is met, the naive answers are beaten."""
     data = ToyObjectsDataModule(
-        str(tmp_path), scenes=20, frames=6, data_seed=77, image_size=64, evaluation_batch_size=2
+        str(tmp_path), scenes=20, frames=4, data_seed=77, image_size=64, evaluation_batch_size=2
     )
     data.prepare_data()
     data.setup("test")

@@ -48,6 +48,7 @@ def test_a_run_is_continued_from_its_checkpoint(command, pipeline, tmp_path):
     assert strict_json(tmp_path / "more" / "metrics.json")["steps"] == 3
 
 
+@pytest.mark.slow
 def test_a_sweep_leaves_a_complete_directory_for_each_job(command, pipeline, tmp_path):
     settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=1"]
     finished = command("fit", "-m", *settings, "seed=0,1", f"out={tmp_path / 'sweep'}")

@@ -24,6 +24,7 @@ def make(source: ListedSource, out: Path, **options: object) -> Path:
     return prepare({"train": source}, SETTINGS, out, **keywords)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes_in_one_process_and_in_two(tmp_path: Path) -> None:
     one = make(ListedSource(NAMES[:4]), tmp_path / "one")
     two = make(ListedSource(NAMES[:4]), tmp_path / "two", workers=2)

@@ -79,6 +79,7 @@ def test_a_run_has_the_panels_of_the_layout_and_logs_nothing_else(run, kind):
     assert rest - set().union(*shown.values()) <= {"epoch", "trainer/global_step", *UNNAMED}
 
 
+@pytest.mark.slow
 def test_pictures_and_histograms_are_those_of_the_run_directory(run):
     wandb_run, out = run(STAGE1)
     (picture,) = wandb_run.folder.glob("files/media/images/pictures_*.png")

@@ -8,6 +8,7 @@ from completesplat.data.toy.module import ToyRoomsDataModule
 SMALL = {"scenes": 4, "frames": 8, "height": 18, "image_size": 16, "batch_size": 2, "targets": 2, "evaluation_gap": 5}
 
 
+@pytest.mark.slow
 def test_rooms_are_made_on_first_use_and_kept(tmp_path):
     module = ToyRoomsDataModule(str(tmp_path), **SMALL)
     module.prepare_data()
