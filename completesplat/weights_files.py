@@ -27,13 +27,18 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
     if expected is not None:
-        with path.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
+        found = sha256_of(path)
         if not found.startswith(expected):
             raise WeightsError(
                 f"{path}: SHA-256 {found}, not {sha256}; {advice} (if that file is meant, {hash_setting}={found})"
             )
     return path
+
+
+def sha256_of(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _download(url: str, sha256: str | None, advice: str) -> Path:

@@ -49,10 +49,22 @@ def test_a_changed_configuration_is_refused_until_the_sums_are_gone(folder):
     assert weights_folder(folder) == folder
 
 
+@pytest.mark.parametrize("left", [0, 1])
+def test_sums_that_do_not_cover_both_files_are_refused(folder, left):
+    (folder / SUMS_FILE).write_text("".join((folder / SUMS_FILE).read_text().splitlines(keepends=True)[:left]))
+    with pytest.raises(WeightsError, match=f"is not the one in {SUMS_FILE}"):
+        weights_folder(folder)
+
+
 def test_names_of_the_box_are_found_and_listed(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "BOX", tmp_path)
     assert in_the_box() == ["copy"]
     assert weights_folder("copy") == tmp_path / "copy"
+    # Data may lie in a folder of the same name where somebody works.
+    monkeypatch.chdir(tmp_path / "copy")
+    (tmp_path / "copy" / "copy").mkdir()
+    assert weights_folder("copy") == tmp_path / "copy"
+    assert CompleteSplat.from_pretrained(".").image_size
     with pytest.raises(WeightsError, match="nothing_of_this_name: no such folder; with the package come copy"):
         weights_folder("nothing_of_this_name")
 

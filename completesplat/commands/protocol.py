@@ -1,12 +1,12 @@
 """What figures were measured of, and how: without it they say nothing."""
 
-import hashlib
 import sys
 from pathlib import Path
 from typing import Any
 
 from completesplat import __version__
 from completesplat.commands.source import git_commit
+from completesplat.weights_files import sha256_of
 
 LPIPS = {"net": "vgg", "version": "0.1", "range": [-1, 1]}
 METRICS: dict[str, dict[str, Any]] = {
@@ -67,9 +67,7 @@ def checkpoint_facts(path: Path) -> dict[str, Any]:
     from completesplat.training.checkpoints import read_checkpoint
 
     contents = read_checkpoint(path)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    facts = {"path": str(path), "sha256": digest, "step": contents.get("global_step")}
+    facts = {"path": str(path), "sha256": sha256_of(path), "step": contents.get("global_step")}
     return {"checkpoint": facts, "ema": "averaging_state" in contents}
 
 
@@ -77,6 +75,5 @@ def weights_facts(weights: str) -> dict[str, Any]:
     """The same for a folder of weights (`completesplat.weights`), which does not say how training ended."""
     from completesplat.weights import WEIGHTS_FILE, weights_folder
 
-    with (weights_folder(weights) / WEIGHTS_FILE).open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    digest = sha256_of(weights_folder(weights) / WEIGHTS_FILE)
     return {"checkpoint": {"path": weights, "sha256": digest, "step": None}, "ema": None}

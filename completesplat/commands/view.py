@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
 EXPORT = "--export"
-WEIGHTS = ("config.json", "model.safetensors")
+WEIGHTS = (CONFIG_FILE, WEIGHTS_FILE)
 MOST_CAMERAS = 24
 
 
@@ -76,8 +77,10 @@ def settings_of(path: Path) -> dict[str, str]:
 
 def make_page(config: Any, out: Path) -> Any:
     """The page with what the settings name, on a port of its own."""
+    import torch
     from hydra.utils import instantiate
 
+    from completesplat.commands.generator import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page
     from completesplat.viewer.samples import read_scene
@@ -85,7 +88,8 @@ def make_page(config: Any, out: Path) -> Any:
     from completesplat.viewer.server import start_server, stop_server
     from completesplat.viewer.stage import Stage
 
-    model = load_model(config) if config.scene is None else None
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = open_generator(config).to(device) if config.scene is None else None
     samples, up = ([], tuple(model.up.tolist())) if model is not None else read_scene(Path(config.scene))
     photograph = None if model is None or config.image is None else model.read(Path(config.image), config.fov)
     cameras = None if config.get("data") is None else data_cameras(config.data)
@@ -105,27 +109,6 @@ def make_page(config: Any, out: Path) -> Any:
     except BaseException:
         stop_server(server)
         raise
-
-
-def load_model(config: Any) -> Any:
-    """The model with the sampler that is wanted, on a GPU where there is one.
-
-    Raises:
-        WeightsError: no weights, or not readable.
-    """
-    import torch
-    from omegaconf import OmegaConf
-
-    from completesplat.generation import CompleteSplat
-    from completesplat.weights import in_the_box
-
-    if config.weights in in_the_box():
-        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
-    model = CompleteSplat.from_pretrained(config.weights)
-    if config.get("sampler") is not None:
-        sampler: Any = OmegaConf.to_container(config.sampler)
-        model.replace_sampler(sampler)
-    return model.to("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def start_settings(config: Any, model: Any) -> dict[str, Any]:

@@ -10,7 +10,6 @@ import viser
 from completesplat.data.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.export.pixels import to_bytes
-from completesplat.export.widening import widened
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
@@ -105,8 +104,10 @@ class Completion:
         scenes: Sequence[Gaussians],
         finished: bool,
     ) -> list[Sample]:
-        """The new samples behind the earlier ones, as many as there is room for; `widened`, as the page is large."""
+        """The new samples behind the earlier ones, as many as there is room for."""
         layers = self.model.autoreconstructor.reconstructor.parameterization.layers
-        wide = [widened(scene, reference) for scene in scenes]
-        new = [Sample(scene, layers, reference, {**settings, "sample": i}, finished) for i, scene in enumerate(wide)]
+        new = [
+            Sample(scene, layers, reference, {**settings, "sample": i}, finished, exact=True)
+            for i, scene in enumerate(scenes)
+        ]
         return [*earlier, *new][-MOST_SAMPLES:]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply
+from completesplat.export.widening import widened
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
@@ -28,6 +29,7 @@ class Sample:
         reference: the camera of its photograph, or one that sees all of it.
         settings: what it was drawn with, for the files that are saved.
         finished: or an estimate on the way.
+        exact: as the model gives it, for our rasterizers; files hold Gaussians that are widened already.
     """
 
     gaussians: Gaussians
@@ -35,6 +37,11 @@ class Sample:
     reference: Cameras
     settings: Mapping[str, Any] = field(default_factory=dict)
     finished: bool = True
+    exact: bool = False
+
+    def for_viewers(self) -> Gaussians:
+        """`widened` once: what the page draws and what is stored."""
+        return widened(self.gaussians, self.reference) if self.exact else self.gaussians
 
     def pivot(self) -> Float[Tensor, "3"]:
         """On the optical axis, at the median depth (by opacity) of the Gaussians in the picture's central ninth."""

@@ -50,7 +50,7 @@ class Saver:
     def ply(self, sample: Sample) -> Path:
         """All layers of the sample, in its reference camera's frame."""
         path = self._next("sample", ".ply")
-        write_ply(path, sample.gaussians, [f"{name} {value}" for name, value in sample.settings.items()])
+        write_ply(path, sample.for_viewers(), [f"{name} {value}" for name, value in sample.settings.items()])
         return path
 
     def video(self, sample: Sample) -> Path:

@@ -93,7 +93,7 @@ class Stage:
                     one.camera.fov = self._framing.fov
 
     def _draw_splats(self, shown: Sequence[Sample], framing: Framing) -> None:
-        scenes = [sample.gaussians for sample in shown]
+        scenes = [sample.for_viewers() for sample in shown]
         if self.depth:
             scenes = depth_colored(scenes)
         wanted = {}

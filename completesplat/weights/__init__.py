@@ -4,11 +4,11 @@ A folder holds `config.json`, `model.safetensors` and `SHA256SUMS` (as `sha256su
 have a model card too, `README.md`.
 """
 
-import hashlib
 import re
 from pathlib import Path
 
 from completesplat.errors import WeightsError
+from completesplat.weights_files import sha256_of
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
@@ -24,8 +24,9 @@ def weights_folder(weights: Path | str) -> Path:
     """The folder that is meant, complete, with every file that has a checksum as it was written.
 
     Args:
-        weights: a folder; else a name of `in_the_box`; else an id of the Hugging Face hub, whose files are downloaded
-            once (a token, a mirror, work without a network: by the hub's own environment variables).
+        weights: a name of `in_the_box` (a folder of that name is meant by `./NAME`); else a folder; else an id of the
+            Hugging Face hub, whose files are downloaded once (a token, a mirror, work without a network: by the hub's
+            own environment variables).
 
     Raises:
         WeightsError: there are none, files are missing, or one has another checksum.
@@ -40,16 +41,16 @@ def weights_folder(weights: Path | str) -> Path:
 
 def write_sums(folder: Path) -> None:
     """Write the checksums of the two files that a model is read from."""
-    lines = [f"{_sha256(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
+    lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
     (folder / SUMS_FILE).write_text("".join(lines))
 
 
 def _locate(weights: str) -> Path:
+    if weights in in_the_box():
+        return BOX / weights
     local = Path(weights).expanduser()
     if local.exists():
         return local
-    if weights in in_the_box():
-        return BOX / weights
     if HUB_ID.fullmatch(weights):
         return _download(weights)
     raise WeightsError(f"{weights}: no such folder; with the package come {', '.join(in_the_box()) or 'no weights'}")
@@ -69,15 +70,11 @@ def _check_sums(folder: Path) -> None:
     sums = folder / SUMS_FILE
     if not sums.is_file():
         return
-    for line in sums.read_text(errors="replace").splitlines():
-        expected, _, name = line.partition("  ")
-        if name in (CONFIG_FILE, WEIGHTS_FILE) and _sha256(folder / name) != expected:
+    entries = (line.partition("  ") for line in sums.read_text(errors="replace").splitlines())
+    expected = {name: digest for digest, _, name in entries}
+    for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if sha256_of(folder / name) != expected.get(name):
             raise WeightsError(
                 f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
                 f"if the change is meant, remove {SUMS_FILE}"
             )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

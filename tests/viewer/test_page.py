@@ -3,6 +3,7 @@
 import io
 import logging
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,10 +15,12 @@ from viewer_scenes import balls_sample
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply
+from completesplat.export.widening import widened
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
+from completesplat.viewer import saving  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page  # noqa: E402
 from completesplat.viewer.saving import Saver  # noqa: E402
@@ -145,6 +148,7 @@ def test_a_picture_that_is_loaded_is_completed_as_the_model_does(completion, mod
     for sample, expected in zip(shown, model(photograph, **START), strict=True):
         assert sample.finished
         assert torch.equal(sample.gaussians.means, expected.means)
+        assert torch.equal(sample.gaussians.scales, expected.scales)
     assert "photo.png" in completion.controls.preview.label
     assert completion.page.looking.chosen.options == ("all, side by side", "sample 1", "sample 2")
 
@@ -273,6 +277,22 @@ def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(pag
         press(page.saving["ply"], Browser())
         assert page.worker.wait(SECONDS)
     assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page, monkeypatch, exact):
+    """Our rasterizer adds its own; what was read from a file holds it already."""
+    sample, drawn = replace(balls_sample(), exact=exact), []
+    page.show([sample])
+    monkeypatch.setattr(
+        saving,
+        "orbit_views",
+        lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None),
+    )
+    (ply,), _ = page.saver.save("ply", [sample]), page.saver.save("video", [sample])
+    wide = widened(sample.gaussians, sample.reference) if exact else sample.gaussians
+    assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)
+    assert torch.equal(drawn[0].scales, sample.gaussians.scales)
 
 
 def test_nothing_is_saved_of_an_empty_page(page):
