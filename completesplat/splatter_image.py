@@ -25,7 +25,7 @@ SH_C0 = 0.28209479177387814
 
 
 class Group(NamedTuple):
-    """Raw values that belong together: their number, and gain and bias of the head that predicts them."""
+    """Raw values that belong together: their number, and gain and bias of Splatter Image's head (`initialize_head`)."""
 
     channels: int
     gain: float
@@ -136,12 +136,28 @@ def from_channels(
 
 @torch.no_grad()
 def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None:
-    """Initialise a network's last convolution as Splatter Image does, group by group (xavier gain, constant bias)."""
+    """Initialise a network's last convolution, behind group normalisation and SiLU, as Splatter Image's output starts.
+
+    Upstream's output passes a 3x3 convolution of 128 channels to N (xavier, weights times 0.2) and then a 1x1
+    convolution with a gain for each group (`gaussian_predictor.py`, SongUNet and SingleImageSongUNetPredictor). Here
+    there is one convolution, whose weights have the variance that lets its raw values deviate as theirs do. With
+    upstream's gains alone they would be spread four times as far, most colours outside [0, 1].
+    """
     assert head.bias is not None
+    inputs = head.weight[0].numel()
     row = 0
     for _ in range(parameterization.layers):
         for group in GROUPS.values():
             rows = slice(row, row + group.channels)
-            nn.init.xavier_uniform_(head.weight[rows], gain=group.gain)
+            bound = math.sqrt(3 * _upstream_variance(group) / inputs)
+            nn.init.uniform_(head.weight[rows], -bound, bound)
             nn.init.constant_(head.bias[rows], group.bias)
             row += group.channels
+
+
+def _upstream_variance(group: Group) -> float:
+    """Variance of upstream's raw values for inputs whose mean square is 1: inputs times variance of a weight, twice."""
+    inputs, outputs = 128 * 9, CHANNELS * 9
+    first = inputs * 0.2**2 * 2 / (inputs + outputs)
+    second = CHANNELS * group.gain**2 * 2 / (CHANNELS + group.channels)
+    return first * second

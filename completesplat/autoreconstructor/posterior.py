@@ -1,5 +1,6 @@
 """The distribution over latent codes that the encoder predicts."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,9 @@ from completesplat.tensors import TensorDataclass
 
 LOG_VARIANCE_RANGE = (-30.0, 20.0)
 """Clamp of Stable Diffusion's VAE (CompVis `ldm/modules/distributions/distributions.py`)."""
+
+ACTIVE_BITS = 0.01
+"""A channel of the latent is called active if each of its values carries more than this on average."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,18 @@ class Posterior(TensorDataclass):
 
     def kl(self) -> Float[Tensor, " batch"]:
         """KL divergence to the standard normal, summed over the latent: 0.5 sum(mu^2 + sigma^2 - 1 - log sigma^2)."""
-        return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance).sum(dim=(1, 2, 3))
+        return self._kl_of_values().sum(dim=(1, 2, 3))
+
+    def channel_bits(self) -> Float[Tensor, " channel"]:
+        """The KL of each channel in bits: summed over space, averaged over the batch."""
+        return self._kl_of_values().sum(dim=(2, 3)).mean(0) / math.log(2)
+
+    def active_channels(self) -> int:
+        """How many channels carry more than `ACTIVE_BITS` a value."""
+        return int((self.channel_bits() > ACTIVE_BITS * self.mean[0, 0].numel()).sum())
+
+    def _kl_of_values(self) -> Float[Tensor, "batch channel height width"]:
+        return 0.5 * (self.mean.square() + self.log_variance.exp() - 1 - self.log_variance)
 
 
 def from_moments(moments: Float[Tensor, "batch channel height width"]) -> Posterior:

@@ -8,11 +8,14 @@ from completesplat.scene import Views
 
 
 class KullbackLeibler:
-    """KL of the latent posterior to the standard normal: summed over the latent, averaged over the batch.
+    """KL of the latent posterior to the standard normal, in nats per value of a picture, averaged over the batch.
 
-    Zero for a model without a posterior. The paper states no weight; Stable Diffusion's is 1e-6.
+    Stable Diffusion adds 1e-6 times the KL of a latent to the *sum* of the errors over the 3 * H * W values of its
+    picture (CompVis `ldm/modules/losses/contperceptual.py`). The other terms here are means over values, so the KL is
+    divided by 3 * H * W too: its weight means the same as Stable Diffusion's at every image size. Zero for a model
+    without a posterior.
     """
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        posterior = prediction.posterior
-        return posterior.kl().mean() if posterior is not None else prediction.images.new_zeros(())
+        posterior, values = prediction.posterior, prediction.images[0, 0].numel()
+        return posterior.kl().mean() / values if posterior is not None else prediction.images.new_zeros(())

@@ -26,7 +26,8 @@ class Pictures(DrawsFixedScenes):
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`). All loggers get `gaussians/opacity_p10`, `_p50`,
     `_p90`, the same of `log10_scale` (all three axes) and `depth` (along the reference's optical axis, in scene
-    units), and `kl/channel_0` and so on if the model has a posterior; Weights & Biases also the picture and histograms.
+    units). If the model has a posterior, they also get what its latent carries (`latent_bits`). Weights & Biases gets
+    the picture and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 1000, scenes: int = 4) -> None:
@@ -44,7 +45,7 @@ class Pictures(DrawsFixedScenes):
         values = distributions(gaussians)
         scalars = {f"gaussians/{name}": value for name, value in percentiles(values).items()}
         if posterior is not None:
-            scalars |= {f"kl/channel_{index}": kl for index, kl in enumerate(channel_kl(posterior))}
+            scalars |= latent_bits(posterior)
         for logger in trainer.loggers:
             # As Lightning counts: a row bears the number of the optimizer steps before its own.
             logger.log_metrics(scalars, step=trainer.global_step - 1)
@@ -70,7 +71,11 @@ def percentiles(values: Mapping[str, Float[np.ndarray, " _"]]) -> dict[str, floa
     return {f"{name}_p{p}": float(np.percentile(of, p)) for name, of in values.items() for p in PERCENTILES}
 
 
-def channel_kl(posterior: Posterior) -> list[float]:
-    """KL divergence to the prior of each channel of the latent: summed over space, mean over the batch."""
-    means, log_variances = posterior.mean.split(1, dim=1), posterior.log_variance.split(1, dim=1)
-    return [Posterior(*parts).kl().mean().item() for parts in zip(means, log_variances, strict=True)]
+def latent_bits(posterior: Posterior) -> dict[str, float]:
+    """KL of the latent to the prior: `latent/bits` a scene, of which `latent/bits_0` and so on in each channel.
+
+    `latent/active_channels` counts the channels that are active (`completesplat.autoreconstructor.posterior`).
+    """
+    bits = posterior.channel_bits().tolist()
+    channels = {f"latent/bits_{index}": value for index, value in enumerate(bits)}
+    return {"latent/bits": sum(bits), "latent/active_channels": float(posterior.active_channels()), **channels}

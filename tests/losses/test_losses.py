@@ -1,5 +1,6 @@
 import pytest
 import torch
+from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from support import some_gaussians
 from torchmetrics.functional.image import structural_similarity_index_measure
 
@@ -47,10 +48,29 @@ def test_ssim_is_one_minus_torchmetrics_value(pair):
     assert ours.item() == pytest.approx(1 - theirs.item(), abs=0.05)
 
 
-def test_kl_is_summed_over_the_latent_and_averaged_over_the_batch(pair):
-    # N(1, 1) against N(0, 1) is 1/2 per element.
-    assert KullbackLeibler()(prediction(pair[0]), views(pair[1])).item() == pytest.approx(2.0)
+def test_kl_is_summed_over_the_latent_and_divided_by_the_values_of_a_picture(pair):
+    # N(1, 1) against N(0, 1) is 1/2 per element, of which there are four; a picture has 3 * 24 * 24 values.
+    value = KullbackLeibler()(prediction(pair[0]), views(pair[1])).item()
+    assert value == pytest.approx(2.0 / (3 * 24 * 24))
     assert KullbackLeibler()(prediction(pair[0], with_posterior=False), views(pair[1])).item() == 0
+
+
+@pytest.mark.parametrize("size", [16, 64])
+def test_kl_weighs_as_in_stable_diffusion_at_every_image_size(size):
+    """There, sum of errors + 1e-6 * KL; divided by the 3 * H * W values of a picture, mean error + our term."""
+    shape = (1, 2, 3, size, size)
+    first, second = torch.rand(shape), torch.rand(shape)
+    mean, log_variance = torch.randn(1, 4, size // 8, size // 8), torch.randn(1, 4, size // 8, size // 8)
+    cameras = Cameras(torch.eye(4).expand(1, 2, 4, 4), torch.eye(3).expand(1, 2, 3, 3), (size, size))
+    truth = Views(second, cameras, torch.ones(1, 2, 1, size, size))
+    terms = {
+        "mse": {"weight": 1.0, "term": MeanSquaredError()},
+        "kl": {"weight": 1e-6, "term": KullbackLeibler()},
+    }
+    total, _ = WeightedSum(terms)(Prediction(first, some_gaussians(1), Posterior(mean, log_variance)), truth)
+    theirs = DiagonalGaussianDistribution(torch.cat([mean, log_variance], dim=1)).kl().sum()
+    errors = (first - second).square().sum() / 2  # of one picture
+    assert total.item() == pytest.approx(((errors + 1e-6 * theirs) / (3 * size * size)).item(), rel=1e-5)
 
 
 def test_weighted_sum_drops_entries_that_are_none(pair):

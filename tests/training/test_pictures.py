@@ -1,3 +1,5 @@
+import math
+
 """What is drawn and measured while a model trains."""
 
 from dataclasses import replace
@@ -16,7 +18,7 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
 from completesplat.training.fixed_scenes import fixed_scenes
 from completesplat.training.panels import depth_panels, scene_panels, sheet
-from completesplat.training.pictures import channel_kl, distributions, percentiles
+from completesplat.training.pictures import distributions, latent_bits, percentiles
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
@@ -129,12 +131,23 @@ def test_percentiles():
     }  # fmt: skip
 
 
-def test_the_divergence_of_the_channels_is_that_of_the_posterior():
+def test_the_bits_of_the_channels_are_those_of_the_posterior():
     posterior = Posterior(torch.randn(3, 4, 5, 6), torch.randn(3, 4, 5, 6))
-    assert len(channel_kl(posterior)) == 4
-    assert sum(channel_kl(posterior)) == pytest.approx(posterior.kl().mean().item(), rel=1e-5)
-    quiet = Posterior(posterior.mean * torch.tensor([0.0, 1, 1, 1])[:, None, None], torch.zeros(3, 4, 5, 6))
-    assert channel_kl(quiet)[0] == 0
+    logged = latent_bits(posterior)
+    bits = [logged[f"latent/bits_{channel}"] for channel in range(4)]
+    assert logged["latent/bits"] == pytest.approx(sum(bits))
+    assert sum(bits) == pytest.approx(posterior.kl().mean().item() / math.log(2), rel=1e-5)
+    assert logged["latent/active_channels"] == 4
+
+
+def test_a_channel_that_is_the_prior_carries_nothing():
+    means = (
+        torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]
+    )  # 0.05^2 / 2 nats: 0.0018 bits a value
+    logged = latent_bits(Posterior(means, torch.zeros(3, 4, 5, 6)))
+    assert logged["latent/bits_0"] == 0
+    assert 0 < logged["latent/bits_2"] < 1
+    assert logged["latent/active_channels"] == 2
 
 
 class Data:
@@ -169,4 +182,4 @@ def test_a_run_leaves_pictures_and_rows(pipeline, stage):
     assert row["step"] == 1
     assert 0 < row["gaussians/opacity_p10"] <= row["gaussians/opacity_p50"] <= row["gaussians/opacity_p90"] < 1
     assert len(row) == 1 + 3 * 3
-    assert any(column.startswith("kl/channel_") for column in table) == (stage == "var")
+    assert any(column.startswith("latent/bits_") for column in table) == (stage == "var")

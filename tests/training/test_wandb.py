@@ -90,7 +90,7 @@ def test_pictures_and_histograms_are_those_of_the_run_directory(run):
     for name in ("opacity", "log10_scale", "depth"):
         # One validation scene of 32 x 32 pixels in two layers; scales have three axes.
         assert sum(shown[f"histograms/{name}/values"]) == 32 * 32 * 2 * (3 if name == "log10_scale" else 1)
-    assert {f"kl/channel_{i}" for i in range(4)} <= wandb_run.merged().keys()
+    assert {f"latent/bits_{i}" for i in range(4)} <= wandb_run.merged().keys()
 
 
 @pytest.mark.slow
