@@ -1,7 +1,6 @@
-import math
-
 """What is drawn and measured while a model trains."""
 
+import math
 from dataclasses import replace
 
 import numpy as np

@@ -48,9 +48,7 @@ PANELS = [
     Panel("Gaussians", "gaussians/depth_p*", "line", "percentiles", FIT),
     Panel("Latents", "latent/bits", "line", "KL of a scene's latent, bits", (STAGE1,), "a variational model"),
     Panel("Latents", "latent/bits_*", "line", "the same of each channel", (STAGE1,), "a variational model"),
-    Panel(
-        "Latents", "latent/active_channels", "line", "active channels", (STAGE1,), "a variational model"
-    ),
+    Panel("Latents", "latent/active_channels", "line", "active channels", (STAGE1,), "a variational model"),
     Panel("Latents", "latent_scale", "line", "factor that gives latents unit deviation", (STAGE2,)),
     Panel("Latents", "latents/std", "line", "deviation of all channels", (STAGE2,)),
     Panel("Latents", "latents/std_*", "line", "deviation of each channel", (STAGE2,)),
