@@ -102,7 +102,7 @@ def test_zero_rotation_is_the_identity_with_a_finite_gradient():
 # Standard deviations of the raw values of szymanowiczs/splatter-image's own network at the start: commit 98b4657,
 # `SingleImageSongUNetPredictor` with the settings of its configs/default_config.yaml and these 15 channels, in evaluation
 # mode: the mean over 20 seeds, two pictures of uniform noise of 128 x 128 each.
-UPSTREAM = {"depth": 0.205, "offset": 0.0209, "opacity": 0.200, "scale": 0.0006, "rotation": 0.196, "color": 0.966}
+UPSTREAM = {"depth": 0.205, "offset": 0.0209, "opacity": 0.200, "scale": 0.00063, "rotation": 0.196, "color": 0.966}
 
 
 def autoreconstructor(channels: tuple[int, ...], layers_per_block: int, groups: int, layers: int) -> nn.Module:
@@ -123,7 +123,7 @@ NETWORKS = {
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_raw_values_start_as_far_apart_as_splatter_images(network):
-    seeds = 2 if network in ("Stable Diffusion's blocks", "Splatter Image") else 8
+    seeds = 2 if network in ("Stable Diffusion's blocks", "Splatter Image") else 12
     deviations = dict.fromkeys(GROUPS, 0.0)
     outside = 0.0
     for seed in range(seeds):

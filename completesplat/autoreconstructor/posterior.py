@@ -12,7 +12,7 @@ from completesplat.tensors import TensorDataclass
 LOG_VARIANCE_RANGE = (-30.0, 20.0)
 """Clamp of Stable Diffusion's VAE (CompVis `ldm/modules/distributions/distributions.py`)."""
 
-ACTIVE_BITS = 0.01
+ACTIVE_BITS = 0.1
 """A channel of the latent is called active if each of its values carries more than this on average."""
 
 
