@@ -26,6 +26,7 @@ def samplers(config: Any, out: Path) -> None:
     from completesplat.reports.machine import machine
     from completesplat.reports.sampling.samplers import CLOSE, REFERENCE, fewest, rows
     from completesplat.reports.sampling.samplers_plot import plot_samplers
+    from completesplat.reports.sweeps.headline import SSIM_NOTE
     from completesplat.reports.tables import table
 
     configs: Any = OmegaConf.to_container(config.samplers)
@@ -45,7 +46,9 @@ def samplers(config: Any, out: Path) -> None:
     plot_samplers(found, out / "samplers.png", f"Samplers: {len(scenes)} scenes, {config.samples} samples each")
     columns = [("sampler", "sampler", ""), ("steps", "steps", "d"), ("calls", "calls", "d"), ("PSNR", "psnr", ".2f")]
     columns += [("SSIM", "ssim", ".4f"), ("diversity", "diversity", ".4f"), ("agreement", "agreement", ".1f")]
-    Console(width=120).print(table("Samplers, from the same noise", [*columns, ("ms", "ms", ".1f")], found))
+    Console(width=120).print(
+        table(f"Samplers, from the same noise. {SSIM_NOTE}", [*columns, ("ms", "ms", ".1f")], found)
+    )
     name, count = REFERENCE
     print(
         f"fewest denoiser calls within {CLOSE} dB of {name} with {count} steps: {best['calls']} "
