@@ -128,7 +128,8 @@ class CompleteSplat(nn.Module):
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
 
         Raises:
-            CompleteSplatError: skips with something hidden, or a number of steps that the sampler cannot make.
+            CompleteSplatError: a weight outside of [0, 1], skips with something hidden, or a number of steps that the
+                sampler cannot make.
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible

@@ -1,5 +1,7 @@
 """Every file of `conf/` composes and instantiates; every experiment trains."""
 
+import re
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -162,3 +164,54 @@ def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, mo
     }.get(experiment, [])
     assert call(monkeypatch, "fit", f"experiment={experiment}", *settings, f"out={tmp_path / 'run'}") == 0
     assert (tmp_path / "run/checkpoints/last.ckpt").is_file()
+
+
+# File below conf/ and key: what a reproduction would find nowhere in the paper.
+NOT_IN_THE_PAPER = [
+    ("autoreconstructor/stable_diffusion", "skip_dropout"),
+    ("autoreconstructor/stable_diffusion", "layer_depths"),
+    ("autoreconstructor/stable_diffusion", "smallest_scale"),
+    ("callbacks/ema", "decay"),
+    ("data/_scenes", "targets"),
+    ("data/_scenes", "references_per_sequence"),
+    ("data/_scenes", "color_jitter"),
+    ("data/_scenes", "box_masks"),
+    ("data/_scenes", "mask_threshold"),
+    ("data/_scenes", "mirroring"),
+    ("data/co3d_category", "val_fraction"),
+    ("data/co3d_category", "depth_before"),
+    ("data/co3d_category", "evaluation_targets"),
+    ("data/realestate10k", "max_gap"),
+    ("data/realestate10k", "near"),
+    ("data/realestate10k", "evaluation_targets"),
+    ("evaluation/images", "criterion"),
+    ("experiment/co3d_diffusion", "decay"),
+    ("experiment/co3d_diffusion_masked", "box_masks"),
+    ("experiment/re10k_diffusion", "decay"),
+    ("experiment/re10k_diffusion_masked", "box_masks"),
+    ("loss/stage2", "term"),
+    ("model/latent_diffusion", "background"),
+    ("model/latent_diffusion", "scale_batches"),
+    ("model/reconstructor_only", "background"),
+    ("model/reconstructor_only", "code_steps"),
+    ("model/splatter_image", "background"),
+    ("model/var", "background"),
+    ("sampler/_noise", "num_train_timesteps"),
+    ("sampler/ddim50", "_target_"),
+    ("schedule/exponential", "warmup_steps"),
+    ("trainer/default", "gradient_clip_val"),
+    ("trainer/default", "limit_val_batches"),
+    ("trainer/default", "precision"),
+    ("trainer/default", "val_check_interval"),
+    ("trainer/test", "precision"),
+]
+
+
+@pytest.mark.parametrize(("file", "key"), NOT_IN_THE_PAPER)
+def test_what_the_paper_does_not_state_is_marked(file: str, key: str) -> None:
+    """In the comment on its line, or right above."""
+    lines = (CONF / f"{file}.yaml").read_text().splitlines()
+    number = next(number for number, line in enumerate(lines) if line.strip().startswith(f"{key}:"))
+    above = takewhile(lambda line: line.strip().startswith("#"), reversed(lines[:number]))
+    said = " ".join([*above, lines[number].partition("#")[2]])
+    assert re.search("not state|states? neither|states? nothing", said)

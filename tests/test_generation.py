@@ -157,6 +157,14 @@ def test_skips_are_off_where_something_is_hidden_and_cannot_be_on(model, picture
     assert same(model(picture, everything, skip_weight=1.0)[0], model(picture)[0])
 
 
+@pytest.mark.parametrize("name", ["skip_weight", "guidance_weight"])
+@pytest.mark.parametrize("weight", [-0.5, 7, float("nan")])
+def test_weights_outside_of_0_to_1_are_refused(model, picture, half, name, weight):
+    for visible in (None, half):
+        with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
+            model(picture, visible, steps=1, **{name: weight})
+
+
 def test_the_scenes_of_all_steps_are_shown(model, picture):
     shown = []
     scenes = model(picture, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))

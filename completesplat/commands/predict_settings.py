@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted
@@ -17,9 +19,10 @@ def check_settings(config: Any) -> None:
     Raises:
         CompleteSplatError: names the setting and its range.
     """
-    for name in ("skip_weight", "guidance_weight", "background"):
-        if config[name] is not None and not 0 <= config[name] <= 1:
-            raise CompleteSplatError(f"{name}={config[name]}: must lie between 0 and 1")
+    allowed_skip_weight(config.skip_weight)
+    check_guidance_weight(config.guidance_weight)
+    if not 0 <= config.background <= 1:
+        raise CompleteSplatError(f"background={config.background}: must lie between 0 and 1")
     for name in ("samples", "frames", "batch"):
         if config[name] is not None and config[name] < 1:
             raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")

@@ -11,7 +11,7 @@ from completesplat.weights_files import sha256_of
 LPIPS = {"net": "vgg", "version": "0.1", "range": [-1, 1]}
 METRICS: dict[str, dict[str, Any]] = {
     "psnr": {"range": [0, 1], "limit_db": 100},
-    "ssim": {"window": 11, "sigma": 1.5, "range": [0, 1]},
+    "ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
     "lpips": LPIPS,
 }
 

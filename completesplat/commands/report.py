@@ -21,9 +21,12 @@ def samplers(config: Any, out: Path) -> None:
     from omegaconf import OmegaConf
     from rich.console import Console
 
+    from completesplat.autoreconstructor.skips import allowed_skip_weight
+    from completesplat.diffusion.guidance import check_guidance_weight
     from completesplat.reports.machine import machine
     from completesplat.reports.sampling.samplers import CLOSE, REFERENCE, fewest, rows
     from completesplat.reports.sampling.samplers_plot import plot_samplers
+    from completesplat.reports.sweeps.headline import SSIM_NOTE
     from completesplat.reports.tables import table
 
     configs: Any = OmegaConf.to_container(config.samplers)
@@ -31,7 +34,8 @@ def samplers(config: Any, out: Path) -> None:
         if name not in configs:
             raise CompleteSplatError(f"steps.{name}: no such sampler; there are {', '.join(configs)}")
         _all_between(f"steps.{name}", counts, 1, 1000)
-    _check_weights(config, "skip_weight", "guidance_weight")
+    allowed_skip_weight(config.skip_weight)
+    check_guidance_weight(config.guidance_weight)
     artist, scenes = open_run(config)
     weights = {"skip_weight": config.skip_weight, "guidance_weight": config.guidance_weight}
     with _status() as tick:
@@ -42,7 +46,9 @@ def samplers(config: Any, out: Path) -> None:
     plot_samplers(found, out / "samplers.png", f"Samplers: {len(scenes)} scenes, {config.samples} samples each")
     columns = [("sampler", "sampler", ""), ("steps", "steps", "d"), ("calls", "calls", "d"), ("PSNR", "psnr", ".2f")]
     columns += [("SSIM", "ssim", ".4f"), ("diversity", "diversity", ".4f"), ("agreement", "agreement", ".1f")]
-    Console(width=120).print(table("Samplers, from the same noise", [*columns, ("ms", "ms", ".1f")], found))
+    Console(width=120).print(
+        table(f"Samplers, from the same noise. {SSIM_NOTE}", [*columns, ("ms", "ms", ".1f")], found)
+    )
     name, count = REFERENCE
     print(
         f"fewest denoiser calls within {CLOSE} dB of {name} with {count} steps: {best['calls']} "
@@ -60,7 +66,7 @@ def controls(config: Any, out: Path) -> None:
     from completesplat.reports.tables import table
 
     for name in ("skip_weights", "guidance_weights"):
-        _all_between(name, config[name], 0, 1)
+        _require_list(name, config[name])
     settings = grid(config.skip_weights, config.guidance_weights)
     artist, scenes = open_run(config)
     with _status() as tick:
@@ -85,13 +91,14 @@ def controls(config: Any, out: Path) -> None:
 
 def masked(config: Any, out: Path) -> None:
     """Write `masked.png`: inputs with boxes over them, several completions of each."""
+    from completesplat.diffusion.guidance import check_guidance_weight
     from completesplat.reports.sampling.masked import strips
     from completesplat.reports.sampling.strips import draw_strips
 
     for box in config.boxes:
         if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
             raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
-    _check_weights(config, "guidance_weight")
+    check_guidance_weight(config.guidance_weight)
     artist, scenes = open_run(config)
     with _status() as tick:
         tick("completions")
@@ -130,14 +137,14 @@ def open_run(config: Any) -> tuple[Any, list[Any]]:
 
 
 def _all_between(name: str, values: Any, least: float, most: float) -> None:
-    if isinstance(values, int | float | str) or not values or any(not least <= value <= most for value in values):
+    _require_list(name, values)
+    if any(not least <= value <= most for value in values):
         raise CompleteSplatError(f"{name}={values}: all must lie between {least:g} and {most:g}")
 
 
-def _check_weights(config: Any, *names: str) -> None:
-    for name in names:
-        if not 0 <= config[name] <= 1:
-            raise CompleteSplatError(f"{name}={config[name]}: must lie between 0 and 1")
+def _require_list(name: str, values: Any) -> None:
+    if isinstance(values, int | float | str) or not values:
+        raise CompleteSplatError(f"{name}={values}: must be a list of numbers")
 
 
 def _write(path: Path, results: Mapping[str, Any]) -> None:

@@ -19,9 +19,9 @@ def depth(config: Any, out: Path) -> None:
 
     check_settings(config)
     weights = config.skip_weight, config.guidance_weight
+    settings = grid(weights[:1], weights[1:])
     artist, scenes = open_run(config)
     with Console(stderr=True).status("drawing") as status:
-        settings = grid(weights[:1], weights[1:])
         found = rows(artist, settings, scenes, config.far_degrees, lambda text: status.update(f"drawing: {text}"))
         status.update("drawing: the figure")
         pictures = strips(artist, scenes[: config.shown_scenes], *weights, config.shown)
@@ -45,9 +45,8 @@ def check_settings(config: Any) -> None:
     Raises:
         CompleteSplatError: names the setting and its range.
     """
-    for name, most in (("skip_weight", 1), ("guidance_weight", 1), ("far_degrees", 180)):
-        if not 0 <= config[name] <= most:
-            raise CompleteSplatError(f"{name}={config[name]}: must lie between 0 and {most}")
+    if not 0 <= config.far_degrees <= 180:
+        raise CompleteSplatError(f"far_degrees={config.far_degrees}: must lie between 0 and 180")
     for name in ("shown", "shown_scenes"):
         if config[name] < 1:
             raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")

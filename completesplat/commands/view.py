@@ -159,10 +159,13 @@ def check_settings(config: Any) -> None:
     Raises:
         CompleteSplatError: names the setting and its range.
     """
+    from completesplat.autoreconstructor.skips import allowed_skip_weight
+    from completesplat.diffusion.guidance import check_guidance_weight
+
+    allowed_skip_weight(config.skip_weight)
+    check_guidance_weight(config.guidance_weight)
     ranges = {
         "samples": (1, 8),
-        "skip_weight": (0, 1),
-        "guidance_weight": (0, 1),
         "steps": (1, 1000),
         "seed": (0, 2**31),
         "port": (1, 65535),

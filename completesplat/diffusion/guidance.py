@@ -6,8 +6,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from completesplat.errors import CompleteSplatError
+
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(noisy latent, timestep, conditioning) -> predicted noise."""
+
+
+def check_guidance_weight(weight: float) -> None:
+    """Refuse a weight that mixes nothing.
+
+    Raises:
+        CompleteSplatError: it lies outside of [0, 1].
+    """
+    if not 0 <= weight <= 1:
+        raise CompleteSplatError(f"guidance_weight={weight:g}: must lie between 0 and 1")
 
 
 def guided_noise(
@@ -22,7 +34,11 @@ def guided_noise(
     The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as
     it is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice
     the batch.
+
+    Raises:
+        CompleteSplatError: w outside of [0, 1].
     """
+    check_guidance_weight(weight)
     if weight == 0:
         return denoise(noisy_latent, timestep, conditioning)
     nothing = torch.zeros_like(conditioning)

@@ -55,7 +55,8 @@ class Sampler:
         prediction says about the clean latent.
 
         Raises:
-            CompleteSplatError: a number of steps that the scheduler cannot make.
+            CompleteSplatError: a guidance weight outside of [0, 1], or a number of steps that the scheduler cannot
+                make.
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)

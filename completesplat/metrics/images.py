@@ -21,7 +21,13 @@ def psnr(
 def ssim(
     predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
 ) -> Float[Tensor, " image"]:
-    """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1]."""
+    """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
+
+    The mean is over all pixels, and the window sees the picture mirrored beyond its border, as in Flash3D's evaluator
+    (`evaluation/evaluator.py`, torchmetrics). Splatter Image's metric (`utils/loss_utils.py`) sees zeros there, and
+    skimage's, which pixelSplat uses (`src/evaluation/metrics.py`), leaves 5 pixels out on every side. The paper prints
+    no SSIM.
+    """
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     values = structural_similarity_index_measure(predicted, true, data_range=1.0, reduction="none")

@@ -5,6 +5,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from completesplat.reports.sweeps.headline import SSIM_NOTE
+
 COLUMNS = [
     (region, view, metric)
     for region in ("full", "object")
@@ -19,7 +21,7 @@ LABELS = {"full": "all\npixels", "object": "object\npixels", "psnr": "PSNR", "ss
 def evaluation_table(results: dict[str, Any]) -> Table:
     """One row for each predictor of `Evaluation.results`, PSNR in dB."""
     first = next(iter(results.values()))
-    table = Table(title=f"{first['scenes']} scenes, {first['views']} novel views")
+    table = Table(title=f"{first['scenes']} scenes, {first['views']} novel views", caption=SSIM_NOTE)
     table.add_column("predictor", no_wrap=True)
     more = [("full", "novel", metric) for metric in WHERE_MEASURED if metric in first["full"]["novel"]]
     for region, view, metric in [*COLUMNS, *more]:

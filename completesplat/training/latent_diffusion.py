@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
@@ -37,6 +39,7 @@ class LatentDiffusion(SceneModule):
         **rendering_and_optimization: see `SceneModule`.
 
     Raises:
+        CompleteSplatError: a weight of the samples outside of [0, 1].
         WeightsError: a checkpoint is unusable, or both are given.
     """
 
@@ -60,7 +63,8 @@ class LatentDiffusion(SceneModule):
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
         self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
-        self.skip_weight = skip_weight
+        check_guidance_weight(guidance_weight)
+        self.skip_weight = allowed_skip_weight(skip_weight)
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
         if autoreconstructor_checkpoint is not None and checkpoint is not None:

@@ -6,6 +6,7 @@ from omegaconf import OmegaConf
 from support import strict_json
 
 from completesplat.diffusion.sampling import Sampler
+from completesplat.reports.sweeps.headline import SSIM_NOTE
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
@@ -87,7 +88,9 @@ def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path
     assert (described["scenes"], described["views"], described["skipped"]) == (model["scenes"], model["views"], 0)
     assert described["checkpoint"]["sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     assert described["ema"] is True  # stage 2 averages its weights
-    assert described["metrics"]["ssim"]["window"] == 11
+    ssim = described["metrics"]["ssim"]
+    assert (ssim["window"], ssim["border"]) == (11, "mirrored, counted")
+    assert SSIM_NOTE in " ".join(finished.out.split())
     assert model["seconds"].keys() == {"inference", "rendering"}
     assert model["full"]["novel"]["swd"] > 0
     # Toy objects have true depth; predictors that are pictures alone have none to compare.

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from completesplat.diffusion.guidance import guided_noise
+from completesplat.errors import CompleteSplatError
 
 LATENT = torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
 FEATURES = torch.randn(2, 3, 8, 8, generator=torch.Generator().manual_seed(1))
@@ -44,3 +45,11 @@ def test_between_it_is_linear_and_the_customary_scale_is_one_minus_the_weight(we
     guided = guided_noise(Counting(), LATENT, STEP, FEATURES, weight)
     customary = unconditional() + (1 - weight) * (conditional() - unconditional())
     torch.testing.assert_close(guided, customary)
+
+
+@pytest.mark.parametrize("weight", [-0.1, 1.1, 7.5, float("nan")])
+def test_a_weight_outside_of_0_to_1_is_refused(weight):
+    denoise = Counting()
+    with pytest.raises(CompleteSplatError, match=f"guidance_weight={weight:g}: must lie between 0 and 1"):
+        guided_noise(denoise, LATENT, STEP, FEATURES, weight)
+    assert denoise.calls == 0

@@ -95,6 +95,11 @@ def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter)
     assert np.abs(means - expected).max() <= 1 / 4096
 
 
+def test_spz_files_are_version_4_in_its_plain_header(written):
+    """As README says; nianticlabs/spz, README, "Header (version 4)": magic number NGSP, then the version."""
+    assert (written / "a.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
+
+
 def test_a_file_that_is_none_is_refused_in_its_words(converter, tmp_path):
     (tmp_path / "bad.ply").write_text("no splats")
     with pytest.raises(CompleteSplatError, match=r"failed with status 1: .+") as caught:

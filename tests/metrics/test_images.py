@@ -1,9 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from completesplat.commands.protocol import METRICS
 from completesplat.metrics.images import PSNR_LIMIT, object_only, psnr, ssim
+from completesplat.reports.sweeps.headline import SSIM_NOTE
 
 
 @pytest.fixture(scope="module")
@@ -19,17 +22,42 @@ def test_psnr_agrees_with_skimage(pair):
     np.testing.assert_allclose(psnr(*pair).numpy(), expected, rtol=1e-5)
 
 
-def test_ssim_agrees_with_skimage(pair):
-    """Ours averages over the whole image, skimage over all but a border of 5 pixels: where that is equal, over 1s."""
-    framed = [torch.nn.functional.pad(x, (12, 12, 12, 12), value=0.5) for x in pair]
-    height, width = framed[0].shape[-2:]
-    inner = (height - 10) * (width - 10) / (height * width)
+def similarity_map(first, second, border, **value):
+    """SSIM of every pixel and channel (Wang et al. 2004), blurred by scipy with this treatment of the border."""
+    x, y = first.double().numpy(), second.double().numpy()
+
+    def blurred(image):
+        settings = {"sigma": 1.5, "truncate": 3.5, "mode": border, "axes": (1, 2)}
+        return gaussian_filter(image, **settings, **value)
+
+    mean_x, mean_y = blurred(x), blurred(y)
+    variances = blurred(x * x) - mean_x**2 + blurred(y * y) - mean_y**2
+    covariance = blurred(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + 0.01**2) / (mean_x**2 + mean_y**2 + 0.01**2)
+    return luminance * (2 * covariance + 0.03**2) / (variances + 0.03**2)
+
+
+def test_ssim_counts_the_border_and_mirrors_the_picture_there(pair):
+    """As torchmetrics, and with it Flash3D's evaluator; `SSIM_NOTE` and the protocol say so beside the figures."""
+    expected = [similarity_map(p, t, "mirror").mean() for p, t in zip(*pair, strict=True)]
+    np.testing.assert_allclose(ssim(*pair).numpy(), expected, atol=1e-5)
+    assert METRICS["ssim"]["border"] == "mirrored, counted"
+    assert "mean over all pixels, the picture mirrored at its border" in SSIM_NOTE
+
+
+def test_skimage_leaves_5_pixels_out_where_ssim_counts_all(pair):
     settings = {"channel_axis": 0, "data_range": 1, "gaussian_weights": True, "sigma": 1.5}
-    expected = [
-        structural_similarity(t.numpy(), p.numpy(), use_sample_covariance=False, **settings) * inner + 1 - inner
-        for p, t in zip(*(x.double() for x in framed), strict=True)
-    ]
-    np.testing.assert_allclose(ssim(*framed).numpy(), expected, atol=1e-4)
+    for p, t, ours in zip(*pair, ssim(*pair), strict=True):
+        theirs = structural_similarity(t.double().numpy(), p.double().numpy(), use_sample_covariance=False, **settings)
+        assert similarity_map(p, t, "mirror")[:, 5:-5, 5:-5].mean() == pytest.approx(theirs, abs=1e-9)
+        assert abs(ours.item() - theirs) > 0.01
+    assert "skimage leaves 5 pixels out on every side" in SSIM_NOTE
+
+
+def test_splatter_image_counts_the_border_too_but_against_black(pair):
+    """Its `utils/loss_utils.py` pads with zeros, which makes the pictures alike at the border: higher than ours."""
+    for p, t, ours in zip(*pair, ssim(*pair), strict=True):
+        assert similarity_map(p, t, "constant", cval=0).mean() > ours.item() + 0.01
 
 
 def test_identical_images_have_the_highest_reported_psnr(pair):

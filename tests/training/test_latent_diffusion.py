@@ -8,6 +8,7 @@ import torch
 from support import tiny_generator
 from torch import nn
 
+from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import EncodedScene, SceneBatch, Views
@@ -198,3 +199,10 @@ def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(m
     assert module.state_dict().keys() == module_of(monkeypatch)[0].state_dict().keys()
     module.training_step(scenes(), 0)
     assert compiled == [1]
+
+
+@pytest.mark.parametrize("setting", [{"skip_weight": 7}, {"guidance_weight": 1.5}])
+def test_weights_of_its_samples_outside_of_0_to_1_are_refused(setting, monkeypatch):
+    ((name, weight),) = setting.items()
+    with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
+        module_of(monkeypatch, **setting)

@@ -25,6 +25,7 @@ def import_capture(
     sequence: str | None = None,
     hold_out: int = 8,
     quality: int = 95,
+    most_missing: float = 0.5,
     progress: bool = True,
 ) -> Path:
     """Write a capture to `out`/`category`, as the only sequence of a category; all of it or nothing.
@@ -36,6 +37,7 @@ def import_capture(
         hold_out: of so many frames one goes to validation and test, the others to training. Small captures hold out
             more often, so that there are two.
         quality: of JPEG files that are written anew.
+        most_missing: largest share of the frames of a `transforms.json` that may have no picture; they are left out.
 
     Returns:
         The category's folder.
@@ -50,8 +52,7 @@ def import_capture(
         raise CompleteSplatError(
             "colmap=FOLDER goes with images=FOLDER (and masks=FOLDER), transforms=FILE with neither"
         )
-    if hold_out < 2 or not 1 <= quality <= 100:
-        raise CompleteSplatError(f"hold_out must be at least 2 and quality 1 to 100, not {hold_out} and {quality}")
+    _check_numbers(hold_out, quality, most_missing)
     if category is None:
         raise CompleteSplatError("category is needed: give category=NAME")
     folder = Path(out) / _plain("category", str(category))
@@ -59,19 +60,30 @@ def import_capture(
         raise DataError("is there already: remove it or choose another category", str(folder))
     if sequence is not None:
         _plain("sequence", str(sequence))
-    capture = _read(transforms, colmap, images, masks)
+    capture = _read(transforms, colmap, images, masks, most_missing)
     name = str(sequence) if sequence is not None else _made_plain(capture.name)
     written = _write_whole(folder, name, capture, hold_out, quality, progress)
     _report(folder, name, written)
     return folder
 
 
+def _check_numbers(hold_out: int, quality: int, most_missing: float) -> None:
+    if hold_out < 2 or not 1 <= quality <= 100:
+        raise CompleteSplatError(f"hold_out must be at least 2 and quality 1 to 100, not {hold_out} and {quality}")
+    if not 0 <= most_missing <= 1:
+        raise CompleteSplatError(f"most_missing={most_missing:g}: must lie between 0 and 1")
+
+
 def _read(
-    transforms: Path | str | None, colmap: Path | str | None, images: Path | str | None, masks: Path | str | None
+    transforms: Path | str | None,
+    colmap: Path | str | None,
+    images: Path | str | None,
+    masks: Path | str | None,
+    most_missing: float,
 ) -> Capture:
     if colmap is not None and images is not None:
         return read_colmap(Path(colmap), Path(images), None if masks is None else Path(masks))
-    return read_transforms(Path(str(transforms)))
+    return read_transforms(Path(str(transforms)), most_missing)
 
 
 def _write_whole(folder: Path, sequence: str, capture: Capture, hold_out: int, quality: int, progress: bool) -> Written:

@@ -1,6 +1,8 @@
 """Captures as a `transforms.json` with pictures: the format of NeRF, instant-ngp and nerfstudio."""
 
+import logging
 import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,8 @@ from completesplat.data.importing.capture import (
 from completesplat.data.importing.pictures import picture_size
 from completesplat.errors import DataError
 
+logger = logging.getLogger(__name__)
+
 # Which coefficients a model has, of OpenCV's; `k4` means other things in other programs.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 USED = {
@@ -46,9 +50,10 @@ USED = {
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 SCALE_TOLERANCE = 1e-3
+MOST_NAMED = 5
 
 
-def read_transforms(path: Path) -> Capture:
+def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
     """Read `transforms.json`; what one frame says goes before what the file says for all.
 
     `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
@@ -58,6 +63,12 @@ def read_transforms(path: Path) -> Capture:
     `process_data/colmap_utils.py`). `mask_path` is the foreground. `ply_file_path` is in the world of the poses
     (`create_ply_from_colmap`, ibid.). Paths are relative to the file's folder and stay in it.
 
+    Frames without a picture are left out, as instant-ngp leaves them out where frames have a `sharpness`
+    (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 pictures.
+
+    Args:
+        most_missing: largest share of the frames that may have no picture.
+
     Raises:
         DataError: whatever is missing, malformed or impossible, with the file and the number of the frame in it.
     """
@@ -66,28 +77,40 @@ def read_transforms(path: Path) -> Capture:
     with at(path):
         entries = field(content, "frames", list)
         frames = []
-        for number, entry in enumerate(entries):
+        for number, image in _find_pictures(path, entries, most_missing).items():
             with at(frame=number):
-                frames.append(_read_frame(root, number, content, entry))
+                frames.append(_read_frame(root, number, content, entries[number], image))
         ordered = in_order(frames)
         cloud = None if content.get("ply_file_path") is None else field(content, "ply_file_path", str)
         points = None if cloud is None else _read_cloud(inside(root, cloud))
     return Capture(path.resolve().parent.name, path, ordered, points)
 
 
-def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any) -> CapturedFrame:
-    image = _find_picture(root, field(entry, "file_path", str))
+def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> dict[int, Path]:
+    """The pictures that are there, by the number of their frame."""
+    found, missing = {}, []
+    for number, entry in enumerate(entries):
+        with at(frame=number):
+            name = field(entry, "file_path", str)
+            candidates = [inside(path.parent, name + suffix) for suffix in SUFFIXES]
+        picture = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if picture is None:
+            missing.append(name)
+        else:
+            found[number] = picture
+    if missing:
+        counted = f"{len(missing)} of {len(entries)} frames have no picture"
+        named = ", ".join(missing[:MOST_NAMED]) + (", ..." if len(missing) > MOST_NAMED else "")
+        if len(missing) > most_missing * len(entries):
+            raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
+        logger.warning("%s: %s and are left out: %s", path, counted, named)
+    return found
+
+
+def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any, image: Path) -> CapturedFrame:
     mask = None if entry.get("mask_path") is None else require_file(inside(root, field(entry, "mask_path", str)))
     lens = _read_lens({**content, **entry}, image)
     return CapturedFrame(number, image, mask, lens, _read_pose(entry.get("transform_matrix")))
-
-
-def _find_picture(root: Path, name: str) -> Path:
-    for suffix in SUFFIXES:
-        path = inside(root, name + suffix)
-        if path.is_file():
-            return path
-    raise MissingFile("no such file, with or without .png and .jpg", str(inside(root, name)))
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from completesplat.reports.comparison.cells import LEGEND, Cell, Heading, Notes, Row, Table
 from completesplat.reports.comparison.entries import Entry, described
-from completesplat.reports.sweeps.headline import GROUPS, METRICS, marks, metric
+from completesplat.reports.sweeps.headline import GROUPS, METRICS, SSIM_NOTE, marks, metric
 
 ALIKE = (
     "data_set",
@@ -42,11 +42,11 @@ def own_tables(entries: Sequence[Entry]) -> list[Table]:
 
 
 def protocol_said(protocol: dict[str, Any]) -> str:
-    """What is common to a table's rows, as a sentence."""
+    """What is common to a table's rows, in sentences."""
     said = [f"{key} {protocol[key]}" for key in SAID if protocol.get(key) is not None]
     fingerprint = protocol.get("data_fingerprint")
     said += [f"data fingerprint {str(fingerprint)[:12]}"] if fingerprint else []
-    return f"Measured alike in all rows: {', '.join(said)}."
+    return f"Measured alike in all rows: {', '.join(said)}. {SSIM_NOTE}"
 
 
 def _table(name: str, entries: Sequence[Entry]) -> Table:

@@ -5,6 +5,8 @@ from itertools import product
 
 import torch
 
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import psnr
 from completesplat.reports.sampling.drawing import Artist
@@ -17,8 +19,16 @@ PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
 
 
 def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
-    """All pairs of (skip weight, guidance weight), the paper's three included."""
-    return sorted({*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER})
+    """All pairs of (skip weight, guidance weight), the paper's three included.
+
+    Raises:
+        CompleteSplatError: a weight outside of [0, 1].
+    """
+    pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
+    for skip_weight, guidance_weight in pairs:
+        allowed_skip_weight(skip_weight)
+        check_guidance_weight(guidance_weight)
+    return sorted(pairs)
 
 
 def rows(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from completesplat.reports.sweeps.headline import SSIM_NOTE
 from completesplat.reports.sweeps.jobs import collect
 from completesplat.reports.sweeps.labels import labels
 from completesplat.reports.sweeps.remarks import commands, remarks
@@ -11,7 +12,7 @@ from completesplat.reports.sweeps.rows import rows
 
 CAPTION = (
     "Mean ± sample standard deviation over seeds; PSNR in dB. "
-    "The best of our rows is in bold, the second best underlined."
+    f"The best of our rows is in bold, the second best underlined. {SSIM_NOTE}"
 )
 NOTHING = "No job of this sweep has finished."
 

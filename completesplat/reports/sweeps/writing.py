@@ -8,7 +8,7 @@ from rich.console import Console
 
 from completesplat.export.atomic import atomic_path
 from completesplat.reports.sweeps.chart import plot_summary
-from completesplat.reports.sweeps.headline import columns, figure, group, metric
+from completesplat.reports.sweeps.headline import SSIM_NOTE, columns, figure, group, metric
 from completesplat.reports.sweeps.latex import latex
 from completesplat.reports.sweeps.markdown import markdown
 from completesplat.reports.sweeps.rows import IDENTITY
@@ -29,7 +29,7 @@ def write_summary(folder: Path) -> Summary:
 
 
 def show_summary(summary: Summary) -> None:
-    """Print the headline columns and the remarks."""
+    """Print the headline columns, how SSIM was measured, and the remarks."""
     # No markup: a label may hold brackets. Without a terminal, wide enough for all columns.
     console = Console(width=None if Console().is_terminal else 160, markup=False, highlight=False)
     shown = columns(summary.rows)
@@ -37,7 +37,7 @@ def show_summary(summary: Summary) -> None:
     rows = [row | {column: figure(row, column) for column in shown} for row in summary.rows]
     identity = [("ablation", "ablation", ""), ("seeds", "seeds", ">"), ("scenes", "scenes", ">")]
     console.print(table("Test scenes, mean ± deviation over seeds", [*identity, *headings], rows))
-    for remark in summary.remarks:
+    for remark in (SSIM_NOTE, *summary.remarks):
         console.print(remark)
 
 

@@ -53,7 +53,11 @@ TRANSFORMS = {
     "a scaled pose": (scaled_pose, BadCamera, r"transforms\.json, frame 3: transform_matrix scales by 2;"),
     "a mirrored pose": (mirrored_pose, BadCamera, "frame 3: .* reflection"),
     "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
-    "a missing picture": (of_frame(2, file_path="images/x"), MissingFile, r"images/x, frame 2: no such file, with or"),
+    "hardly any picture": (
+        lambda c: [frame.update(file_path="images/x") for frame in c["frames"][:5]],
+        MissingFile,
+        r"transforms\.json: 5 of 8 frames have no picture, more than most_missing=0\.5: images/x,",
+    ),
     "a picture twice": (of_frame(2, file_path="./images/r_1"), BadAnnotation, "frame 2: the same picture as frame 1"),
     "a picture outside": (
         of_frame(2, file_path="../r_2.png"),
@@ -143,6 +147,7 @@ def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
         ({"transforms": "a", "masks": "c"}, "colmap=FOLDER goes with images=FOLDER"),
         ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
         ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
+        ({"transforms": "a", "most_missing": 1.5}, "most_missing=1.5: must lie between 0 and 1"),
         ({"transforms": "a", "category": None}, "category is needed: give category=NAME"),
         ({"transforms": "a", "category": "a/b"}, "category must be a folder name"),
         ({"transforms": "a", "category": ".."}, "category must be a folder name"),

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
+from completesplat.data.checks import MissingFile
 from completesplat.data.importing import import_capture
 
 LENSES = {
@@ -140,6 +141,57 @@ def test_a_point_cloud_is_taken_over_without_stray_points(captures, tmp_path):
     vertices = PlyData.read(str(category / "in/pointcloud.ply"))["vertex"]
     np.testing.assert_allclose(np.stack([vertices[a] for a in "xyz"], axis=1), captures.POINTS, atol=1e-6)
     assert set(vertices["blue"]) == {30}
+
+
+def write_with_missing(captures, folder, frames, missing):
+    """A capture of so many frames, of which those numbers have no picture; the path of its transforms.json."""
+    poses = captures.opengl_poses(frames).tolist()
+    names = [f"images/r_{number}.jpg" for number in range(frames)]
+    listed = [{"file_path": name, "transform_matrix": pose} for name, pose in zip(names, poses, strict=True)]
+    path = captures.write_transforms(folder, captures.Shot(), frames=listed)
+    for number in set(range(frames)) - set(missing):
+        Image.new("RGB", (210, 150), (number, 0, 0)).save(folder / names[number])
+    return path
+
+
+def test_frames_without_a_picture_are_counted_named_and_left_out(captures, tmp_path, command, caplog):
+    # As instant-ngp's fox: 17 of 67 listed frames have no picture.
+    missing = range(0, 67, 4)
+    path = write_with_missing(captures, tmp_path / "fox", 67, missing)
+    with caplog.at_level(logging.INFO):
+        finished = command("data", "import", f"transforms={path}", f"out={tmp_path / 'out'}", "category=fox")
+    assert finished.status == 0, finished.err
+    named = ", ".join(f"images/r_{number}.jpg" for number in (0, 4, 8, 12, 16))
+    text = caplog.text + finished.out + finished.err
+    assert f"{path}: 17 of 67 frames have no picture and are left out: {named}, ..." in text
+    entries = captures.annotations(tmp_path / "out/fox")
+    kept = [number for number in range(67) if number not in missing]
+    reference = captures.opengl_poses(67)[kept, :3, 3]
+    rotations, translations = (np.array([entry["viewpoint"][key] for entry in entries]) for key in "RT")
+    # Each kept picture keeps its own pose. PyTorch3D: x R + T = 0 in the camera's centre.
+    np.testing.assert_allclose(-np.einsum("nij,nj->ni", rotations, translations), reference, atol=1e-6)
+
+
+@pytest.mark.parametrize("change", [str, lambda name: f"./{name}", lambda name: name.removesuffix(".jpg")])
+def test_nothing_is_said_of_pictures_that_are_there(captures, tmp_path, caplog, change):
+    path = captures.write_transforms(tmp_path / "in", captures.Shot(), ".jpg")
+    captures.edit(path, lambda content: [f.update(file_path=change(f["file_path"])) for f in content["frames"]])
+    with caplog.at_level(logging.WARNING):
+        category = import_capture(tmp_path / "out", "desk", path, progress=False)
+    assert len(captures.annotations(category)) == 8
+    assert caplog.text == ""
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.5, False), (0.49, True), (0.0, True)])
+def test_too_many_frames_without_a_picture_are_refused(captures, tmp_path, share, refused):
+    path = write_with_missing(captures, tmp_path / "in", 20, range(10))
+    if refused:
+        with pytest.raises(MissingFile, match=rf"transforms\.json: 10 of 20 frames .* most_missing={share:g}"):
+            import_capture(tmp_path / "out", "desk", path, most_missing=share, progress=False)
+        assert not list(tmp_path.glob("out/*"))
+    else:
+        category = import_capture(tmp_path / "out", "desk", path, most_missing=share, progress=False)
+        assert len(captures.annotations(category)) == 10
 
 
 def test_the_command_writes_it_and_says_what_comes_next(captures, tmp_path, command, caplog):

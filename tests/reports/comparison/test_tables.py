@@ -8,6 +8,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.reports.comparison.building import tables
 from completesplat.reports.comparison.cells import Table
 from completesplat.reports.comparison.entries import duration
+from completesplat.reports.sweeps.headline import SSIM_NOTE
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
 ROOMS = {"name": "realestate10k_100", "data_set": "realestate10k", "resolution": 128, "image_size": 128, "scenes": 100}
@@ -111,6 +112,11 @@ def test_own_tables_hold_only_what_was_measured_alike(runs, run) -> None:
         run(f"run{index}", 20.0 + index, **change)
     rows = [len(ours(table)) for name, table in made(runs).items() if name.startswith("own_")]
     assert sorted(rows) == [1] * 5 + [2]
+
+
+def test_tables_of_our_own_say_below_how_ssim_counts_the_border(runs, run) -> None:
+    run("a", 20.0)
+    assert any(SSIM_NOTE in line for line in made(runs)["own_1"].below())
 
 
 def test_best_and_second_of_our_own_are_marked_and_naive_predictors_are_not(runs, run) -> None:

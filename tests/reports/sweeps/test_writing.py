@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from completesplat.reports.sweeps.headline import SSIM_NOTE
 from completesplat.reports.sweeps.latex import escape
 from completesplat.reports.sweeps.rows import IDENTITY
 from completesplat.reports.sweeps.summary import summarize
@@ -87,7 +88,7 @@ def test_all_remarks_and_the_command_stand_below_both_tables(ablations, written)
     tex = (ablations.folder / "summary.tex").read_text()
     summary = summarize(ablations.folder)
     assert len(summary.remarks) == 4
-    for said in (*summary.remarks, *summary.commands):
+    for said in (SSIM_NOTE, *summary.remarks, *summary.commands):
         assert said in markdown
         assert escape(said) in tex
 

@@ -1,0 +1,89 @@
+"""What pyproject.toml declares is what is imported, and nothing else."""
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+DISTRIBUTIONS = packages_distributions()
+
+# Why something is declared that nothing imports.
+NEVER_IMPORTED = {
+    "beartype": "checks the types of jaxtyping in all tests (pytest's options)",
+    "hydra-submitit-launcher": "found by hydra: hydra/launcher=submitit_slurm",
+    "ipykernel": "runs the notebooks",
+    "mypy": "a program",
+    "nbclient": "runs the notebooks",
+    "pytest-xdist": "an option of pytest",
+    "ruff": "a program",
+}
+
+
+def normal(name: str) -> str:
+    """The name of a distribution as PyPI compares it (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def declared(lines: Iterable[str]) -> set[str]:
+    return {normal(Requirement(line).name) for line in lines}
+
+
+def modules(path: Path) -> Iterator[str]:
+    """Absolute names of all modules that a file imports, those inside functions included."""
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield node.module or ""
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.importorskip":
+            yield ast.literal_eval(node.args[0])
+
+
+def imported(folder: str) -> dict[str, set[str]]:
+    """The distributions that may be meant by each top-level module of others; of one that is not installed, its name.
+
+    Modules of the configurations' `_target_` are imported as well.
+    """
+    names = {name.split(".")[0] for path in (ROOT / folder).rglob("*.py") for name in modules(path)}
+    if folder == "completesplat":
+        texts = [path.read_text() for path in (ROOT / "conf").rglob("*.yaml")]
+        names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}
+    own = {"completesplat", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
+    others = names - own - set(sys.stdlib_module_names)
+    return {name: {normal(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
+
+
+NEEDED = declared(PROJECT["dependencies"])
+OPTIONAL = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
+DEVELOPERS = declared(EXTRAS["dev"])
+
+
+@pytest.mark.parametrize(
+    ("folder", "allowed"),
+    [("completesplat", NEEDED | OPTIONAL), ("tests", NEEDED | DEVELOPERS)],
+    ids=["package", "tests"],
+)
+def test_everything_imported_is_declared(folder: str, allowed: set[str]) -> None:
+    assert {name: found for name, found in imported(folder).items() if not found & allowed} == {}
+
+
+@pytest.mark.parametrize(
+    ("folder", "there"), [("completesplat", NEEDED | OPTIONAL), ("tests", DEVELOPERS)], ids=["package", "tests"]
+)
+def test_everything_declared_is_imported_or_has_a_reason(folder: str, there: set[str]) -> None:
+    used = set().union(*imported(folder).values(), *imported("completesplat").values())
+    assert there - used - NEVER_IMPORTED.keys() == set()
+
+
+def test_reasons_are_given_for_what_is_declared_and_not_imported_only() -> None:
+    used = set().union(*imported("completesplat").values(), *imported("tests").values())
+    assert NEVER_IMPORTED.keys() <= (NEEDED | OPTIONAL | DEVELOPERS) - used
