@@ -149,7 +149,7 @@ BAD_ENTRIES: dict[str, tuple[str, Edit, type[DataError], str | None, int | None,
     "member_is_text": (SET_LIST, lambda s: s["train"].append("a"), BadAnnotation, None, None, "is expected"),
     "member_of_text": (SET_LIST, lambda s: s["val"].append(["c", "1"]), BadAnnotation, None, None, "is expected"),
     "unknown_sequence": (SET_LIST, lambda s: s["train"].append(["x", 0]), BadAnnotation, "x", 0, "but not annotated"),
-    "unknown_frame": (SET_LIST, lambda s: s["test"].append(["a", 99]), BadAnnotation, "a", 99, "but not annotated"),
+    "unknown_frame": (SET_LIST, lambda s: s["train"].append(["a", 99]), BadAnnotation, "a", 99, "but not annotated"),
     "sequence_not_annotated": (SEQUENCES, lambda e: e[1:], BadAnnotation, "a", None, "not annotated"),
 }  # fmt: skip
 

@@ -168,7 +168,7 @@ OF_ALL: dict[str, tuple[Damage, dict[str, Any], type[CompleteSplatError], str]] 
     "gzip_bomb": (text(SEQUENCES, gzip.compress(b"[" + b" " * 2**27 + b"]")), {}, UnreadableFile, "unpacks to more"),
     "deep_nesting": (text(SEQUENCES, nested(10**5)), {}, UnreadableFile, SEQUENCES),
     "set_list_with_nan": (text(SET_LIST, '{"train": [NaN], "val": [], "test": []}'), {}, UnreadableFile, "NaN"),
-    "set_list_of_another_subset": (lambda c: None, {"subset": "manyview_test"}, DataError, "fewview_train"),
+    "set_list_of_another_subset": (lambda c: None, {"subset": "manyview_test"}, DataError, "fewview_dev"),
     "no_sequences_at_all": (
         emptied,
         {}, DataError, "no train sequences",

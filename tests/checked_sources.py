@@ -32,6 +32,7 @@ class Source:
     bugs: set[str] = field(default_factory=set)
     refused: list[DataError] = field(default_factory=list)
     left_out: dict[str, list[str]] = field(default_factory=dict)
+    listed: int = 0
     at_once: int = 2
     log: Path | None = None
 

@@ -11,7 +11,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 CATEGORY = "things"
-SUBSET = "fewview_train"
+SUBSET = "fewview_dev"
 FRAMES, SEQUENCES, SET_LIST = "frame_annotations.jgz", "sequence_annotations.jgz", f"set_lists/set_lists_{SUBSET}.json"
 # Landscape, so that height and width cannot be mixed up.
 SIZE = (24, 32)
@@ -54,6 +54,25 @@ def pytorch3d_pixels(
     x = (left_border - ndc[:, 0]) / (2 * left_border) * width
     y = (top_border - ndc[:, 1]) / (2 * top_border) * height
     return np.stack([x, y], axis=-1), camera[:, 2]
+
+
+def splatter_image(points: np.ndarray, viewpoints: Sequence[Mapping[str, Any]]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Splatter Image's `data_preprocessing/co3d_normalisation.py`, step by step on PyTorch3D's row vectors.
+
+    Returns:
+        Its camera centres' distances to the world's origin, its points, and its scale.
+    """
+    rotations, translations = (np.array([view[key] for view in viewpoints]) for key in "RT")
+    mean = points.mean(axis=0)
+    points, translations = points - mean, translations + np.einsum("i,nij->nj", mean, rotations)
+    sideways = rotations.transpose(0, 2, 1)[:, 0] - rotations.transpose(0, 2, 1)[:, 0].mean(axis=0)
+    first, up = np.linalg.svd(sideways)[2][[0, 2]]
+    basis = np.stack([first, up, np.cross(first, up)], axis=1)
+    rotations, points = basis.T @ rotations, points @ basis
+    middle = np.array([0, points[:, 1].max() - np.ptp(points[:, 1]) / 2, 0])
+    points, translations = points - middle, translations + np.einsum("i,nij->nj", middle, rotations)
+    factor = 1.2 * 0.95 / (2 * np.abs(points).max())
+    return np.linalg.norm(factor * translations, axis=-1), factor * points, factor
 
 
 def noise(sequence: str, frame: int, size: tuple[int, int] = SIZE) -> np.ndarray:

@@ -65,6 +65,7 @@ class ListedSource:
     content: str = "a"
     refused: list[DataError] = field(default_factory=list)
     left_out: dict[str, list[str]] = field(default_factory=dict)
+    listed: int = 0
     was_read: list[str] = field(default_factory=list)
 
     def read(self, name: str) -> PosedSequence:

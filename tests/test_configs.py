@@ -125,6 +125,13 @@ def test_the_papers_stages(data):
     assert one.data.color_jitter is not None
 
 
+@pytest.mark.parametrize("experiment", ["co3d_var_stage1", "co3d_var_stage2"])
+def test_categories_are_tested_on_sequences_never_seen_with_all_their_frames(experiment):
+    data = compose_config("fit", f"experiment={experiment}", "data.root=x", "model.checkpoint=x").data
+    assert (data.subset, data.allow_shared_sequences) == ("fewview_dev", False)
+    assert (data.validation_targets, data.evaluation_targets) == (8, None)
+
+
 @pytest.mark.parametrize("data", ["co3d", "re10k"])
 def test_the_papers_diffusion(data):
     main = compose_config("fit", f"experiment={data}_diffusion", "data.root=x", *NEEDED)

@@ -33,6 +33,7 @@ def protocol(name: str, module: Any, data: Any, results: dict[str, Any]) -> dict
         **data.describe(),
         "image_size": evaluation.model_size or resolution,
         "resolution": resolution,
+        "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": evaluation.skipped, "views": model["views"]},
         **{"samples": evaluation.samples, "criterion": evaluation.criterion, "seed": evaluation.seed},
         **drawing(module),

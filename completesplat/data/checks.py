@@ -72,6 +72,12 @@ class TooFewFrames(DataError):
     kind = "too few frames"
 
 
+class SharedSequences(DataError):
+    """A list of sequences to train on that names some to test on."""
+
+    kind = "shared sequence"
+
+
 class ChangedFile(DataError):
     """A file that is no longer what its checksum was taken of."""
 

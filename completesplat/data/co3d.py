@@ -19,16 +19,19 @@ class CO3DDataModule(SceneDataModule):
     """Scenes of one category.
 
     Training draws a random reference and random targets of a sequence; validation and test take a sequence's first
-    frame as the reference and its other frames as targets. Needs neither PyTorch3D nor the `co3d` package.
+    frame as the reference and others as targets. Needs neither PyTorch3D nor the `co3d` package.
 
     Args:
         root: folder of the categories, or a prepared category.
         category: a folder below `root`, such as "hydrant".
-        subset: the set list that splits the frames; None, or where there are no set lists at all: split by seed. CO3D's
-            own fewview lists repeat training frames in their test split except `fewview_dev` and `fewview_test`.
-        val_fraction, test_fraction, split_seed: of a split by seed.
+        subset: the set list that splits the frames, which is named after what is tested (Splatter Image:
+            `fewview_dev`); None: split by seed.
+        allow_shared_sequences: take a set list also where it tests on training sequences, as CO3D's `fewview_train`
+            does, and as all do that divide the frames of one sequence (`manyview_...`, an imported capture).
+        val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
-        evaluation_targets: at most this many evenly spaced targets of an evaluation scene; None: all.
+        evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
+        validation_targets: the same of a validation scene; None: as many as of a test scene.
         depth_before, depth_after: the depth range around the object's centre, where the object's half size is 0.57
             (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full pictures).
         **settings: of `SceneDataModule`.
@@ -38,7 +41,8 @@ class CO3DDataModule(SceneDataModule):
         self,
         root: str,
         category: str,
-        subset: str | None = "fewview_train",
+        subset: str | None = "fewview_dev",
+        allow_shared_sequences: bool = False,
         val_fraction: float = 0.05,
         test_fraction: float = 0.1,
         split_seed: int = 0,
@@ -47,6 +51,7 @@ class CO3DDataModule(SceneDataModule):
         min_point_cloud_quality: float | None = None,
         most_training_sequences: int | None = None,
         evaluation_targets: int | None = None,
+        validation_targets: int | None = None,
         depth_before: float = 1.5,
         depth_after: float = 4.0,
         **settings: Any,
@@ -56,19 +61,32 @@ class CO3DDataModule(SceneDataModule):
             raise CompleteSplatError(f"data.min_frames={min_frames}: a scene needs at least 2")
         self.category = category
         self.subset = subset
+        self.allow_shared_sequences = allow_shared_sequences
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
         self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
         self.framing = Framing(self.image_size, depth_before, depth_after)
         self.evaluation_targets = evaluation_targets
+        self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 
-    def describe(self) -> dict[str, str]:
+    def describe(self) -> dict[str, str | None]:
         """See `SceneDataModule`."""
         targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         return {
             "data_set": f"co3d/{self.category}",
+            "subset": self.subset,
+            "split": self._split(),
             "crop": "largest square around the principal point",
             "protocol_views": f"reference: a sequence's first frame; targets: {targets}",
         }
+
+    def _split(self) -> str:
+        """How sequences are divided, in words."""
+        val, test, seed = self.seeded
+        if self.subset is None:
+            return f"by seed {seed}: {val:g} of the sequences for validation, {test:g} for the test"
+        if self.allow_shared_sequences:
+            return "of the set list, shared sequences allowed"
+        return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
     def prepared_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
@@ -77,6 +95,7 @@ class CO3DDataModule(SceneDataModule):
         return {
             "category": self.category,
             "subset": self.subset,
+            "allow_shared_sequences": self.allow_shared_sequences,
             **seeded,
             "split_seed": self.seeded.seed,
             **parts,
@@ -84,7 +103,8 @@ class CO3DDataModule(SceneDataModule):
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
         """All splits: the annotations are read once."""
-        category = read_category(self.root, self.category, self.subset, self.seeded, self.filters)
+        which = self.root, self.category, self.subset
+        category = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
         return {
             name: CO3DSource(members, self.framing, category.files, category.refused)
             for name, members in category.splits.items()
@@ -94,6 +114,7 @@ class CO3DDataModule(SceneDataModule):
         """A random reference and random targets."""
         return training_views(frames, self.targets, rng)
 
-    def evaluation_views(self, sequence: PosedSequence) -> Choice:
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """The first frame as reference, others as targets."""
-        return evaluation_views(len(sequence.frames), self.evaluation_targets)
+        targets = self.validation_targets if split == "val" else self.evaluation_targets
+        return evaluation_views(len(sequence.frames), targets)

@@ -8,7 +8,13 @@ from typing import NamedTuple
 
 from completesplat.data.checks import BadAnnotation, Refuse, inside
 from completesplat.data.co3d_annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
-from completesplat.data.co3d_splits import SeededSplit, read_set_list, set_list_path, split_by_seed
+from completesplat.data.co3d_splits import (
+    SeededSplit,
+    kept_apart,
+    read_set_list,
+    set_list_path,
+    split_by_seed,
+)
 from completesplat.data.sequences import SPLITS
 from completesplat.errors import DataError
 
@@ -32,9 +38,18 @@ class Filters:
 
 @dataclass(frozen=True)
 class SplitMembers:
-    """What one split is made of: frames in order and point clouds by sequence; what was left out, by reason."""
+    """What one split is made of, by sequence.
 
+    Attributes:
+        listed: how many sequences the split has by its list, usable or not.
+        frames: those of the split, in order.
+        captured: all frames of the same sequences, also those of other splits: they tell which way is up.
+        left_out: names of sequences, by reason.
+    """
+
+    listed: int = 0
     frames: dict[str, list[CO3DFrame]] = field(default_factory=dict)
+    captured: dict[str, list[CO3DFrame]] = field(default_factory=dict)
     point_clouds: dict[str, Path | None] = field(default_factory=dict)
     left_out: dict[str, list[str]] = field(default_factory=dict)
 
@@ -47,13 +62,20 @@ class Category(NamedTuple):
     refused: list[DataError]
 
 
-def read_category(root: Path, category: str, subset: str | None, seeded: SeededSplit, filters: Filters) -> Category:
+def read_category(
+    root: Path, category: str, subset: str | None, seeded: SeededSplit, filters: Filters, allow_shared: bool = False
+) -> Category:
     """The sequences of a category, their frames divided as the set list `subset` says, or else by seed.
 
     Frames that the set list does not name are not looked at.
 
+    Args:
+        allow_shared: take the set list as it is, also where a sequence is in several of its parts; else see
+            `kept_apart`.
+
     Raises:
-        DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below `root`.
+        DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
+            `root`; or training sequences are tested.
     """
     folder = inside(root, category)
     if not os.path.isdir(folder):
@@ -61,7 +83,9 @@ def read_category(root: Path, category: str, subset: str | None, seeded: SeededS
     frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
     set_list, refused = set_list_path(folder, subset), list[DataError]()
     refuse: Refuse = refused.append
-    listed = read_set_list(set_list, refuse) if set_list else None
+    listed, lost = read_set_list(set_list, refuse) if set_list else None, list[str]()
+    if set_list and listed is not None and not allow_shared:
+        listed, lost = kept_apart(set_list, listed, seeded)
     wanted = set().union(*listed.values()) if listed is not None else None
     videos = read_videos(root, videos_file, refuse)
     frames = read_frames(root, frames_file, lambda *key: wanted is None or key in wanted, refuse)
@@ -78,6 +102,8 @@ def read_category(root: Path, category: str, subset: str | None, seeded: SeededS
             if number not in frames.get(name, ()) and not {(name, None), (name, number)} & places:
                 refuse(BadAnnotation("the frame is listed, but not annotated", str(set_list), name, number))
     splits = {split: _members(split, listed[split], frames, videos, filters) for split in SPLITS}
+    if lost:
+        splits["val"].left_out["in training too"] = lost
     files = [frames_file, videos_file, *([set_list] if set_list else [])]
     return Category(splits, files, refused)
 
@@ -89,7 +115,7 @@ def _members(
     videos: dict[str, CO3DVideo],
     filters: Filters,
 ) -> SplitMembers:
-    members = SplitMembers()
+    members = SplitMembers(listed=len({name for name, _ in listed}))
     for name, number in sorted(listed):
         if number in frames.get(name, ()):
             members.frames.setdefault(name, []).append(frames[name][number])
@@ -104,7 +130,9 @@ def _members(
         for name in best[most:]:
             members.left_out.setdefault(f"not among the {most} with the best viewpoint quality", []).append(name)
             del members.frames[name]
-    members.point_clouds.update({name: videos[name].point_cloud for name in members.frames})
+    for name in members.frames:
+        members.captured[name] = list(frames[name].values())
+        members.point_clouds[name] = videos[name].point_cloud
     return members
 
 

@@ -21,32 +21,51 @@ DEPTH_QUANTILE = 0.99
 FOREGROUND = 128  # of 255
 # Smaller eigenvalues than this (of at most 1) mean that the optical axes are parallel.
 PARALLEL = 1e-4
+UP = 1
+
+Axes = Float[np.ndarray, "3 3"]
 
 
 class Placement(NamedTuple):
-    """Centre of the object and half its size: the largest distance from the centre along an axis."""
+    """Centre of the object and half its size: the largest distance from the centre along one of the upright axes."""
 
     center: Float[Tensor, "3"]
     half_size: float
 
 
-def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame]) -> Placement:
+def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], captured: Sequence[CO3DFrame]) -> Placement:
     """From the point cloud; without one from the depth maps; without those from the cameras alone.
 
-    Upstream turns the scene upright before it takes the largest coordinate (Splatter Image, `co3d_normalisation.py`).
-    Poses relative to a reference do not see that rotation, save for the axes, so it is left out.
+    Args:
+        frames: whose depth maps and cameras count.
+        captured: all frames of the sequence, which tell the axes.
 
     Raises:
         DataError: what would tell is unreadable, empty, without extent or not finite.
     """
     if point_cloud is not None:
-        return from_point_cloud(point_cloud)
+        return from_point_cloud(point_cloud, upright_axes(captured))
     with_depth = [frame for frame in frames if frame.depth is not None]
-    return from_depth_maps(with_depth) if with_depth else from_cameras(frames)
+    return from_depth_maps(with_depth, upright_axes(captured)) if with_depth else from_cameras(frames)
 
 
-def from_point_cloud(path: Path) -> Placement:
-    """The points' mean, and max |coordinate - mean| (Splatter Image, `co3d_normalisation.py`).
+def upright_axes(frames: Sequence[CO3DFrame]) -> Axes:
+    """The axes of an upright frame in the sequence's world, as columns; the second points up, or down.
+
+    People hold a camera level: its x axis varies least upwards and most along the first of these axes (Splatter Image,
+    `co3d_normalisation.py`).
+    """
+    sideways = torch.stack([frame.camera.world_to_camera[0, :3] for frame in frames]).numpy()
+    sideways = sideways - sideways.mean(axis=0)
+    least, middle, most = np.linalg.eigh(sideways.T @ sideways)[1].T
+    return np.stack([most, least, middle], axis=-1)
+
+
+def from_point_cloud(path: Path, axes: Axes) -> Placement:
+    """As Splatter Image places it (`co3d_normalisation.py`).
+
+    The centre is the points' mean, but upwards the middle between the lowest and the highest; half the size is the
+    largest coordinate from there, along the upright axes.
 
     Raises:
         MissingFile: no such file.
@@ -60,13 +79,14 @@ def from_point_cloud(path: Path) -> Placement:
     except Exception as error:  # The parser raises nearly anything on a damaged file.
         raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
     with at(path):
-        return _placement(points, 1.0, "the point cloud")
+        return _placement(points, axes, 1.0, "the point cloud")
 
 
-def from_depth_maps(frames: Sequence[CO3DFrame]) -> Placement:
+def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
     """From what up to 8 evenly spaced depth maps show of the foreground, as if that were the point cloud.
 
-    Depth maps have outliers: of |coordinate - mean| the 99 % quantile counts instead of the maximum.
+    Depth maps have outliers: the 99 % quantile counts instead of the largest value, and the 1 % quantile instead of
+    the smallest.
 
     Raises:
         DataError: a depth map or a mask is missing or unreadable.
@@ -77,7 +97,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame]) -> Placement:
     for frame in chosen:
         with at(frame=frame.number):
             points.append(_foreground(frame))
-    return _placement(np.concatenate(points), DEPTH_QUANTILE, "the depth maps' foreground")
+    return _placement(np.concatenate(points), axes, DEPTH_QUANTILE, "the depth maps' foreground")
 
 
 def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
@@ -120,9 +140,14 @@ def _foreground(frame: CO3DFrame) -> np.ndarray:
     return unproject(frame.camera, pixels, depth[known].double()).numpy()
 
 
-def _placement(points: np.ndarray, quantile: float, what: str) -> Placement:
-    center = points.mean(axis=0) if len(points) else np.full(3, np.nan)
-    half_size = float(np.quantile(np.abs(points - center), quantile, axis=0).max()) if len(points) else np.nan
-    if not (np.isfinite(half_size) and half_size > 0):
-        raise BadPlacement(f"{what} is empty, without extent or not finite")
-    return Placement(torch.from_numpy(center), half_size)
+def _placement(points: np.ndarray, axes: Axes, quantile: float, what: str) -> Placement:
+    if not len(points) or not np.isfinite(points).all():
+        raise BadPlacement(f"{what} is empty or not finite")
+    mean = points.mean(axis=0)
+    upright = (points - mean) @ axes
+    middle = np.quantile(upright[:, UP], [1 - quantile, quantile]).mean()
+    upright[:, UP] -= middle
+    half_size = float(np.quantile(np.abs(upright), quantile, axis=0).max())
+    if not half_size > 0:
+        raise BadPlacement(f"{what} is without extent")
+    return Placement(torch.from_numpy(mean + middle * axes[:, UP]), half_size)

@@ -21,7 +21,7 @@ from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, crop_resize, transform_points
 from completesplat.tensors import stack
 
-# Half the object's size after scaling (Splatter Image: 1.2 * 0.95 / 2).
+# The object's half size (see `Placement`) after scaling (Splatter Image: 1.2 * 0.95 / 2).
 OBJECT_HALF_SIZE = 0.57
 SMALLEST_NEAR = 0.1
 # Cameras that stay within this share of their distance to the object show nothing but one view of it.
@@ -50,9 +50,11 @@ class CO3DSource:
     ) -> None:
         self.names = sorted(members.frames)
         self.left_out = members.left_out
+        self.listed = members.listed
         self.refused = refused
         self.framing = framing
         self._frames = members.frames
+        self._captured = members.captured
         self._point_clouds = members.point_clouds
         self._files = files
         self._sequences: dict[str, PosedSequence] = {}
@@ -81,7 +83,7 @@ class CO3DSource:
 
     def _make(self, name: str) -> PosedSequence:
         frames, size = self._frames[name], self.framing.image_size
-        placement = object_placement(self._point_clouds[name], frames)
+        placement = object_placement(self._point_clouds[name], frames, self._captured[name])
         factor = OBJECT_HALF_SIZE / placement.half_size
         cameras = stack([_cropped(frame, size) for frame in frames])
         cameras = cameras.scale_world(torch.tensor(factor, dtype=torch.float64))

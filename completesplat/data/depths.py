@@ -21,5 +21,5 @@ def evaluation_depths(data: SceneDataModule, split: str, name: str) -> Float[Ten
     sequence = data.source(split).read(name)
     if sequence.read_depth is None:
         return None
-    reference, targets = data.evaluation_views(sequence)
+    reference, targets = data.evaluation_views(sequence, split)
     return torch.stack([sequence.read_depth(view) for view in (reference, *targets)])

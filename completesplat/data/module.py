@@ -107,8 +107,8 @@ class SceneDataModule(LightningDataModule):
         """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
 
     @abstractmethod
-    def describe(self) -> dict[str, str]:
-        """For results: "data_set", and how pictures are cut ("crop") and views chosen ("protocol_views")."""
+    def describe(self) -> Mapping[str, str | None]:
+        """For results: "data_set", "crop" of pictures, "protocol_views"; "subset" and "split" where there are lists."""
 
     @abstractmethod
     def open(self, split: str) -> Mapping[str, SequenceSource]:
@@ -123,8 +123,8 @@ class SceneDataModule(LightningDataModule):
         """Reference and targets of a training scene."""
 
     @abstractmethod
-    def evaluation_views(self, sequence: PosedSequence) -> Choice:
-        """Reference and targets of a scene of validation or test.
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """Reference and targets of a scene of "val" or "test".
 
         Raises:
             DataError: the sequence has not got the frames that are asked for.
@@ -221,7 +221,7 @@ class SceneDataModule(LightningDataModule):
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        scenes = EvaluationScenes(self.store(split), self.evaluation_views)
+        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split))
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)

@@ -116,7 +116,7 @@ class RE10KDataModule(SceneDataModule):
         """A random reference and random targets near it."""
         return nearby_views(frames, self.targets, *self.gaps, rng)
 
-    def evaluation_views(self, sequence: PosedSequence) -> Choice:
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """The views of the evaluation index; without one, the first frame and some that follow it."""
         if self._test_views is None or sequence.name not in self._test_views:
             return evaluation_views_within(len(sequence.frames), *self.evaluation)

@@ -60,6 +60,7 @@ class RE10KSource:
         self.names = names
         self.refused: list[DataError] = clips.refused
         self.left_out = {"frames are missing": clips.missing} if clips.missing else {}
+        self.listed = len(names) + len(clips.missing)
         self.framing = framing
         self._clips = clips
 

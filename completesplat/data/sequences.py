@@ -49,11 +49,13 @@ class SequenceSource(Protocol):
         names: of the sequences that can be read, as far as listing them showed.
         refused: what listing them found broken.
         left_out: names that were left out although nothing is broken, by reason.
+        listed: how many sequences the data set has for this split, usable or not.
     """
 
     names: list[str]
     refused: list[DataError]
     left_out: dict[str, list[str]]
+    listed: int
 
     def read(self, name: str) -> PosedSequence:
         """One sequence: its cameras now, its pictures when asked for.

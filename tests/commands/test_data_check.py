@@ -140,6 +140,7 @@ def checked(command, root: Path, out: Path) -> tuple[Any, Any]:
         "data=co3d_category",
         f"data.root={root}",
         "data.category=toy_objects",
+        "data.subset=fewview_train",
         "data.image_size=16",
         "workers=1",
     ]
@@ -199,3 +200,16 @@ def test_a_set_that_cannot_be_opened_is_reported_as_well(command, intact, tmp_pa
     assert finished.status == 1
     (entry,) = found["refused"]
     assert entry["file"].endswith(SEQUENCES)
+
+
+def test_sequences_that_are_trained_on_and_tested_are_reported(command, intact, tmp_path):
+    root = tmp_path / "data" / "set"
+    shutil.copytree(intact, root)
+    Copy(root / "toy_objects").edit(SET_LIST, lambda lists: lists["test"].extend(lists["train"][:6]))
+    finished, found = checked(command, root, tmp_path / "out")
+    assert finished.status == 1
+    (refused,) = found["refused"]
+    assert refused["file"] == str(root / "toy_objects" / SET_LIST)
+    assert "2 sequences" in refused["reason"]
+    assert found["counts"] == {"shared sequence": 1}
+    assert "shared sequence" in finished.out

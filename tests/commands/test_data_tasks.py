@@ -98,5 +98,6 @@ def test_an_imported_capture_can_be_shown(command, tmp_path):
     assert imported.status == 0
     assert (tmp_path / "out/thing/frame_annotations.jgz").is_file()
     settings = ["data=co3d_category", f"data.root={tmp_path / 'out'}", "data.category=thing", "data.subset=imported"]
+    settings += ["data.allow_shared_sequences=true"]
     assert command("data", "show", *settings, "data.image_size=12", f"out={tmp_path / 'show'}").status == 0
     assert (tmp_path / "show/show.png").is_file()

@@ -86,6 +86,8 @@ def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path
     assert (described["skip_weight"], described["guidance_weight"], described["seed"]) == (1.0, 0.5, 3)
     assert (described["image_size"], described["resolution"]) == (32, 32)
     assert (described["scenes"], described["views"], described["skipped"]) == (model["scenes"], model["views"], 0)
+    assert (described["scenes_listed"], described["subset"]) == (model["scenes"], "fewview_train")
+    assert described["split"].startswith("of the set list")
     assert described["checkpoint"]["sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     assert described["ema"] is True  # stage 2 averages its weights
     ssim = described["metrics"]["ssim"]

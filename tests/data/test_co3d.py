@@ -5,23 +5,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, write_tree
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, change, write_tree
 from lightning import LightningModule, Trainer
 from PIL import Image
 from plyfile import PlyData
 
 from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.co3d_category import Filters, SplitMembers, read_category
-from completesplat.data.co3d_placement import from_point_cloud
+from completesplat.data.co3d_placement import object_placement
 from completesplat.data.co3d_splits import SeededSplit
 from completesplat.data.toy import write_objects
+from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
 
 
 def module(root: Path, **settings) -> CO3DDataModule:
-    data = CO3DDataModule(str(root), "toy_objects", **{"image_size": 16, "batch_size": 2, "targets": 2, **settings})
+    defaults = {"subset": SUBSET, "image_size": 16, "batch_size": 2, "targets": 2}
+    data = CO3DDataModule(str(root), "toy_objects", **defaults | settings)
     data.setup()
     return data
 
@@ -77,18 +79,18 @@ def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
     seen = scene(module(toy_root, depth_before=1.0, depth_after=2.0), "test", 0, 0, [1, 2, 3])
     ((name, frames),) = members(toy_root, "test").frames.items()
     cloud = toy_root / "toy_objects" / name / "pointcloud.ply"
-    center, half_size = from_point_cloud(cloud)
+    center, half_size = object_placement(cloud, frames, frames)
     factor = 0.57 / half_size
     vertices = PlyData.read(str(cloud))["vertex"]
     points = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
-    assert np.abs(points - center.numpy()).max() * factor == pytest.approx(0.57)
+    assert 0.57 <= np.linalg.norm(points - center.numpy(), axis=-1).max() * factor <= 0.57 * 3**0.5
     pose = frames[0].camera.world_to_camera.numpy()
     local = torch.from_numpy((points @ pose[:3, :3].T + pose[:3, 3]) * factor).float()
     for view in range(3):
         pixels = project(seen.targets.cameras[view], local)[0].long()
         mask = seen.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]]
         assert (mask > 0).float().mean() > 0.97
-    middle = local.mean(dim=0)[2].item()
+    middle = (pose[2, :3] @ center.numpy() + pose[2, 3]) * factor
     assert seen.depth_range.tolist() == pytest.approx([middle - 1, middle + 2], abs=1e-4)
     assert 1.8 < middle < 2.4
 
@@ -142,8 +144,15 @@ def test_evaluation_goes_from_the_first_frame_to_all_others(toy_root):
     assert batch.targets.images.shape[1] == 1
 
 
+def test_validation_shows_fewer_targets_than_the_test_where_asked(toy_root):
+    data = module(toy_root, validation_targets=2)
+    assert [batch.targets.images.shape[1] for batch in (*data.val_dataloader(), *data.test_dataloader())] == [2, 3]
+    same = module(toy_root, evaluation_targets=1)
+    assert [batch.targets.images.shape[1] for batch in (*same.val_dataloader(), *same.test_dataloader())] == [1, 1]
+
+
 def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
-    write_tree(tmp_path, {"a": 4, "b": 3, "c": 4}, {"train": ["c"], "val": ["a", "c"], "test": ["a", "b"]})
+    write_tree(tmp_path, dict(zip("abcd", (4, 3, 4, 4), strict=True)), {"train": "d", "val": "ac", "test": "ab"})
     data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, evaluation_batch_size=2)
     assert [batch.targets.images.shape[:2] for batch in data.test_dataloader()] == [(1, 3), (1, 2)]
     assert [batch.targets.images.shape[:2] for batch in data.val_dataloader()] == [(2, 3)]
@@ -199,7 +208,7 @@ def test_mean_image_is_the_mean_of_the_training_frames(toy_root):
 
 def test_an_empty_split_is_refused_where_it_is_needed(tmp_path):
     write_objects(tmp_path, scenes=1, frames=2, size=8, seed=0, workers=1, progress=False)
-    data = CO3DDataModule(str(tmp_path), "toy_objects")
+    data = CO3DDataModule(str(tmp_path), "toy_objects", subset=SUBSET)
     for stage, split in (("fit", "val"), ("validate", "val"), ("test", "test")):
         with pytest.raises(DataError, match=f"no {split} sequences") as caught:
             data.setup(stage)

@@ -25,7 +25,7 @@ from co3d_trees import (
 from completesplat.data.checks import BadCamera, OutsidePath
 from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.co3d_category import Category, Filters, read_category
-from completesplat.data.co3d_placement import from_depth_maps
+from completesplat.data.co3d_placement import from_depth_maps, upright_axes
 from completesplat.data.co3d_splits import SeededSplit
 from completesplat.errors import CompleteSplatError, DataError
 
@@ -45,7 +45,7 @@ def annotate(
 
 
 def read(root: Path, subset: str | None = SUBSET, rule: SeededSplit | None = None, **filters) -> Category:
-    return read_category(root, CATEGORY, subset, rule or SeededSplit(0.2, 0.3, 0), Filters(**filters))
+    return read_category(root, CATEGORY, subset, rule or SeededSplit(0.2, 0.3, 0), Filters(**filters), True)
 
 
 def names(category: Category) -> dict[str, set[str]]:
@@ -69,14 +69,14 @@ def test_frames_come_in_order_whatever_the_file_says(tmp_path):
     assert category.splits["train"].frames["a"][0].camera.image_size == (24, 32)
 
 
-def test_without_set_lists_whole_sequences_are_split_by_seed(tmp_path):
+def test_whole_sequences_are_split_by_seed(tmp_path):
     annotate(tmp_path, many(60))
-    category = read(tmp_path)
+    category = read(tmp_path, subset=None)
     taken = names(category)
     assert taken["train"] | taken["val"] | taken["test"] == set(many(60))
     assert sum(map(len, taken.values())) == 60
     assert all(len(frames) == 2 for split in SPLITS for frames in category.splits[split].frames.values())
-    assert taken != names(read(tmp_path, rule=SeededSplit(0.2, 0.3, 1)))
+    assert taken != names(read(tmp_path, subset=None, rule=SeededSplit(0.2, 0.3, 1)))
     assert taken == names(read(tmp_path, subset=None))
 
 
@@ -84,7 +84,7 @@ def test_without_set_lists_whole_sequences_are_split_by_seed(tmp_path):
 def test_a_split_by_seed_holds_out_the_asked_shares(tmp_path, val, test):
     """Within four standard deviations of a binomial share."""
     annotate(tmp_path, many(400))
-    taken = names(read(tmp_path, rule=SeededSplit(val, test, 0)))
+    taken = names(read(tmp_path, subset=None, rule=SeededSplit(val, test, 0)))
     for split, share in (("val", val), ("test", test)):
         assert abs(len(taken[split]) - 400 * share) < 4 * math.sqrt(400 * share * (1 - share))
 
@@ -92,7 +92,7 @@ def test_a_split_by_seed_holds_out_the_asked_shares(tmp_path, val, test):
 def test_sequences_stay_in_their_split_when_others_come(tmp_path):
     annotate(tmp_path / "few", many(40))
     annotate(tmp_path / "more", many(100))
-    few, more = names(read(tmp_path / "few")), names(read(tmp_path / "more"))
+    few, more = names(read(tmp_path / "few", subset=None)), names(read(tmp_path / "more", subset=None))
     assert all(few[split] == more[split] & set(many(40)) for split in SPLITS)
     assert all(few.values())
 
@@ -101,18 +101,18 @@ def test_sequences_stay_in_their_split_when_others_come(tmp_path):
 def test_fewer_than_three_sequences_cannot_be_split(tmp_path, count):
     annotate(tmp_path, many(count))
     with pytest.raises(DataError, match=f"{count} sequences cannot be split"):
-        read(tmp_path)
+        read(tmp_path, subset=None)
 
 
 def test_three_sequences_are_one_for_each_split(tmp_path):
     annotate(tmp_path, many(3))
-    assert [len(taken) for taken in names(read(tmp_path, rule=SeededSplit(0, 0, 0))).values()] == [1, 1, 1]
+    assert [len(taken) for taken in names(read(tmp_path, None, SeededSplit(0, 0, 0))).values()] == [1, 1, 1]
 
 
 def test_a_split_by_seed_without_training_sequences_is_refused(tmp_path):
     annotate(tmp_path, many(5))
     with pytest.raises(DataError, match=r"no training sequences with val_fraction=0\.6, test_fraction=0\.4"):
-        read(tmp_path, rule=SeededSplit(0.6, 0.4, 0))
+        read(tmp_path, subset=None, rule=SeededSplit(0.6, 0.4, 0))
 
 
 def test_null_splits_by_seed_where_there_are_set_lists(tmp_path):
@@ -124,7 +124,7 @@ def test_null_splits_by_seed_where_there_are_set_lists(tmp_path):
 def test_an_unknown_subset_is_refused_with_those_that_are_there(tmp_path):
     annotate(tmp_path, many(3), {"train": list(many(3)), "val": [], "test": []})
     (tmp_path / CATEGORY / "set_lists/set_lists_manyview_dev_0.json").write_text("{}")
-    with pytest.raises(DataError, match=r"'other'.*fewview_train, manyview_dev_0") as caught:
+    with pytest.raises(DataError, match=r"'other'.*fewview_dev, manyview_dev_0") as caught:
         read(tmp_path, subset="other")
     assert caught.value.file == str(tmp_path / CATEGORY / "set_lists")
 
@@ -136,7 +136,8 @@ def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
     listed = {split: [["one", i, f"{CATEGORY}/one/images/x"] for i in part] for split, part in parts.items()}
     (category / "set_lists").mkdir()
     (category / "set_lists/set_lists_manyview_dev_0.json").write_text(json.dumps(listed))
-    data = CO3DDataModule(str(tmp_path), CATEGORY, subset="manyview_dev_0", image_size=8, on_bad="raise")
+    which = {"subset": "manyview_dev_0", "allow_shared_sequences": True}
+    data = CO3DDataModule(str(tmp_path), CATEGORY, **which, image_size=8, on_bad="raise")
     data.setup("fit")
     data.setup("test")
     assert {s: {n: data.source(s).read(n).frames for n in data.source(s).names} for s in SPLITS} == {
@@ -226,8 +227,10 @@ def test_sequences_without_a_cloud_are_placed_by_their_depth_maps(tmp_path):
     change(category / SEQUENCES, lambda entries: entries[0].update(point_cloud=None))
     data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, on_bad="raise", depth_before=0.5, depth_after=0.7)
     frames = read(tmp_path).splits["train"].frames["a"]
-    distance = 4 * 0.57 / from_depth_maps(frames).half_size
+    placement = from_depth_maps(frames, upright_axes(frames))
+    factor = 0.57 / placement.half_size
+    depths = [(frame.camera.world_to_camera[2, :3] @ placement.center + 4).item() * factor for frame in frames]
     sequence = data.source("train").read("a")
-    np.testing.assert_allclose(sequence.cameras.centers.norm(dim=-1), distance)
-    np.testing.assert_allclose(sequence.depth_ranges, [[distance - 0.5, distance + 0.7]] * 6, rtol=1e-6)
-    assert from_depth_maps(frames).half_size < 4 * 10 / 36
+    np.testing.assert_allclose(sequence.cameras.centers.norm(dim=-1), 4 * factor)
+    np.testing.assert_allclose(sequence.depth_ranges, [[depth - 0.5, depth + 0.7] for depth in depths], rtol=1e-6)
+    assert placement.half_size < 4 * 10 / 36

@@ -12,6 +12,7 @@ from co3d_trees import (
     orbit,
     pytorch3d_pixels,
     sequence_entry,
+    splatter_image,
     write_annotations,
     write_cloud,
 )
@@ -22,7 +23,8 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
 
-CENTER, HALF_SIZE = np.array([5.0, -3.0, 2.0]), 2.5
+CENTER = np.array([5.0, -3.0, 2.0])
+CLOUD = CENTER + 2.5 * np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
 POINT = CENTER + np.array([0.35, 0.5, -0.3])
 FRAMES = 5
 SPREAD = 3.0  # of the blob, in pixels of the files
@@ -62,8 +64,7 @@ def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[
             Image.fromarray(pixels).save(root / entry["image"]["path"])
             Image.fromarray(pixels[..., 0]).save(root / entry["mask"]["path"])
             entries.append({**entry, "depth": None})
-        cube = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
-        write_cloud(root / CATEGORY / name / "pointcloud.ply", CENTER + HALF_SIZE * cube)
+        write_cloud(root / CATEGORY / name / "pointcloud.ply", CLOUD)
     write_annotations(root, entries, [sequence_entry(n) for n in "abc"], {"train": "a", "val": "b", "test": "c"})
 
 
@@ -74,10 +75,10 @@ def centroid(values: Tensor) -> Tensor:
     return torch.stack([(weights.sum(0) * x).sum(), (weights.sum(1) * y).sum()]) / weights.sum()
 
 
-def point_in_reference(viewpoint: dict, is_mirrored: bool) -> Tensor:
+def point_in_reference(viewpoint: dict, is_mirrored: bool, scale: float) -> Tensor:
     """The point [1 3] as the reference's camera sees it (+x right, +y down), at the common scale."""
     left, up, forward = POINT @ np.array(viewpoint["R"]) + viewpoint["T"]
-    seen = np.array([left if is_mirrored else -left, -up, forward]) * 0.57 / HALF_SIZE
+    seen = np.array([left if is_mirrored else -left, -up, forward]) * scale
     return torch.tensor(seen[None], dtype=torch.float32)
 
 
@@ -104,8 +105,9 @@ def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_poin
     for batch in [*training, *evaluation]:
         views, (name,) = batch.all_views(), batch.names
         number = round(255 / 40 * batch.reference.images[0, 1].mean().item())
-        viewpoint = viewpoints(name, layout, PRINCIPAL_POINTS[principal_point])[number]
-        pixels, depth = project(views.cameras[0], point_in_reference(viewpoint, mirrored(batch)))
+        around = viewpoints(name, layout, PRINCIPAL_POINTS[principal_point])
+        _, _, scale = splatter_image(CLOUD, around)
+        pixels, depth = project(views.cameras[0], point_in_reference(around[number], mirrored(batch), scale))
         for seen in (views.images[0, :, 0], views.masks[0, :, 0]):
             assert max((centroid(one) - pixel).norm() for one, pixel in zip(seen, pixels[:, 0], strict=True)) < 0.1
         assert batch.depth_range[0, 0] < depth[0] < batch.depth_range[0, 1]

@@ -9,10 +9,13 @@ from plyfile import PlyData
 
 from completesplat.data import co3d_depth
 from completesplat.data.co3d_annotations import CO3DFrame, DepthMap
-from completesplat.data.co3d_placement import from_point_cloud
+from completesplat.data.co3d_category import Filters, read_category
+from completesplat.data.co3d_placement import object_placement
 from completesplat.data.co3d_source import OBJECT_HALF_SIZE
+from completesplat.data.co3d_splits import SeededSplit
 from completesplat.data.depths import evaluation_depths
 from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.data.toy.objects import SUBSET
 from completesplat.data.transforms import Square
 from completesplat.geometry.cameras import Cameras, pinhole, project
 
@@ -31,7 +34,9 @@ def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
     file = toy_root / "toy_objects" / name / "pointcloud.ply"
     vertices = PlyData.read(str(file))["vertex"]
     points = torch.stack([torch.from_numpy(vertices[axis].copy()).double() for axis in "xyz"], dim=-1)
-    points = points * OBJECT_HALF_SIZE / from_point_cloud(file).half_size
+    category = read_category(toy_root, "toy_objects", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+    frames = category.splits["test"].frames[name]
+    points = points * OBJECT_HALF_SIZE / object_placement(file, frames, frames).half_size
     for view in range(4):
         pixels, z = project(sequence.cameras[view], points)
         columns, rows = pixels.long().clamp(0, 31).unbind(-1)

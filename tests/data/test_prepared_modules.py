@@ -12,6 +12,7 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.module import SceneDataModule
 from completesplat.data.prepared.writing import prepare
 from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
 
@@ -19,7 +20,8 @@ SPLITS = ("train", "val", "test")
 
 
 def objects(root: Path, **settings) -> CO3DDataModule:
-    return CO3DDataModule(str(root), "toy_objects", **{"image_size": 16, "batch_size": 2, "targets": 2} | settings)
+    defaults = {"subset": SUBSET, "image_size": 16, "batch_size": 2, "targets": 2}
+    return CO3DDataModule(str(root), "toy_objects", **defaults | settings)
 
 
 def clips(root: Path, **settings) -> RE10KDataModule:

@@ -284,7 +284,7 @@ FIRST = ["splits", "train", "shards", 0]
 @pytest.mark.parametrize(
     ("edit", "kind"),
     [
-        (set_at(["format"], 2), UnreadableFile),
+        (set_at(["format"], 1), UnreadableFile),
         (set_at(["format"], "1"), BadAnnotation),
         (set_at(["codec"], None), BadAnnotation),
         (set_at(["settings"], []), BadAnnotation),
@@ -293,6 +293,7 @@ FIRST = ["splits", "train", "shards", 0]
         (set_at(["splits", "train"], []), BadAnnotation),
         (set_at(["splits", "train", "names"], ["s3"]), BadAnnotation),
         (set_at(["splits", "train", "names", 0], 3), BadAnnotation),
+        (set_at(["splits", "train", "listed"], None), BadAnnotation),
         (set_at(["splits", "train", "left_out"], {"x": "1"}), BadAnnotation),
         (set_at(["splits", "train", "refused"], [{}]), BadAnnotation),
         (set_at([*FIRST, "file"], "../secret.arrow"), OutsidePath),

@@ -10,6 +10,7 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.prepared.writing import prepare
 from completesplat.data.scenes import TrainingScenes
 from completesplat.data.toy import write_objects
+from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch
 
@@ -18,7 +19,7 @@ SPLITS = ("train", "val", "test")
 
 def module(root: Path, **settings) -> CO3DDataModule:
     defaults = {"image_size": 8, "batch_size": 2, "targets": 1, "references_per_sequence": 2, "streaming": True}
-    return CO3DDataModule(str(root), "toy_objects", **defaults | settings)
+    return CO3DDataModule(str(root), "toy_objects", SUBSET, **defaults | settings)
 
 
 @pytest.fixture(scope="module")

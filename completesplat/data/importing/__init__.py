@@ -122,7 +122,9 @@ def _report(folder: Path, sequence: str, written: Written) -> None:
     )
     logger.info("point cloud: %s", f"{written.points} points" if written.points else "none")
     root = shlex.quote(f"data.root={folder.parent}")
-    data = f"data=co3d_category {root} data.category={folder.name} data.subset={SUBSET}"
+    # A capture is one sequence, some of whose frames are held out.
+    lists = f"data.subset={SUBSET} data.allow_shared_sequences=true"
+    data = f"data=co3d_category {root} data.category={folder.name} {lists}"
     logger.info("to look at it:  completesplat data show %s", data)
     logger.info(
         "to train on it: completesplat fit experiment=toy_var %s data.batch_size=8 data.references_per_sequence=64",

@@ -19,7 +19,7 @@ from completesplat.data.checks import (
 )
 from completesplat.errors import DataError
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"
 
 Scalar = str | int | float | bool | None
@@ -54,9 +54,15 @@ class Shard:
 
 @dataclass(frozen=True)
 class Split:
-    """The part of a store that one source was made into; `names` are in the order of the source."""
+    """The part of a store that one source was made into.
+
+    Attributes:
+        listed: how many sequences the source's list has, usable or not.
+        names: those that are here, in the order of the source.
+    """
 
     fingerprint: str
+    listed: int
     names: tuple[str, ...]
     shards: tuple[Shard, ...]
     refused: tuple[Refusal, ...]
@@ -174,5 +180,10 @@ def _split(root: Path, entry: dict[str, Any]) -> Split:
     refused = tuple(refusal_from_json(refusal) for refusal in field(entry, "refused", list))
     left_out = field(entry, "left_out", dict)
     return Split(
-        field(entry, "fingerprint", str), names, shards, refused, {key: field(left_out, key, int) for key in left_out}
+        field(entry, "fingerprint", str),
+        field(entry, "listed", int),
+        names,
+        shards,
+        refused,
+        {key: field(left_out, key, int) for key in left_out},
     )

@@ -32,6 +32,7 @@ class PreparedSource:
         self.names = list(entry.names)
         self.refused: list[DataError] = []
         self.left_out: dict[str, list[str]] = {}
+        self.listed = entry.listed
         self._fingerprint = entry.fingerprint
         self._places = {
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)

@@ -195,6 +195,7 @@ def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
     refused = [Refusal.of(error) for error in source.refused]
     return Split(
         source.fingerprint(),
+        source.listed,
         tuple(name for name in source.names if name in there),
         tuple(record.shard for record in records),
         (*refused, *(refusal for record in records for refusal in record.refused)),

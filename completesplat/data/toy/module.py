@@ -1,5 +1,6 @@
 """Toy objects and rooms as data modules that make their own data."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.prepared.manifest import is_prepared
 from completesplat.data.realestate10k import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.objects import CATEGORY, write_objects
+from completesplat.data.toy.objects import CATEGORY, SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
 
 
@@ -19,6 +20,7 @@ class ToyObjectsDataModule(CO3DDataModule):
     Args:
         root: where the scenes are, or will be.
         scenes, frames, data_seed: what to make where there is nothing yet.
+        subset: see `CO3DDataModule`; the only one that is written.
         depth_before: see `CO3DDataModule`; closer than there, as in `conf/data/toy_objects.yaml`: a model knows the
             depth range that it was trained with.
         **reading: settings of `CO3DDataModule`.
@@ -30,15 +32,16 @@ class ToyObjectsDataModule(CO3DDataModule):
         scenes: int = 400,
         frames: int = 24,
         data_seed: int = 0,
+        subset: str | None = SUBSET,
         depth_before: float = 1.0,
         **reading: Any,
     ) -> None:
-        super().__init__(root, CATEGORY, depth_before=depth_before, **reading)
+        super().__init__(root, CATEGORY, subset, depth_before=depth_before, **reading)
         self.scenes = scenes
         self.frames = frames
         self.data_seed = data_seed
 
-    def describe(self) -> dict[str, str]:
+    def describe(self) -> dict[str, str | None]:
         """See `SceneDataModule`."""
         return super().describe() | {"data_set": CATEGORY}
 
@@ -54,7 +57,8 @@ class ToyObjectsDataModule(CO3DDataModule):
             DataError: the files are not the toy objects as they were written, or none is of the test split.
         """
         store = self.store("test")
-        return ToyHiddenModes(self.root, store, self.evaluation_views, self.image_size, views, spread_views)
+        choose = partial(self.evaluation_views, split="test")
+        return ToyHiddenModes(self.root, store, choose, self.image_size, views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):

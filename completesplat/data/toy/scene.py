@@ -1,7 +1,8 @@
 """Draws one toy scene: an object, its surroundings, a hidden patch and an orbit of cameras.
 
-Lengths are chosen so that the object's point cloud, centred on its mean, reaches 0.57 along some axis (the scale that
-the CO3D reader brings every scene to); cameras circle at about 2.1, the dome stands at 3.5.
+Lengths are chosen so that the object's point cloud, centred on its mean, reaches 0.57 along some axis; cameras circle
+at about 2.1, the dome stands at 3.5. The CO3D reader, which turns and centres the cloud anew, brings scenes to 1.00 to
+1.14 times that size (40 scenes, median 1.04).
 """
 
 from dataclasses import dataclass

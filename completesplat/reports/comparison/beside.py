@@ -45,20 +45,27 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
 def belongs(table: PublishedTable, entry: Entry) -> bool:
     """Whether an entry was measured as the table's figures were.
 
-    It was tested by one of the table's protocols on one of its data sets, no scene was skipped, and resolution and,
-    where the table states it, number of scenes are those of a published row. A best of k belongs where the paper has
-    one of equally many samples; what has seen the views that it is scored on belongs nowhere.
+    It was tested by one of the table's protocols on one of its data sets and on the table's list of sequences, no scene
+    was skipped, and resolution and number of scenes are those of a published row; where the table states no number,
+    they are all scenes of the list. A best of k belongs where the paper has one of equally many samples; what has seen
+    the views that it is scored on belongs nowhere.
     """
     protocol = entry.run.protocol
     if protocol.get("name") not in table.evaluations:
         return False
     if protocol["data_set"] not in table.data_sets() or protocol.get("skipped") or entry.upper_bound:
         return False
+    if table.subset and protocol.get("subset") != table.subset:
+        return False
     if entry.predictor == BEST_OF_K and protocol.get("samples") != table.oracle_samples:
         return False
     own = {"scenes": str(protocol["scenes"]), "resolution": str(protocol["resolution"])}
+    unstated = {"scenes": str(protocol.get("scenes_listed"))}
     return any(
-        all(own[key] == value.replace(",", "") for key, value in _size(table, row).items() if value)
+        all(
+            own[key] == (value.replace(",", "") or unstated.get(key, own[key]))
+            for key, value in _size(table, row).items()
+        )
         for row in table.rows
     )
 

@@ -15,10 +15,13 @@ DESCRIBED = [
     *(
         "name",
         "data_set",
+        "subset",
+        "split",
         "image_size",
         "resolution",
         "crop",
         "scenes",
+        "scenes_listed",
         "skipped",
         "views",
         "protocol_views",

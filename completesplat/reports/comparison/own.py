@@ -10,6 +10,8 @@ from completesplat.reports.sweeps.headline import GROUPS, METRICS, SSIM_NOTE, ma
 
 ALIKE = (
     "data_set",
+    "subset",
+    "split",
     "name",
     "resolution",
     "scenes",
@@ -21,7 +23,7 @@ ALIKE = (
     "metrics",
 )
 """What the protocols of a table's rows have in common."""
-SAID = ("resolution", "scenes", "skipped", "views", "protocol_views", "crop")
+SAID = ("subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "crop")
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
 IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]

@@ -24,6 +24,7 @@ class RepeatedSource:
 
     def __post_init__(self) -> None:
         self.names = [f"{number:06d}" for number in range(self.count)]
+        self.listed = self.count
 
     def read(self, name: str) -> PosedSequence:
         """A sequence of the other source under this name."""

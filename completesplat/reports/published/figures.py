@@ -46,6 +46,8 @@ class PublishedTable:
     """The protocols (`conf/evaluation/`) by which a run of ours is measured as these figures are."""
     resolution: str
     """Of all rows; empty where each row states its own."""
+    subset: str
+    """The list of sequences that the figures are taken to be of; empty where there is one list only."""
     oracle_samples: int | None
     """Of the row "k-best oracle"; None where there is no such row."""
     legend: Mapping[str, str]
@@ -94,6 +96,7 @@ def _table(entry: dict[str, Any]) -> PublishedTable:
     return PublishedTable(
         **given,
         resolution=entry.get("resolution", ""),
+        subset=entry.get("subset", ""),
         oracle_samples=entry.get("oracle_samples"),
         legend={mark: entry[mark] for mark in ("dagger", "star") if mark in entry},
         columns=columns,

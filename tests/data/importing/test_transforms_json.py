@@ -202,7 +202,9 @@ def test_the_command_writes_it_and_says_what_comes_next(captures, tmp_path, comm
     assert finished.status == 0, finished.err
     assert (tmp_path / "out/desk/kitchen_table/images/frame000001.png").is_file()
     text = caplog.text + finished.out + finished.err
-    assert f"data.root={tmp_path / 'out'} data.category=desk data.subset=imported" in text
+    assert (
+        f"data.root={tmp_path / 'out'} data.category=desk data.subset=imported data.allow_shared_sequences=true" in text
+    )
     assert "8 copied as they are" in text
     lists = json.loads((tmp_path / "out/desk/set_lists/set_lists_imported.json").read_text())
     assert [entry[1] for entry in lists["test"]] == [0, 4]

@@ -11,6 +11,7 @@ from completesplat.reports.comparison.entries import duration
 from completesplat.reports.sweeps.headline import SSIM_NOTE
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
+HYDRANTS |= {"subset": "fewview_dev", "scenes_listed": 77}
 ROOMS = {"name": "realestate10k_100", "data_set": "realestate10k", "resolution": 128, "image_size": 128, "scenes": 100}
 PAPERS = ["full_images", "realestate10k", "ablations", "objects_only"]
 
@@ -57,6 +58,11 @@ def test_a_run_by_the_papers_protocol_stands_below_its_rows_in_its_own_columns(r
         {"resolution": 256},
         {"skipped": 3},
         {"data_set": "co3d/apple"},
+        {"subset": "fewview_train"},
+        {"subset": None},
+        {"scenes": 76},
+        {"scenes_listed": 78},
+        {"scenes_listed": None},
         {"data_set": "toy_objects"},
         ROOMS | {"scenes": 99},
         ROOMS | {"resolution": 256},

@@ -15,7 +15,8 @@ ENVIRONMENT = re.compile(r"\\(begin|end)\{(\w+\*?)\}")
 
 @pytest.fixture
 def written(runs, run, tmp_path):
-    run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128)
+    whole = {"subset": "fewview_dev", "scenes_listed": 20}
+    run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%", 20.0)
     found = tables(runs)[0]
     write_tables(found, tmp_path / "out")

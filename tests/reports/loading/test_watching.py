@@ -58,5 +58,5 @@ def test_the_decoders_are_there(path: str) -> None:
 
 
 def test_decoding_is_part_of_reading(toy_root) -> None:
-    data = CO3DDataModule(str(toy_root), "toy_objects", image_size=16, batch_size=2)
+    data = CO3DDataModule(str(toy_root), "toy_objects", "fewview_train", image_size=16, batch_size=2)
     assert 0 < decoding_share(data.train_dataloader()) < 1
