@@ -130,9 +130,9 @@ class SceneDataModule(LightningDataModule):
             DataError: the sequence has not got the frames that are asked for.
         """
 
-    def evaluated_names(self, split: str, names: list[str]) -> list[str]:
+    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
         """Of the sequences of a split those that are used."""
-        return names
+        return source
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Whether all evaluation scenes have the same number of targets."""
@@ -174,14 +174,14 @@ class SceneDataModule(LightningDataModule):
         """
         if split not in self._stores:
             source = self.source(split)
-            names = self.evaluated_names(split, source.names)
-            if not names:
+            used = self.evaluated(split, source)
+            if not used.names:
                 raise DataError(f"no {split} sequences that can be used", str(self.root))
             left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
             logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-            self._stores[split] = SceneStore(source, names, self.mask_threshold, self.cache)
+            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache)
         return self._stores[split]
 
     @cached_property

@@ -39,15 +39,17 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
             rows.append(Row("ours", cells))
     marks = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
     remarks = [f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, [*remarks, *marks, LEGEND, VIEWS], notes)
+    remarks += [*marks, LEGEND, VIEWS, *table.remarks]
+    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
 def belongs(table: PublishedTable, entry: Entry) -> bool:
     """Whether an entry was measured as the table's figures were.
 
     It was tested by one of the table's protocols on one of its data sets, no scene was skipped, and resolution and,
-    where the table states it, number of scenes are those of a published row. A best of k belongs where the paper has
-    one of equally many samples; what has seen the views that it is scored on belongs nowhere.
+    where the table states it, number of scenes are those of a published row, or that number is a complete run's. A
+    best of k belongs where the paper has one of equally many samples; what has seen the views that it is scored on
+    belongs nowhere.
     """
     protocol = entry.run.protocol
     if protocol.get("name") not in table.evaluations:
@@ -57,10 +59,9 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     if entry.predictor == BEST_OF_K and protocol.get("samples") != table.oracle_samples:
         return False
     own = {"scenes": str(protocol["scenes"]), "resolution": str(protocol["resolution"])}
-    return any(
-        all(own[key] == value.replace(",", "") for key, value in _size(table, row).items() if value)
-        for row in table.rows
-    )
+    sizes = [_size(table, row) for row in table.rows]
+    sizes += [size | {"scenes": table.complete[size["scenes"]]} for size in sizes if size["scenes"] in table.complete]
+    return any(all(own[key] == value.replace(",", "") for key, value in size.items() if value) for size in sizes)
 
 
 def _size(table: PublishedTable, row: Sequence[Figure]) -> dict[str, str]:
