@@ -93,12 +93,12 @@ class SceneDataModule(LightningDataModule):
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
-        self.workers = workers
-        self.cache = cache
-        self.streaming = streaming
+        self.workers, self.cache, self.streaming = workers, cache, streaming
         self.encoded = None if encoded is None else Path(encoded)
         self.policy = on_bad, most_bad
         self.seed = seed
+        # The same data in the smaller pictures that a tested model sees.
+        self.at_model_size: SceneDataModule | None = None
         self._sources: dict[str, SequenceSource] = {}
         self._stores: dict[str, SceneStore] = {}
 
@@ -221,7 +221,8 @@ class SceneDataModule(LightningDataModule):
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        scenes = EvaluationScenes(self.store(split), self.evaluation_views)
+        seen = self.at_model_size and self.at_model_size.store(split)
+        scenes = EvaluationScenes(self.store(split), self.evaluation_views, seen=seen)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)

@@ -18,6 +18,7 @@ DESCRIBED = [
         "image_size",
         "resolution",
         "crop",
+        "precision",
         "scenes",
         "skipped",
         "views",

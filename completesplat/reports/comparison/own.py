@@ -17,11 +17,12 @@ ALIKE = (
     "views",
     "protocol_views",
     "crop",
+    "precision",
     "data_fingerprint",
     "metrics",
 )
 """What the protocols of a table's rows have in common."""
-SAID = ("resolution", "scenes", "skipped", "views", "protocol_views", "crop")
+SAID = ("resolution", "scenes", "skipped", "views", "protocol_views", "crop", "precision")
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
 IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]
