@@ -221,7 +221,7 @@ class SceneDataModule(LightningDataModule):
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        seen = self.at_model_size and self.at_model_size.store(split)
+        seen = None if self.at_model_size is None else self.at_model_size.store(split)
         scenes = EvaluationScenes(self.store(split), self.evaluation_views, seen=seen)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
