@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.geometry.cameras import Cameras
 from completesplat.tensors import TensorDataclass
 
 
@@ -18,11 +18,6 @@ class Views(TensorDataclass):
     cameras: Cameras
     masks: Float[Tensor, "*batch 1 height width"]
 
-    def resized(self, size: int) -> "Views":
-        """The same in smaller square pictures, each pixel the mean of those that it covers."""
-        cameras = crop_resize(self.cameras, 0, 0, self.cameras.image_size[1], size)
-        return Views(_shrunk(self.images, size), cameras, _shrunk(self.masks, size))
-
 
 @dataclass(frozen=True)
 class SceneBatch(TensorDataclass):
@@ -31,7 +26,8 @@ class SceneBatch(TensorDataclass):
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
     `visible` is 1 where the conditioning may see the reference picture, 0 within the boxes of masked diffusion.
-    `names` are sequences, `reference_frame` the reference's place in its sequence.
+    `names` are sequences, `reference_frame` the reference's place in its sequence. `seen` are the same scenes in the
+    smaller pictures that a model sees whose renders are compared with these; None: it sees these.
     """
 
     reference: Views
@@ -40,17 +36,12 @@ class SceneBatch(TensorDataclass):
     visible: Float[Tensor, "*batch 1 height width"]
     reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
+    seen: "SceneBatch | None" = None
 
     def __getitem__(self, index: int | slice) -> "SceneBatch":
         """One scene of a batch, or some of them."""
-        return replace(super().__getitem__(index), names=self.names[index])
-
-    def resized(self, size: int) -> "SceneBatch":
-        """The same scenes in smaller pictures, each pixel the mean of those that it covers."""
-        visible = _shrunk(self.visible, size).floor()  # what is partly hidden is hidden
-        return replace(
-            self, reference=self.reference.resized(size), targets=self.targets.resized(size), visible=visible
-        )
+        seen = None if self.seen is None else self.seen[index]
+        return replace(super().__getitem__(index), names=self.names[index], seen=seen)
 
     def all_views(self) -> Views:
         """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
@@ -89,8 +80,3 @@ class EncodedScene(TensorDataclass):
 
 def _prepend(one: Tensor, many: Tensor, axis: int) -> Tensor:
     return torch.cat([one.unsqueeze(axis), many], dim=axis)
-
-
-def _shrunk(images: Float[Tensor, "*batch channel _ _"], size: int) -> Float[Tensor, "*batch channel _ _"]:
-    shrunk = torch.nn.functional.adaptive_avg_pool2d(images.reshape(-1, *images.shape[-3:]), size)
-    return shrunk.view(*images.shape[:-2], size, size)

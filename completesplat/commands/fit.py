@@ -1,5 +1,6 @@
 """`completesplat fit`: train one stage, then score it."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,10 @@ def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     from hydra.utils import instantiate
     from lightning import seed_everything
-    from lightning.pytorch.callbacks import WeightAveraging
 
     from completesplat.commands import quieten
     from completesplat.commands.protocol import protocol
+    from completesplat.commands.scoring import scored_data, set_scoring
     from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
@@ -24,8 +25,11 @@ def run(config: Any, out: Path) -> None:
     checkpoint = checkpoint_to_continue(config, out)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
+    # What cannot be scored is refused now, not after the training.
+    tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     module = instantiate(config.model, _convert_="all")
-    module.evaluation = instantiate(config.evaluation.scoring, _convert_="all")
+    if tested is not None:
+        set_scoring(module, config.evaluation)
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
@@ -33,18 +37,19 @@ def run(config: Any, out: Path) -> None:
         show(parameter_table(module))
     with finished(loggers):
         shown = begin(module, trainer, config, out)
-        metrics = _train_and_test(trainer, module, data, checkpoint, config.test)
+        metrics = _train(trainer, module, data, checkpoint)
+        if tested is not None:
+            metrics |= _test(config, module, tested)
         for logger in loggers:  # a run shorter than the logging interval leaves its figures too
             logger.log_metrics(metrics, step=trainer.global_step)
             logger.save()
-        scores = module.test_results() if config.test else None
+        scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:
             return
         results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
-            ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)
-            described = protocol(config.evaluation.name, module, data, scores) | {"ema": ema}
+            described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
         _write(results, out / "metrics.json")
         if scores is not None:
@@ -78,18 +83,38 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
     return path
 
 
-def _train_and_test(trainer: Any, module: Any, data: Any, checkpoint: str | None, test: bool) -> dict[str, float]:
-    """Everything that was logged, in the end; a model that has nothing to learn beforehand is scored at once."""
-    metrics: dict[str, Any] = {}
-    if any(parameter.requires_grad for parameter in module.parameters()):
-        try:
-            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-        except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
-            raise KeyboardInterrupt from stop
-        metrics |= trainer.callback_metrics
-    steps = trainer.global_step
-    if test:
-        trainer.test(module, datamodule=data, verbose=False)
-        metrics |= trainer.callback_metrics
-    assert trainer.global_step == steps
-    return {name: value.item() for name, value in metrics.items()}
+def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict[str, float]:
+    """Everything that was logged, in the end; a model that has nothing to learn beforehand is not trained."""
+    if not any(parameter.requires_grad for parameter in module.parameters()):
+        return {}
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
+        raise KeyboardInterrupt from stop
+    return {name: value.item() for name, value in trainer.callback_metrics.items()}
+
+
+def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
+    """Score as `completesplat test` does; everything that was logged."""
+    from hydra.utils import instantiate
+
+    from completesplat.commands.scoring import scoring_trainer
+
+    progress = instantiate(config.callbacks.progress, _convert_="all")
+    callbacks = [] if progress is None else [progress]
+    trainer = scoring_trainer(config, callbacks=callbacks, logger=False, enable_checkpointing=False)
+    trainer.test(module, datamodule=data, verbose=False)
+    return {name: value.item() for name, value in trainer.callback_metrics.items()}
+
+
+def _facts(trainer: Any, out: Path) -> dict[str, Any]:
+    """Which weights were scored: those of the last checkpoint, if any was written."""
+    from lightning.pytorch.callbacks import WeightAveraging
+
+    from completesplat.commands.protocol import checkpoint_facts
+
+    last = out / "checkpoints" / "last.ckpt"
+    facts = checkpoint_facts(last) if last.is_file() else {}
+    if facts.get("checkpoint", {}).get("step") == trainer.global_step:
+        return facts
+    return {"checkpoint": None, "ema": any(isinstance(callback, WeightAveraging) for callback in trainer.callbacks)}

@@ -16,23 +16,23 @@ METRICS: dict[str, dict[str, Any]] = {
 }
 
 
-def protocol(name: str, module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
+def protocol(asked: Any, module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
     """The statement that stands beside the results of a test.
 
     Args:
-        name: of the protocol.
+        asked: the configuration of the protocol (`conf/evaluation/`).
         results: of the module's test.
     """
     from completesplat.reports.machine import machine
 
     evaluation, model = module.evaluation, results["model"]
-    resolution = data.image_size
     described = {
-        "name": name,
+        "name": asked.name,
         "method": module.method,
         **data.describe(),
-        "image_size": evaluation.model_size or resolution,
-        "resolution": resolution,
+        "image_size": (data.at_model_size or data).image_size,
+        "resolution": data.image_size,
+        "precision": asked.precision,
         "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": evaluation.skipped, "views": model["views"]},
         **{"samples": evaluation.samples, "criterion": evaluation.criterion, "seed": evaluation.seed},

@@ -13,12 +13,12 @@ def evaluation_depths(data: SceneDataModule, split: str, name: str) -> Float[Ten
     None where the data set has no depth, or only the pictures of it were prepared.
 
     Args:
-        name: of the sequence.
+        name: of the scene.
 
     Raises:
         DataError: a depth map cannot be read.
     """
-    sequence = data.source(split).read(name)
+    sequence = data.store(split).source.read(name)
     if sequence.read_depth is None:
         return None
     reference, targets = data.evaluation_views(sequence, split)

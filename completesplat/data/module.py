@@ -93,12 +93,12 @@ class SceneDataModule(LightningDataModule):
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
-        self.workers = workers
-        self.cache = cache
-        self.streaming = streaming
+        self.workers, self.cache, self.streaming = workers, cache, streaming
         self.encoded = None if encoded is None else Path(encoded)
         self.policy = on_bad, most_bad
         self.seed = seed
+        # The same data in the smaller pictures that a tested model sees.
+        self.at_model_size: SceneDataModule | None = None
         self._sources: dict[str, SequenceSource] = {}
         self._stores: dict[str, SceneStore] = {}
 
@@ -130,9 +130,9 @@ class SceneDataModule(LightningDataModule):
             DataError: the sequence has not got the frames that are asked for.
         """
 
-    def evaluated_names(self, split: str, names: list[str]) -> list[str]:
+    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
         """Of the sequences of a split those that are used."""
-        return names
+        return source
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Whether all evaluation scenes have the same number of targets."""
@@ -174,14 +174,14 @@ class SceneDataModule(LightningDataModule):
         """
         if split not in self._stores:
             source = self.source(split)
-            names = self.evaluated_names(split, source.names)
-            if not names:
+            used = self.evaluated(split, source)
+            if not used.names:
                 raise DataError(f"no {split} sequences that can be used", str(self.root))
             left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
             logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-            self._stores[split] = SceneStore(source, names, self.mask_threshold, self.cache)
+            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache)
         return self._stores[split]
 
     @cached_property
@@ -221,7 +221,8 @@ class SceneDataModule(LightningDataModule):
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
-        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split))
+        seen = None if self.at_model_size is None else self.at_model_size.store(split)
+        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split), seen=seen)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)

@@ -1,23 +1,29 @@
 """RealEstate10K (Zhou et al., SIGGRAPH 2018) as a data module."""
 
-import logging
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from completesplat.data.checks import BadAnnotation
+from completesplat.data.checks import BadAnnotation, require_file
 from completesplat.data.module import SceneDataModule
-from completesplat.data.realestate10k_evaluation import choose_clips
+from completesplat.data.realestate10k_evaluation import (
+    ChosenSource,
+    EvaluationIndex,
+    choose_clips,
+    log_choice,
+    read_index,
+    read_keys,
+)
 from completesplat.data.realestate10k_source import CROPS, Framing, RE10KSource, open_clips
 from completesplat.data.scenes import Choice, EvaluationScenes
-from completesplat.data.sequences import PosedSequence
+from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.splits import split_by_hash
 from completesplat.data.view_selection import evaluation_views_within, nearby_views
 from completesplat.errors import CompleteSplatError
-
-logger = logging.getLogger(__name__)
+from completesplat.weights_files import sha256_of
 
 
 class RE10KDataModule(SceneDataModule):
@@ -31,7 +37,8 @@ class RE10KDataModule(SceneDataModule):
         min_gap, max_gap: frames between the reference and a training target, either way (Flash3D: at most 30).
         evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and so many
             evenly spaced targets among the next `evaluation_gap` frames.
-        evaluation_index: pixelSplat's file of test views, instead of that rule.
+        evaluation_index: a file of test views, instead of that rule: in the format of pixelSplat, MVSplat360,
+            latentSplat or Flash3D (`read_index`).
         scene_list: a file with the keys of the clips to test, one a line.
         crop: "center": the largest central square (DFM); "principal": the largest one around the principal point.
         near, far: depth range in the clips' units (DFM, `data_io/realestate10k.py:55-56`; not stated by the paper).
@@ -71,16 +78,28 @@ class RE10KDataModule(SceneDataModule):
         self.framing = Framing(self.image_size, crop, scale, near, far)
         self.val_fraction = val_fraction
         self.val_seed = val_seed
-        self._test_views: dict[str, tuple[int, list[int]]] | None = None
+        self._test_views: dict[str, Choice] | None = None
+
+    @cached_property
+    def index(self) -> EvaluationIndex | None:
+        """The content of `evaluation_index`.
+
+        Raises:
+            DataError: it is missing or malformed.
+        """
+        return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
-        """See `SceneDataModule`."""
+        """See `SceneDataModule`; a list that decides is named, with the work whose format it has and its checksum."""
         count, gap = self.evaluation
         views = f"reference: first frame; {count} targets within {gap} frames"
+        if self.index is not None:
+            views = f"those of {_identity(self.evaluation_index, self.index.form)}"
+        listed = "" if self.scene_list is None else f"; scenes of {_identity(self.scene_list)}"
         return {
             "data_set": "realestate10k",
             "crop": f"largest square, {self.framing.crop}",
-            "protocol_views": views if self.evaluation_index is None else "those of the evaluation index",
+            "protocol_views": views + listed,
         }
 
     def prepared_settings(self) -> dict[str, Any]:
@@ -97,15 +116,15 @@ class RE10KDataModule(SceneDataModule):
         # Both read through the same two chunks.
         return {"train": RE10KSource(clips, train, self.framing), "val": RE10KSource(clips, val, self.framing)}
 
-    def evaluated_names(self, split: str, names: list[str]) -> list[str]:
+    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
         """Of the test clips those that the evaluation index and the list of scenes name."""
         if split != "test":
-            return names
-        chosen = choose_clips(names, self.evaluation_index, self.scene_list)
+            return source
+        listed = None if self.scene_list is None else read_keys(self.scene_list)
+        chosen = choose_clips(source.names, self.index, listed)
+        log_choice(chosen)
         self._test_views = chosen.views
-        counts = ", ".join(f"{count} {reason}" for reason, count in chosen.left_out.items())
-        logger.info("%d clips to test%s", len(chosen.keys), f"; left out: {counts}" if counts else "")
-        return chosen.keys
+        return ChosenSource(source, chosen)
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Known from the evaluation index; reading all clips for it would take hours."""
@@ -126,3 +145,9 @@ class RE10KDataModule(SceneDataModule):
             if frame not in position:
                 raise BadAnnotation("the frame is in the evaluation index, not in the data", None, sequence.name, frame)
         return position[reference], [position[frame] for frame in targets]
+
+
+def _identity(path: Path | None, *said: str) -> str:
+    """A file's name and content, wherever it lies."""
+    assert path is not None
+    return f"{path.name} ({', '.join([*said, f'SHA-256 {sha256_of(require_file(path))[:12]}'])})"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -160,14 +161,20 @@ class EvaluationScenes(Dataset[Loaded]):
     Args:
         choose: sequence -> views. Raises `DataError` where it has not got them.
         names: the sequences; None: all.
+        seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
     """
 
     def __init__(
-        self, store: SceneStore, choose: Callable[[PosedSequence], Choice], names: Sequence[str] | None = None
+        self,
+        store: SceneStore,
+        choose: Callable[[PosedSequence], Choice],
+        names: Sequence[str] | None = None,
+        seen: SceneStore | None = None,
     ) -> None:
         self.store = store
         self.choose = choose
         self.names = store.names if names is None else names
+        self.seen = seen
 
     def __len__(self) -> int:
         return len(self.names)
@@ -177,13 +184,17 @@ class EvaluationScenes(Dataset[Loaded]):
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
         own = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, own)
+        return EvaluationScenes(self.store, self.choose, own, self.seen)
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]
         try:
             sequence = self.store.source.read(name)
-            return Loaded(self.store.scene(sequence, *self.choose(sequence)), ())
+            views = self.choose(sequence)
+            scene = self.store.scene(sequence, *views)
+            if self.seen is not None:
+                scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
+            return Loaded(scene, ())
         except DataError as error:
             return Loaded(None, (error,))
 

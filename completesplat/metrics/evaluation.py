@@ -45,8 +45,6 @@ class Evaluation:
             (the one that is best by `criterion`, an oracle, since it takes the truth to choose it) and `mean_of_k`.
         criterion: metric by which the best is chosen: mean of the novel views, all pixels.
         seed: of what is drawn; each scene has its own, which depends on its name only besides.
-        model_size: side of the pictures that the model sees, where it is smaller than that of the pictures that its
-            renders are compared with, after they are upsampled (bilinear); None: the same.
         perceptual: LPIPS, or why it is missing.
         sets: metrics of whole sets of images, of the novel views; or why they are missing, by name.
     """
@@ -56,7 +54,6 @@ class Evaluation:
         samples: int = 1,
         criterion: str = "psnr",
         seed: int = 0,
-        model_size: int | None = None,
         perceptual: ImageMetric | Missing | None = None,
         sets: Mapping[str, SetMetric | Missing | None] | None = None,
     ) -> None:
@@ -73,7 +70,7 @@ class Evaluation:
         if criterion not in self.metrics:
             said = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
             raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {said}")
-        self.samples, self.criterion, self.seed, self.model_size = samples, criterion, seed, model_size
+        self.samples, self.criterion, self.seed = samples, criterion, seed
         self.set_metrics = present
         self.reset()
 

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.depths import evaluation_depths
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.evaluation import DepthViews, Evaluation
@@ -122,15 +122,13 @@ class SceneModule(LightningModule):
         self.log("val/psnr_novel", values.mean(), prog_bar=True, batch_size=len(images))
 
     def on_test_start(self) -> None:
-        if self.evaluation.samples > 1 and not self.draws_samples:
-            raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
         self.evaluation.reset()
         self.timings = Timings()
         self.mean_image = self.trainer.datamodule.mean_image()  # type: ignore[attr-defined]
 
     def test_step(self, scenes: SceneBatch, index: int) -> None:
         evaluation, names = self.evaluation, scenes.names
-        seen = scenes if evaluation.model_size is None else scenes.resized(evaluation.model_size)
+        seen = scenes if scenes.seen is None else scenes.seen
         seeds = [evaluation.scene_seed(name) for name in names]
         gaussians = self.timings.of("inference", lambda: self.draw(seen, seeds, evaluation.samples), len(names))
         truth, cameras = scenes.all_views(), seen.all_views().cameras

@@ -2,6 +2,7 @@ import csv
 
 import pytest
 import torch
+from lightning import Trainer
 from omegaconf import OmegaConf
 from support import SMALL, strict_json
 
@@ -81,3 +82,50 @@ def test_weights_of_another_architecture_are_refused(command, pipeline, tmp_path
     )  # fmt: skip
     assert finished.status == 2
     assert "weights of another architecture" in finished.err.splitlines()[-1]
+
+
+SCORED = ["evaluation.resolution=48", "+evaluation.data.evaluation_targets=1", "seed=4"]
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_a_fit_scores_what_a_test_of_its_checkpoint_scores(command, pipeline, tmp_path, stage):
+    """In the test's precision, with the protocol's changes to the data, and at its resolution."""
+    fit = ["trainer.precision=bf16-mixed", "trainer.max_steps=1", f"data.root={pipeline.toy}", "sampler.steps=2"]
+    if stage == "diffusion":
+        fit += [f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"]
+    run = tmp_path / "run"
+    trained = command("fit", f"experiment=toy_{stage}", *SMALL, *fit, *SCORED, f"out={run}")
+    assert trained.status == 0, trained.err
+    checkpoint = run / "checkpoints/last.ckpt"
+    tested = command("test", f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}")
+    assert tested.status == 0, tested.err
+    ours, theirs = strict_json(run / "metrics.json")["test"], strict_json(tmp_path / "scores/metrics.json")
+    for scores in (ours, theirs):
+        assert scores["protocol"].pop("command").startswith("completesplat ")
+        scores["protocol"]["machine"].pop("date", None)
+        assert scores["model"].pop("seconds").keys() == {"inference", "rendering"}
+    assert ours == theirs
+    assert ours["protocol"]["precision"] == "32-true"
+    assert (ours["protocol"]["image_size"], ours["protocol"]["resolution"]) == (32, 48)
+    assert ours["model"]["views"] == ours["model"]["scenes"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["evaluation=realestate10k_256", "evaluation.evaluation_index=FILE"], "have no setting evaluation_index"),
+        (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
+        (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores pictures only"),
+        (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
+        (["evaluation.scoring.samples=2"], "draws no samples"),
+    ],
+)
+def test_a_protocol_that_does_not_fit_is_refused_before_training(
+    command, pipeline, tmp_path, monkeypatch, arguments, said
+):
+    monkeypatch.setattr(Trainer, "fit", lambda *_, **__: pytest.fail("it trained"))
+    finished = command(
+        "fit", "experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, *arguments, f"out={tmp_path / 'run'}"
+    )
+    assert finished.status == 2
+    assert said in finished.err.splitlines()[-1]

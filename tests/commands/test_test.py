@@ -2,11 +2,15 @@ import hashlib
 import shutil
 
 import pytest
+import torch
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from support import strict_json
 
+from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.reports.sweeps.headline import SSIM_NOTE
+from completesplat.training.scene_module import SceneModule
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
@@ -117,11 +121,41 @@ def test_the_best_of_several_samples_stands_beside_one_and_the_mean(command, pip
     assert metrics["protocol"]["samples"] == 3
 
 
-def test_a_larger_size_is_reached_by_upsampling(command, pipeline, tmp_path):
-    checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    assert command("test", f"ckpt={checkpoint}", "evaluation.resolution=48", f"out={tmp_path}").status == 0
+def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pictures_it_was_trained_on(
+    command, pipeline, tmp_path, monkeypatch
+):
+    shown = []
+    draw = SceneModule.draw
+
+    def watched(self, scenes, *others):
+        shown.append(scenes)
+        return draw(self, scenes, *others)
+
+    monkeypatch.setattr(SceneModule, "draw", watched)
+    root = tmp_path / "larger"  # its pictures are larger than both sizes
+    write_objects(root, scenes=4, frames=3, size=96, seed=0, workers=1, progress=False)
+    checkpoint, change = pipeline.var / "checkpoints/last.ckpt", f"overrides=['data.root={root}']"
+    assert command("test", f"ckpt={checkpoint}", "evaluation.resolution=48", change, f"out={tmp_path}").status == 0
     described = strict_json(tmp_path / "metrics.json")["protocol"]
     assert (described["image_size"], described["resolution"]) == (32, 48)
+    config = OmegaConf.load(pipeline.var / "config.yaml")
+    config.data.root = str(root)
+    trained_on = list(instantiate(config.data, _convert_="all").test_dataloader())
+    assert [scenes.names for scenes in shown] == [scenes.names for scenes in trained_on]
+    for ours, theirs in zip(shown, trained_on, strict=True):
+        ours, theirs = ours.all_views(), theirs.all_views()
+        assert torch.equal(ours.images, theirs.images)
+        assert torch.equal(ours.cameras.intrinsics, theirs.cameras.intrinsics)
+
+
+def test_prepared_pictures_have_one_size(command, pipeline, tmp_path):
+    settings = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32"]
+    assert command("data", "prepare", *settings, f"out={tmp_path / 'prepared'}").status == 0
+    change = f"overrides=['data.root={tmp_path / 'prepared'}']"
+    checkpoint = pipeline.var / "checkpoints/last.ckpt"
+    finished = command("test", f"ckpt={checkpoint}", change, "evaluation.resolution=48", f"out={tmp_path / 'out'}")
+    assert finished.status == 2
+    assert "evaluation.resolution=48: prepared pictures have one size" in finished.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

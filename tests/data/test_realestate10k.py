@@ -142,6 +142,16 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
     assert sorted(batch.names) == sorted(clip.key for clip in TEST)
 
 
+def test_a_model_sees_pictures_made_as_its_training_pictures_were_whatever_size_is_scored(root):
+    small, large = module(root, image_size=8), module(root, image_size=HEIGHT)
+    expected = list(module(root, image_size=HEIGHT).test_dataloader())
+    large.at_model_size = small
+    for batch, truth, seen in zip(large.test_dataloader(), expected, small.test_dataloader(), strict=True):
+        assert same(batch, truth)
+        assert same(batch.seen, seen)
+        assert same(batch[0].seen, seen[0])
+
+
 def test_the_evaluation_index_decides(root, tmp_path, caplog):
     views = {"test0": {"context": [2, 7], "target": [3, 5]}, "test1": None, "gone": {"context": [0, 1], "target": [0]}}
     views |= {key: {"context": [0, 5], "target": [1, 2]} for key in ("test2", "test3")}

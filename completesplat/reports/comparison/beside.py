@@ -39,7 +39,8 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
             rows.append(Row("ours", cells))
     marks = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
     remarks = [f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."]
-    return Table(table.name, f"{table.place}: {table.title}", headings, rows, [*remarks, *marks, LEGEND, VIEWS], notes)
+    remarks += [*marks, LEGEND, VIEWS, *table.remarks]
+    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
 def belongs(table: PublishedTable, entry: Entry) -> bool:
@@ -47,8 +48,8 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
 
     It was tested by one of the table's protocols on one of its data sets and on the table's list of sequences, no scene
     was skipped, and resolution and number of scenes are those of a published row; where the table states no number,
-    they are all scenes of the list. A best of k belongs where the paper has one of equally many samples; what has seen
-    the views that it is scored on belongs nowhere.
+    they are all scenes of the list, and some numbers stand for those of a complete run. A best of k belongs where the
+    paper has one of equally many samples; what has seen the views that it is scored on belongs nowhere.
     """
     protocol = entry.run.protocol
     if protocol.get("name") not in table.evaluations:
@@ -61,12 +62,11 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
         return False
     own = {"scenes": str(protocol["scenes"]), "resolution": str(protocol["resolution"])}
     unstated = {"scenes": str(protocol.get("scenes_listed"))}
+    sizes = [_size(table, row) for row in table.rows]
+    sizes += [size | {"scenes": table.complete[size["scenes"]]} for size in sizes if size["scenes"] in table.complete]
     return any(
-        all(
-            own[key] == (value.replace(",", "") or unstated.get(key, own[key]))
-            for key, value in _size(table, row).items()
-        )
-        for row in table.rows
+        all(own[key] == (value.replace(",", "") or unstated.get(key, own[key])) for key, value in size.items())
+        for size in sizes
     )
 
 

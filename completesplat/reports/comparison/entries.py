@@ -20,6 +20,7 @@ DESCRIBED = [
         "image_size",
         "resolution",
         "crop",
+        "precision",
         "scenes",
         "scenes_listed",
         "skipped",

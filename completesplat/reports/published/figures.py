@@ -55,6 +55,10 @@ class PublishedTable:
     says: list[str]
     columns: list[Column]
     rows: list[list[Figure]]
+    complete: Mapping[str, str]
+    """How many scenes a complete run has, by the number that the paper prints, where they differ."""
+    remarks: list[str]
+    """What must be known to compare with it."""
     options: Mapping[str, str]
     """Names of our configurations, and the methods that they stand for."""
 
@@ -101,5 +105,7 @@ def _table(entry: dict[str, Any]) -> PublishedTable:
         legend={mark: entry[mark] for mark in ("dagger", "star") if mark in entry},
         columns=columns,
         rows=rows,
+        complete=entry.get("complete", {}),
+        remarks=entry.get("remarks", []),
         options=entry.get("options", {}),
     )

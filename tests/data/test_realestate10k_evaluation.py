@@ -1,0 +1,111 @@
+"""Lists of test views in the formats of the works that publish them: read exactly, or refused."""
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+from realestate10k_trees import make_clip, module, same, write_tree
+
+from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.errors import DataError
+
+PAIR = {"context": [2, 7], "target": [3, 5]}
+PIXELSPLAT = {"test0": PAIR, "test1": None, "gone": PAIR}
+MVSPLAT360 = {"test0": {"context": [2, 7], "target": [2, 3, 4, 5], "target_quantify": [3, 5]}, "test1": None}
+LATENTSPLAT = {"test0": [PAIR], "test1": [], "test2": [PAIR, {"context": [1, 4], "target": [0, 6]}]}
+FLASH3D = "test0 2 3 5 1\ntest2 2 3 5 2\n\ntest2 1 0 6 6\ngone 1 2 3 4"
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    test = [make_clip(f"test{i}", frames=8) for i in range(4)]
+    return write_tree(tmp_path_factory.mktemp("rooms"), "chunks", [make_clip("a"), make_clip("b")], test)
+
+
+def data_of(root: Path, content: object, folder: Path, setting: str = "evaluation_index") -> RE10KDataModule:
+    path = folder / "list"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return module(root, evaluation_batch_size=1, **{setting: str(path)})
+
+
+@pytest.mark.parametrize(
+    ("content", "form", "tests"),
+    [
+        (PIXELSPLAT, "pixelSplat", [("test0", "test0", 2, [3, 5])]),
+        (MVSPLAT360, "MVSplat360", [("test0", "test0", 2, [3, 5])]),
+        (
+            LATENTSPLAT,
+            "latentSplat",
+            [("test0", "test0", 2, [3, 5]), ("test2#1", "test2", 2, [3, 5]), ("test2#2", "test2", 1, [0, 6])],
+        ),
+        (
+            FLASH3D,
+            "Flash3D",
+            [("test0", "test0", 2, [3, 5, 1]), ("test2#1", "test2", 2, [3, 5, 2]), ("test2#2", "test2", 1, [0, 6, 6])],
+        ),
+    ],
+)
+def test_each_format_gives_its_views(root, tmp_path, content, form, tests):
+    data = data_of(root, content, tmp_path)
+    batches = list(data.test_dataloader())
+    assert [batch.names for batch in batches] == [(name,) for name, *_ in tests]
+    store = data.store("test")
+    for batch, (name, clip, reference, targets) in zip(batches, tests, strict=True):
+        expected = store.scene(data.source("test").read(clip), reference, targets)
+        assert same(batch[0], expected.__class__(**{**vars(expected), "names": name}))
+    assert f"({form}, SHA-256 " in data.describe()["protocol_views"]
+
+
+def test_two_lists_are_two_protocols(root, tmp_path):
+    said = [data_of(root, content, tmp_path).describe()["protocol_views"] for content in (PIXELSPLAT, MVSPLAT360)]
+    other = {**PIXELSPLAT, "test3": PAIR}
+    assert len({*said, data_of(root, other, tmp_path).describe()["protocol_views"]}) == 3
+
+
+def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
+    missing = {f"gone{i}": PAIR for i in range(7)}
+    with caplog.at_level(logging.INFO, logger="completesplat"):
+        data_of(root, {**PIXELSPLAT, **missing}, tmp_path).store("test")
+    line = next(record for record in caplog.records if "to test" in record.message)
+    assert "1 null in the index (test1)" in line.message
+    assert "8 in the index, not in the data (gone, gone0, gone1, gone2, gone3, ...)" in line.message
+    assert "2 not in the index (test2, test3)" in line.message
+    assert line.levelno == logging.WARNING
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"test0": {**PAIR, "overlap": 0.5}}, "test0: neither null"),
+        ({"test0": {"context": [1], "targets": [2]}}, "test0: neither null"),
+        ({"test0": [[1, 2]]}, "test0: neither null"),
+        ({"test0": 3}, "test0: neither null"),
+        ({"test0": PAIR, "test1": [PAIR]}, "test1: in the format of latentSplat, clips before it in that"),
+        ({"test0": {"context": [1], "target": [2.5]}}, "test0: context and target must be lists of frame numbers"),
+        ({"test0": {"context": [1], "target": [True]}}, "test0: context and target must be lists of frame numbers"),
+        ({"test0": [{"context": [], "target": [1]}]}, "test0: context and target must be lists of frame numbers"),
+        ({"test0": None}, "no clip with views"),
+        ([PAIR], "not a table of clips"),
+        ('{"test0": ', "not a JSON file"),
+        ("test0 1 2 3 4\ntest1 1 2 3\n", "line 2: not `KEY source target target target`"),
+        ("test0 1 2 3 4\n\ntest1 1 2 3 x\n", "line 3: not `KEY source target target target`"),
+        ("test0 1 2 3 -4\n", "line 1: not `KEY source target target target`"),
+        ("test0 247 r\n", "line 1: not `KEY source target target target`"),
+        ("test0\ntest1\n", "data.scene_list"),
+    ],
+)
+def test_what_is_not_understood_is_refused_with_its_place(root, tmp_path, content, said):
+    with pytest.raises(DataError) as refusal:
+        data_of(root, content, tmp_path).store("test")
+    assert str(refusal.value).startswith(str(tmp_path / "list"))
+    assert said in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_list_of_keys_is_one_key_a_line(root, tmp_path):
+    chosen = data_of(root, "test3\n\ntest1\n", tmp_path, "scene_list")
+    assert chosen.store("test").names == ["test1", "test3"]
+    assert "scenes of list (SHA-256 " in chosen.describe()["protocol_views"]
+    with pytest.raises(DataError, match=r"list: line 2: 5 columns.*data.evaluation_index"):
+        data_of(root, "test0\n" + FLASH3D, tmp_path, "scene_list").store("test")
