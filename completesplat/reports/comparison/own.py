@@ -24,20 +24,8 @@ ALIKE = (
     "metrics",
 )
 """What the protocols of a table's rows have in common."""
-SAID = tuple(
-    [
-        "subset",
-        "split",
-        "resolution",
-        "scenes",
-        "scenes_listed",
-        "skipped",
-        "views",
-        "protocol_views",
-        "crop",
-        "precision",
-    ]
-)
+WHICH = ("subset", "split", "resolution", "scenes", "scenes_listed", "skipped")
+SAID = (*WHICH, "views", "protocol_views", "crop", "precision")
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
 IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]
