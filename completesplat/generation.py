@@ -128,8 +128,7 @@ class CompleteSplat(nn.Module):
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
 
         Raises:
-            CompleteSplatError: a weight outside of [0, 1], skips with something hidden, or a number of steps that the
-                sampler cannot make.
+            CompleteSplatError: weights outside of [0, 1], skips with something hidden, impossible steps.
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible

@@ -13,7 +13,7 @@ Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def check_guidance_weight(weight: float) -> None:
-    """Refuse a weight that mixes nothing.
+    """Refuse a weight that is no share of the unconditional prediction.
 
     Raises:
         CompleteSplatError: it lies outside of [0, 1].

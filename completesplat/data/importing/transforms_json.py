@@ -4,6 +4,7 @@ import logging
 import math
 from collections.abc import Sequence
 from functools import partial
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,8 @@ def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> d
         with at(frame=number):
             name = field(entry, "file_path", str)
             candidates = [inside(path.parent, name + suffix) for suffix in SUFFIXES]
-        picture = next((candidate for candidate in candidates if candidate.is_file()), None)
+        # `Path.is_file` raises where a name is too long.
+        picture = next((candidate for candidate in candidates if isfile(candidate)), None)
         if picture is None:
             missing.append(name)
         else:
