@@ -210,7 +210,7 @@ NOT_IN_THE_PAPER = [
     ("trainer/default", "limit_val_batches"),
     ("trainer/default", "precision"),
     ("trainer/default", "val_check_interval"),
-    ("trainer/test", "precision"),
+    ("evaluation/images", "precision"),
 ]
 
 
