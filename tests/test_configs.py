@@ -32,6 +32,7 @@ def test_nothing_in_the_tree_is_forgotten_here():
     assert len(EVERY_OPTION) > 20
 
 
+PAPERS_FIRST_STAGES = ("co3d_var_stage1", "re10k_var_stage1")
 FILES_OF_PROTOCOLS = {
     "realestate10k_100": "scene_list",
     "realestate10k_128": "evaluation_index",
@@ -43,7 +44,8 @@ FILES_OF_PROTOCOLS = {
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
-    needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
+    needed += ["autoreconstructor.pretrained=null"] if option in (*PAPERS_FIRST_STAGES, "stable_diffusion") else []
+    needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
     stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small"))
     needed += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
     needed += NEEDED if stage2 or option == "latent_diffusion" else []
@@ -68,6 +70,7 @@ def test_every_part_instantiates_from_its_config(group, option):
         pytest.skip("needs a CUDA device")
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
     needed += ["data.root=x"] if option == "realestate10k" else []
+    needed += ["autoreconstructor.pretrained=null"] if group == "autoreconstructor" else []
     # Its weights are not in the repository.
     needed += ["loss.terms.lpips=null"] if (group, option) == ("loss", "stage2") else []
     config = compose_config("fit", f"{group}={option}", *needed)
@@ -104,6 +107,27 @@ def test_the_papers_numbers():
     assert config.optimizer.lr == 5e-5
     assert config.sampler.steps == 50
     assert compose_config("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
+
+
+STARTS = {
+    "var_stage1": "autoreconstructor.pretrained",
+    "var_stage2": "model.checkpoint",
+    "diffusion": "model.autoreconstructor_checkpoint",
+    "diffusion_masked": "model.checkpoint",
+}
+
+
+@pytest.mark.parametrize("stage", STARTS)
+@pytest.mark.parametrize("data", ["co3d", "re10k"])
+def test_a_paper_experiment_asks_for_its_data_and_for_what_it_starts_from(data, stage):
+    config = compose_config("fit", f"experiment={data}_{stage}")
+    missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
+    assert missing == {"data.root", STARTS[stage]}
+
+
+@pytest.mark.parametrize("experiment", ["toy_var_stage2", "toy_var_masked", "toy_diffusion_masked"])
+def test_a_toy_experiment_that_goes_on_asks_for_the_checkpoint(experiment):
+    assert OmegaConf.missing_keys(compose_config("fit", f"experiment={experiment}").model) == {"model.checkpoint"}
 
 
 @pytest.mark.parametrize("data", ["co3d", "re10k"])

@@ -4,7 +4,17 @@ import json
 from pathlib import Path
 from typing import Any
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
+
+OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}
+"""Settings of weights to start from."""
+EXAMPLES = {
+    "root": "DIR",
+    "pretrained": "stabilityai/sd-vae-ft-mse, or null for random weights",
+    "checkpoint": "RUN/checkpoints/last.ckpt",
+    "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
+}
+"""What to give for a setting that is missing."""
 
 
 def run(config: Any, out: Path) -> None:
@@ -22,6 +32,7 @@ def run(config: Any, out: Path) -> None:
 
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
+    refuse_missing(config)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     module = instantiate(config.model, _convert_="all")
@@ -70,12 +81,24 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
         return None
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    for part in (config.autoreconstructor, config.conditioning):
-        if "pretrained" in part:
-            part.pretrained = None
-    if "checkpoint" in config.model:
-        config.model.checkpoint = None
+    for part in (config.autoreconstructor, config.conditioning, config.model):
+        for key in OTHER_WEIGHTS & part.keys():
+            part[key] = None
     return path
+
+
+def refuse_missing(config: Any) -> None:
+    """Refuse settings that data and model need and that are not given; one line shows what to give.
+
+    Raises:
+        CompleteSplatError: there is one.
+    """
+    from omegaconf import OmegaConf
+
+    for part in (config.data, config.model):
+        for key in sorted(OmegaConf.missing_keys(part)):
+            example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
+            raise CompleteSplatError(f"{key} is needed: give {key}={example}")
 
 
 def _train_and_test(trainer: Any, module: Any, data: Any, checkpoint: str | None, test: bool) -> dict[str, float]:
