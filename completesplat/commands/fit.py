@@ -1,10 +1,13 @@
 """`completesplat fit`: train one stage, then score it."""
 
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
 from completesplat.errors import CompleteSplatError, WeightsError
+
+logger = logging.getLogger(__name__)
 
 OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}
 """Settings of weights to start from."""
@@ -40,18 +43,21 @@ def run(config: Any, out: Path) -> None:
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    batch_per_process = data.batch_per_process(trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
+        logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, batch_per_process)
     with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train_and_test(trainer, module, data, checkpoint, config.test)
-        for logger in loggers:  # a run shorter than the logging interval leaves its figures too
-            logger.log_metrics(metrics, step=trainer.global_step)
-            logger.save()
+        for one in loggers:  # a run shorter than the logging interval leaves its figures too
+            one.log_metrics(metrics, step=trainer.global_step)
+            one.save()
         scores = module.test_results() if config.test else None
         if not trainer.is_global_zero:
             return
-        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
+        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch}
+        results |= {"data.batch_per_process": batch_per_process, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
             ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)

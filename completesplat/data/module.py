@@ -20,6 +20,7 @@ from completesplat.data.loading import EpochSampler, SceneLoader, check_policy
 from completesplat.data.means import mean_camera, mean_image
 from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.prepared.source import PreparedSource
+from completesplat.data.processes import processes
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.streaming import StreamedScenes
@@ -39,8 +40,9 @@ class SceneDataModule(LightningDataModule):
     Args:
         root: folder of the data set, or of its prepared form.
         image_size: side of the square pictures.
-        batch_size: scenes of a training batch.
-        targets: target views of a training scene (not stated by the paper).
+        batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
+        targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which has no use
+            for them.
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
         references_per_sequence: training items of a sequence in one epoch.
         mask_threshold: masks are cut at this probability; None: they stay soft.
@@ -83,6 +85,8 @@ class SceneDataModule(LightningDataModule):
         if encoded is not None and (color_jitter is not None or mirroring or streaming):
             asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
             raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
+        if targets < 0:
+            raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -199,11 +203,31 @@ class SceneDataModule(LightningDataModule):
     def train_dataloader(self) -> SceneLoader:
         """Random views of all training sequences, in random order."""
         scenes = self._training_scenes()
+        accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
+        batch_size = self.batch_per_process(processes()[1], accumulated)
         order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
         if self.streaming:
-            order = StreamedScenes(scenes, self.source("train"), self.batch_size)
+            order = StreamedScenes(scenes, self.source("train"), batch_size)
         items = order if isinstance(order, StreamedScenes) else scenes
-        return SceneLoader(items, self.batch_size, order, self.workers, *self.policy)
+        return SceneLoader(items, batch_size, order, self.workers, *self.policy)
+
+    def batch_per_process(self, count: int, accumulated: int) -> int:
+        """Scenes of one batch of one process, so that an optimizer step sees `batch_size` scenes.
+
+        Args:
+            count: training processes (devices x nodes).
+            accumulated: batches of each whose gradients make one step.
+
+        Raises:
+            CompleteSplatError: `batch_size` cannot be divided so.
+        """
+        share, rest = divmod(self.batch_size, count * accumulated)
+        if share < 1 or rest:
+            raise CompleteSplatError(
+                f"data.batch_size={self.batch_size} is the batch of an optimizer step: it must be a multiple of "
+                f"{count} processes (trainer.devices x num_nodes) x {accumulated} (trainer.accumulate_grad_batches)"
+            )
+        return share
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views

@@ -188,7 +188,7 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
     (tmp_path / "process_notes.py").write_text(NOTE)
     sweep = tmp_path / "sweep"
     arguments = [
-        *settings(toy_root, steps=1), "seed=3,4", f"out={sweep}", "trainer.devices=2", "+trainer.strategy=ddp",
+        *settings(toy_root, steps=1), "seed=3,4", f"out={sweep}", "trainer.devices=2", "trainer.strategy=ddp",
         "rasterizer=reference", "test=false",
         "+callbacks.note={_target_: process_notes.Note, folder: '${out}/notes', seed: '${seed}'}",
     ]  # fmt: skip
