@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from support import SMALL, call, compose_config
@@ -46,7 +47,7 @@ def test_every_option_composes_and_resolves(group, option):
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
     needed += ["autoreconstructor.pretrained=null"] if option in (*PAPERS_FIRST_STAGES, "stable_diffusion") else []
     needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
-    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small"))
+    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
     needed += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
     needed += NEEDED if stage2 or option == "latent_diffusion" else []
     config = compose_config("fit", f"{group}={option}", *needed)
@@ -135,16 +136,42 @@ def test_the_papers_stages(data):
     one, two = (
         compose_config("fit", f"experiment={data}_var_stage{n}", "data.root=x", "model.checkpoint=x") for n in (1, 2)
     )
-    assert [(c.trainer.max_epochs, c.trainer.max_steps, c.optimizer.lr) for c in (one, two)] == [
-        (6000, -1, 5e-5),
-        (8000, -1, 5e-6),
-    ]
+    lengths = [(c.trainer.get("max_epochs"), c.trainer.max_steps) for c in (one, two)]
+    assert lengths == {"co3d": [(6000, -1), (8000, -1)], "re10k": [(None, 200_000), (None, 270_000)]}[data]
+    assert [c.optimizer.lr for c in (one, two)] == [5e-5, 5e-6]
     weights = [{name: term.weight for name, term in c.loss.terms.items() if term.weight} for c in (one, two)]
     assert weights[0] == {"mse": 0.8, "ssim": 0.2, "kl": 1e-6}
     assert weights[1] == weights[0] | {"lpips": 0.01}
     assert (one.data.batch_size, one.data.image_size) == (two.data.batch_size, two.data.image_size) == (32, 128)
     assert one.data.color_jitter == two.data.color_jitter
     assert one.data.color_jitter is not None
+
+
+PAPERS = [option for option in options("experiment") if option.startswith(("co3d_", "re10k_"))]
+
+
+@pytest.mark.parametrize("experiment", PAPERS)
+def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock(experiment):
+    config = compose_config("fit", f"experiment={experiment}")
+    assert config.rasterizer._target_.endswith("selection.cuda")
+    checkpoint = config.callbacks.checkpoint
+    assert (checkpoint.every_n_train_steps, checkpoint.every_minutes) == (None, 30)
+    elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
+    assert instantiate(elsewhere.rasterizer) is not None
+
+
+def test_the_cached_experiment_is_the_papers_without_jitter_and_asks_for_its_cache():
+    needed = ["data.root=x", "model.autoreconstructor_checkpoint=x"]
+    pictures, cached = (
+        OmegaConf.to_container(compose_config("fit", f"experiment=co3d_diffusion{name}", *needed), resolve=True)
+        for name in ("", "_cached")
+    )
+    data = cached["data"] | {"encoded": None, "color_jitter": pictures["data"]["color_jitter"]}
+    assert cached | {"data": data} == pictures
+    assert cached["data"]["color_jitter"] is None
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(compose_config("fit", "experiment=co3d_diffusion_cached", *needed).data, _convert_="all")
+    assert "data.encoded is needed: give data.encoded=DIR" in str(caught.value.__cause__)
 
 
 @pytest.mark.parametrize("data", ["co3d", "re10k"])

@@ -26,6 +26,13 @@ def help_commands() -> list[str]:
     return [line for line in lines if line.startswith("completesplat ") and "${" not in line]
 
 
+def experiment_commands(name: str) -> list[str]:
+    """What the head of an experiment's file lists, in order; a backslash joins lines."""
+    text = (conf_folder() / "experiment" / f"{name}.yaml").read_text()
+    comments = "\n".join(line[1:] for line in text.splitlines() if line.startswith("#")).replace("\\\n", " ")
+    return [" ".join(line.split()) for line in comments.splitlines() if line.strip().startswith("completesplat ")]
+
+
 def arguments_of(command: str) -> list[str]:
     """Verb and arguments; what follows a # is a comment."""
     return shlex.split(command, comments=True)[1:]

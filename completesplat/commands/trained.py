@@ -94,6 +94,9 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
         parent, _, name = key.rpartition(".")
         if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
+    # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
+    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
+        config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     return config
 
 

@@ -53,7 +53,7 @@ class SceneDataModule(LightningDataModule):
         cache: keep decoded pictures in memory.
         streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
         encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
-            validation and test read pictures.
+            validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         most_bad: skipping more than this share of an epoch's items is an error.
     """
@@ -82,6 +82,8 @@ class SceneDataModule(LightningDataModule):
         check_policy(on_bad)
         if mask_threshold is not None and not 0 < mask_threshold <= 1:
             raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
+        if encoded == "":
+            raise CompleteSplatError("data.encoded is needed: give data.encoded=DIR, which `data latents` wrote")
         if encoded is not None and (color_jitter is not None or mirroring or streaming):
             asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
             raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
