@@ -15,8 +15,9 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def readme_commands() -> list[str]:
-    """Lines of the README's code blocks that start with `completesplat`, without their comments."""
-    lines = [line for block in BLOCK.findall(README.read_text()) for line in block.splitlines()]
+    """Lines of the README's code blocks that start with `completesplat`; a backslash joins lines."""
+    blocks = [block.replace("\\\n", " ") for block in BLOCK.findall(README.read_text())]
+    lines = [line for block in blocks for line in block.splitlines()]
     return [line.strip() for line in lines if line.startswith("completesplat ")]
 
 

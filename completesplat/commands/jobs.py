@@ -41,7 +41,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
-    resolved = OmegaConf.to_container(config, resolve=True)
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
@@ -49,6 +49,10 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
             OmegaConf.save(resolved, temporary)
         _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
+    for key in ("checkpoint", "autoreconstructor_checkpoint"):
+        # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
+        if OmegaConf.select(config, f"model.{key}") is not None:
+            config.model[key] = resolved["model"][key]
     with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
         import_module(f"completesplat.commands.{verb}").run(config, out)
     print(out)
