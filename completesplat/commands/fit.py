@@ -28,6 +28,7 @@ def run(config: Any, out: Path) -> None:
 
     from completesplat.commands import quieten
     from completesplat.commands.protocol import protocol
+    from completesplat.data.processes import batch_per_process
     from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
@@ -43,10 +44,10 @@ def run(config: Any, out: Path) -> None:
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
-    batch_per_process = data.batch_per_process(trainer.world_size, trainer.accumulate_grad_batches)
+    share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
-        logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, batch_per_process)
+        logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
     with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train_and_test(trainer, module, data, checkpoint, config.test)
@@ -57,7 +58,7 @@ def run(config: Any, out: Path) -> None:
         if not trainer.is_global_zero:
             return
         results = {"steps": trainer.global_step, "epochs": trainer.current_epoch}
-        results |= {"data.batch_per_process": batch_per_process, **metrics}
+        results |= {"data.batch_per_process": share, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
             ema = any(isinstance(callback, WeightAveraging) for callback in callbacks)

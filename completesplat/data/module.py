@@ -20,12 +20,13 @@ from completesplat.data.loading import EpochSampler, SceneLoader, check_policy
 from completesplat.data.means import mean_camera, mean_image
 from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.prepared.source import PreparedSource
-from completesplat.data.processes import processes
+from completesplat.data.processes import batch_per_process, processes
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.settings import check_settings
 from completesplat.data.streaming import StreamedScenes
 from completesplat.data.typical_camera import TypicalCamera
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
@@ -80,15 +81,7 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         check_policy(on_bad)
-        if mask_threshold is not None and not 0 < mask_threshold <= 1:
-            raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
-        if encoded == "":
-            raise CompleteSplatError("data.encoded is needed: give data.encoded=DIR, which `data latents` wrote")
-        if encoded is not None and (color_jitter is not None or mirroring or streaming):
-            asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
-            raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
-        if targets < 0:
-            raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
+        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring or streaming)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -206,30 +199,12 @@ class SceneDataModule(LightningDataModule):
         """Random views of all training sequences, in random order."""
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
-        batch_size = self.batch_per_process(processes()[1], accumulated)
+        batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
         if self.streaming:
             order = StreamedScenes(scenes, self.source("train"), batch_size)
         items = order if isinstance(order, StreamedScenes) else scenes
         return SceneLoader(items, batch_size, order, self.workers, *self.policy)
-
-    def batch_per_process(self, count: int, accumulated: int) -> int:
-        """Scenes of one batch of one process, so that an optimizer step sees `batch_size` scenes.
-
-        Args:
-            count: training processes (devices x nodes).
-            accumulated: batches of each whose gradients make one step.
-
-        Raises:
-            CompleteSplatError: `batch_size` cannot be divided so.
-        """
-        share, rest = divmod(self.batch_size, count * accumulated)
-        if share < 1 or rest:
-            raise CompleteSplatError(
-                f"data.batch_size={self.batch_size} is the batch of an optimizer step: it must be a multiple of "
-                f"{count} processes (trainer.devices x num_nodes) x {accumulated} (trainer.accumulate_grad_batches)"
-            )
-        return share
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views

@@ -10,6 +10,7 @@ from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 from torch import distributed, multiprocessing
 
+from completesplat.data.processes import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -50,15 +51,13 @@ def test_two_processes_share_the_batch(toy_root, tmp_path):
     ("batch_size", "count", "accumulated", "share"), [(32, 1, 1, 32), (32, 8, 1, 4), (32, 8, 2, 2), (32, 32, 1, 1)]
 )
 def test_the_share_of_a_process(batch_size, count, accumulated, share):
-    data = instantiate(compose_config("fit", f"data.batch_size={batch_size}").data, _convert_="all")
-    assert data.batch_per_process(count, accumulated) == share
+    assert batch_per_process(batch_size, count, accumulated) == share
 
 
 @pytest.mark.parametrize(("count", "accumulated"), [(3, 1), (8, 8), (64, 1)])
 def test_what_does_not_divide_is_refused(count, accumulated):
-    data = instantiate(compose_config("fit", "data.batch_size=32").data, _convert_="all")
     with pytest.raises(CompleteSplatError, match=r"data.batch_size=32 .* must be a multiple of"):
-        data.batch_per_process(count, accumulated)
+        batch_per_process(32, count, accumulated)
 
 
 def test_accumulated_batches_share_it_and_what_a_process_gets_is_recorded(command, toy_root, tmp_path, monkeypatch):
