@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from support import SMALL, call, compose_config
@@ -34,6 +35,7 @@ def test_nothing_in_the_tree_is_forgotten_here():
     assert len(EVERY_OPTION) > 20
 
 
+PAPERS_FIRST_STAGES = ("co3d_var_stage1", "re10k_var_stage1")
 FILES_OF_PROTOCOLS = {
     "realestate10k_100": "scene_list",
     "realestate10k_128": "evaluation_index",
@@ -45,8 +47,9 @@ FILES_OF_PROTOCOLS = {
 def test_every_option_composes_and_resolves(group, option):
     needed = ["data.root=x", "data.category=y"] if option == "co3d_category" else []
     needed += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) and not needed else []
-    needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
-    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small"))
+    needed += ["autoreconstructor.pretrained=null"] if option in (*PAPERS_FIRST_STAGES, "stable_diffusion") else []
+    needed += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
+    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
     needed += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
     needed += NEEDED if stage2 or option == "latent_diffusion" else []
     config = compose_config("fit", f"{group}={option}", *needed)
@@ -70,6 +73,7 @@ def test_every_part_instantiates_from_its_config(group, option):
         pytest.skip("needs a CUDA device")
     needed = ["data.root=x", "data.category=y"] if option.startswith("co3d_") else []
     needed += ["data.root=x"] if option == "realestate10k" else []
+    needed += ["autoreconstructor.pretrained=null"] if group == "autoreconstructor" else []
     # Its weights are not in the repository.
     needed += ["loss.terms.lpips=null"] if (group, option) == ("loss", "stage2") else []
     config = compose_config("fit", f"{group}={option}", *needed)
@@ -108,15 +112,35 @@ def test_the_papers_numbers():
     assert compose_config("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
 
 
+STARTS = {
+    "var_stage1": "autoreconstructor.pretrained",
+    "var_stage2": "model.checkpoint",
+    "diffusion": "model.autoreconstructor_checkpoint",
+    "diffusion_masked": "model.checkpoint",
+}
+
+
+@pytest.mark.parametrize("stage", STARTS)
+@pytest.mark.parametrize("data", ["co3d", "re10k"])
+def test_a_paper_experiment_asks_for_its_data_and_for_what_it_starts_from(data, stage):
+    config = compose_config("fit", f"experiment={data}_{stage}")
+    missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
+    assert missing == {"data.root", STARTS[stage]}
+
+
+@pytest.mark.parametrize("experiment", ["toy_var_stage2", "toy_var_masked", "toy_diffusion_masked"])
+def test_a_toy_experiment_that_goes_on_asks_for_the_checkpoint(experiment):
+    assert OmegaConf.missing_keys(compose_config("fit", f"experiment={experiment}").model) == {"model.checkpoint"}
+
+
 @pytest.mark.parametrize("data", ["co3d", "re10k"])
 def test_the_papers_stages(data):
     one, two = (
         compose_config("fit", f"experiment={data}_var_stage{n}", "data.root=x", "model.checkpoint=x") for n in (1, 2)
     )
-    assert [(c.trainer.max_epochs, c.trainer.max_steps, c.optimizer.lr) for c in (one, two)] == [
-        (6000, -1, 5e-5),
-        (8000, -1, 5e-6),
-    ]
+    lengths = [(c.trainer.get("max_epochs"), c.trainer.max_steps) for c in (one, two)]
+    assert lengths == {"co3d": [(6000, -1), (8000, -1)], "re10k": [(None, 200_000), (None, 270_000)]}[data]
+    assert [c.optimizer.lr for c in (one, two)] == [5e-5, 5e-6]
     weights = [{name: term.weight for name, term in c.loss.terms.items() if term.weight} for c in (one, two)]
     assert weights[0] == {"mse": 0.8, "ssim": 0.2, "kl": 1e-6}
     assert weights[1] == weights[0] | {"lpips": 0.01}
@@ -130,6 +154,33 @@ def test_categories_are_tested_on_sequences_never_seen_with_all_their_frames(exp
     data = compose_config("fit", f"experiment={experiment}", "data.root=x", "model.checkpoint=x").data
     assert (data.subset, data.allow_shared_sequences) == ("fewview_dev", False)
     assert (data.validation_targets, data.evaluation_targets) == (8, None)
+
+
+PAPERS = [option for option in options("experiment") if option.startswith(("co3d_", "re10k_"))]
+
+
+@pytest.mark.parametrize("experiment", PAPERS)
+def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock(experiment):
+    config = compose_config("fit", f"experiment={experiment}")
+    assert config.rasterizer._target_.endswith("selection.cuda")
+    checkpoint = config.callbacks.checkpoint
+    assert (checkpoint.every_n_train_steps, checkpoint.every_minutes) == (None, 30)
+    elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
+    assert instantiate(elsewhere.rasterizer) is not None
+
+
+def test_the_cached_experiment_is_the_papers_without_jitter_and_asks_for_its_cache():
+    needed = ["data.root=x", "model.autoreconstructor_checkpoint=x"]
+    pictures, cached = (
+        OmegaConf.to_container(compose_config("fit", f"experiment=co3d_diffusion{name}", *needed), resolve=True)
+        for name in ("", "_cached")
+    )
+    data = cached["data"] | {"encoded": None, "color_jitter": pictures["data"]["color_jitter"]}
+    assert cached | {"data": data} == pictures
+    assert cached["data"]["color_jitter"] is None
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(compose_config("fit", "experiment=co3d_diffusion_cached", *needed).data, _convert_="all")
+    assert "data.encoded is needed: give data.encoded=DIR" in str(caught.value.__cause__)
 
 
 @pytest.mark.parametrize("data", ["co3d", "re10k"])
@@ -197,12 +248,12 @@ NOT_IN_THE_PAPER = [
     ("experiment/re10k_diffusion", "decay"),
     ("experiment/re10k_diffusion_masked", "box_masks"),
     ("loss/stage2", "term"),
-    ("model/latent_diffusion", "background"),
-    ("model/latent_diffusion", "scale_batches"),
+    ("model/_latent_diffusion", "background"),
+    ("model/_latent_diffusion", "scale_batches"),
     ("model/reconstructor_only", "background"),
     ("model/reconstructor_only", "code_steps"),
     ("model/splatter_image", "background"),
-    ("model/var", "background"),
+    ("model/var_from_checkpoint", "background"),
     ("sampler/_noise", "num_train_timesteps"),
     ("sampler/ddim50", "_target_"),
     ("schedule/exponential", "warmup_steps"),

@@ -15,8 +15,9 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
 def readme_commands() -> list[str]:
-    """Lines of the README's code blocks that start with `completesplat`, without their comments."""
-    lines = [line for block in BLOCK.findall(README.read_text()) for line in block.splitlines()]
+    """Lines of the README's code blocks that start with `completesplat`; a backslash joins lines."""
+    blocks = [block.replace("\\\n", " ") for block in BLOCK.findall(README.read_text())]
+    lines = [line for block in blocks for line in block.splitlines()]
     return [line.strip() for line in lines if line.startswith("completesplat ")]
 
 
@@ -24,6 +25,13 @@ def help_commands() -> list[str]:
     """The examples of every verb's configuration."""
     lines = [line.strip() for verb in VERBS for line in (conf_folder() / f"{verb}.yaml").read_text().splitlines()]
     return [line for line in lines if line.startswith("completesplat ") and "${" not in line]
+
+
+def experiment_commands(name: str) -> list[str]:
+    """What the head of an experiment's file lists, in order; a backslash joins lines."""
+    text = (conf_folder() / "experiment" / f"{name}.yaml").read_text()
+    comments = "\n".join(line[1:] for line in text.splitlines() if line.startswith("#")).replace("\\\n", " ")
+    return [" ".join(line.split()) for line in comments.splitlines() if line.strip().startswith("completesplat ")]
 
 
 def arguments_of(command: str) -> list[str]:

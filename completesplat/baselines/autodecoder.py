@@ -27,13 +27,13 @@ class AutoDecoder(nn.Module):
     Args:
         reconstructor: without skips, as there are no features.
         image_size: side of the pictures.
-        rows: pictures that the table has room for.
+        rows: pictures that the table has room for; see `make_room`. Weights that are loaded bring as many as they have.
 
     Raises:
         CompleteSplatError: a reconstructor with skips, or an image size that its levels do not divide.
     """
 
-    def __init__(self, reconstructor: Reconstructor, image_size: int, rows: int) -> None:
+    def __init__(self, reconstructor: Reconstructor, image_size: int, rows: int = 0) -> None:
         super().__init__()
         factor = 2 ** (len(reconstructor.network.up_blocks) - 1)
         if len(reconstructor.skips) > 0:
@@ -42,12 +42,23 @@ class AutoDecoder(nn.Module):
             raise CompleteSplatError(f"image_size={image_size}: must be a multiple of {factor}")
         self.reconstructor = reconstructor
         self.shape = (reconstructor.post_quant_conv.in_channels, image_size // factor, image_size // factor)
-        self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape))
         self._rows: dict[tuple[str, int], int] = {}
+        self.make_room(rows)
 
     def forward(self, codes: Float[Tensor, "batch channel latent_height latent_width"]) -> SplatterImage:
         """Reconstruct from codes."""
         return self.reconstructor(codes, ())
+
+    def make_room(self, rows: int) -> None:
+        """A new table for so many pictures, all rows of it free."""
+        device = self.reconstructor.post_quant_conv.weight.device
+        self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape).to(device))
+        self._rows = {}
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+        if (codes := state_dict.get(f"{prefix}codes")) is not None and len(codes) != len(self.codes):
+            self.make_room(len(codes))
+        super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(
         self, names: Sequence[str], frames: Int64[Tensor, " batch"]
@@ -66,7 +77,7 @@ class AutoDecoder(nn.Module):
 
     def _row(self, name: str, frame: int) -> int:
         if (name, frame) not in self._rows and len(self._rows) == len(self.codes):
-            raise CompleteSplatError(f"all {len(self.codes)} codes are taken: set model.model.rows to more")
+            raise CompleteSplatError(f"all {len(self.codes)} codes are taken: this is a picture of another data set")
         return self._rows.setdefault((name, frame), len(self._rows))
 
     def get_extra_state(self) -> list[list[str | int]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.commands.jobs import PROCESS_OF_JOB, run_job, run_process_of_job
-from completesplat.commands.sweeps import is_sweep, job_name, sweep_arguments
+from completesplat.commands.sweeps import is_sweep, job_name, one_of_several, sweep_arguments
 from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
 
@@ -47,6 +47,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     program, given = sys.argv[0], arguments
     if is_sweep(arguments):
         arguments = [*arguments, *sweep_arguments(verb, arguments, RUN_NAME)]
+    elif one_of_several() and not any(argument.startswith("out=") for argument in arguments):
+        raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
     sys.argv = [f"completesplat {verb}", *arguments]
 
     failures: list[Exception] = []

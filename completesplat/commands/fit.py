@@ -2,10 +2,23 @@
 
 import copy
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
+
+logger = logging.getLogger(__name__)
+
+OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}
+"""Settings of weights to start from."""
+EXAMPLES = {
+    "root": "DIR",
+    "pretrained": "stabilityai/sd-vae-ft-mse, or null for random weights",
+    "checkpoint": "RUN/checkpoints/last.ckpt",
+    "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
+}
+"""What to give for a setting that is missing."""
 
 
 def run(config: Any, out: Path) -> None:
@@ -16,6 +29,7 @@ def run(config: Any, out: Path) -> None:
     from completesplat.commands import quieten
     from completesplat.commands.protocol import protocol
     from completesplat.commands.scoring import scored_data, set_scoring
+    from completesplat.data.processes import batch_per_process
     from completesplat.reports.dashboard.logging import begin, log_test
     from completesplat.reports.evaluation_table import evaluation_table, show
     from completesplat.reports.parameters import parameter_table
@@ -23,6 +37,7 @@ def run(config: Any, out: Path) -> None:
 
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
+    refuse_missing(config)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     # What cannot be scored is refused now, not after the training.
@@ -33,20 +48,23 @@ def run(config: Any, out: Path) -> None:
     callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
     loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
     trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
+        logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
     with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train(trainer, module, data, checkpoint)
         if tested is not None:
             metrics |= _test(config, module, tested)
-        for logger in loggers:  # a run shorter than the logging interval leaves its figures too
-            logger.log_metrics(metrics, step=trainer.global_step)
-            logger.save()
+        for one in loggers:  # a run shorter than the logging interval leaves its figures too
+            one.log_metrics(metrics, step=trainer.global_step)
+            one.save()
         scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:
             return
-        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, **metrics}
+        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch}
+        results |= {"data.batch_per_process": share, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
@@ -75,12 +93,24 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
         return None
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
-    for part in (config.autoreconstructor, config.conditioning):
-        if "pretrained" in part:
-            part.pretrained = None
-    if "checkpoint" in config.model:
-        config.model.checkpoint = None
+    for part in (config.autoreconstructor, config.conditioning, config.model):
+        for key in OTHER_WEIGHTS & part.keys():
+            part[key] = None
     return path
+
+
+def refuse_missing(config: Any) -> None:
+    """Refuse settings that data and model need and that are not given; one line shows what to give.
+
+    Raises:
+        CompleteSplatError: there is one.
+    """
+    from omegaconf import OmegaConf
+
+    for part in (config.data, config.model):
+        for key in sorted(OmegaConf.missing_keys(part)):
+            example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
+            raise CompleteSplatError(f"{key} is needed: give {key}={example}")
 
 
 def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict[str, float]:

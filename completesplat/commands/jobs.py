@@ -35,16 +35,24 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
+    from completesplat.export.atomic import atomic_path
+
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
-    resolved = OmegaConf.to_container(config, resolve=True)
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
-    OmegaConf.save(resolved, out / CONFIG)
-    _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
+    if is_first_process():
+        with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
+            OmegaConf.save(resolved, temporary)
+        _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
+    for key in ("checkpoint", "autoreconstructor_checkpoint"):
+        # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
+        if OmegaConf.select(config, f"model.{key}") is not None:
+            config.model[key] = resolved["model"][key]
     with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
         import_module(f"completesplat.commands.{verb}").run(config, out)
     print(out)
@@ -55,6 +63,11 @@ def run_process_of_job(verb: str, out: Path) -> None:
     from omegaconf import OmegaConf
 
     import_module(f"completesplat.commands.{verb}").run(OmegaConf.load(out / CONFIG), out)
+
+
+def is_first_process() -> bool:
+    """Whether this is the first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone."""
+    return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
 
 
 def is_finished(out: Path, config: Any) -> bool:

@@ -15,14 +15,18 @@ def is_sweep(arguments: list[str]) -> bool:
     return "-m" in arguments or "--multirun" in arguments
 
 
+def one_of_several() -> bool:
+    """Whether a launcher started several of this process: torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`)."""
+    return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
+
+
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
     """What a sweep needs besides its own arguments: one directory, and in it one for each job, named by what is swept.
 
     Raises:
         CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
     """
-    # torchrun sets the first, srun the second.
-    if "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1:
+    if one_of_several():
         raise CompleteSplatError(
             "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
         )

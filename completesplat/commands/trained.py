@@ -11,6 +11,7 @@ ONLY_FOR_TRAINING = (
     "model.autoreconstructor_checkpoint",
     "model.checkpoint",
     "model.model.pretrained",
+    "model.completesplat.autoreconstructor.pretrained",
     "model.completesplat.conditioning.pretrained",
     "model.loss.terms.lpips",
 )
@@ -90,8 +91,12 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
     config = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(overrides))
     # The weights come from this checkpoint.
     for key in ONLY_FOR_TRAINING:
-        if OmegaConf.select(config, key) is not None:
+        parent, _, name = key.rpartition(".")
+        if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
+    # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
+    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
+        config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     return config
 
 

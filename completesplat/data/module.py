@@ -20,11 +20,13 @@ from completesplat.data.loading import EpochSampler, SceneLoader, check_policy
 from completesplat.data.means import mean_camera, mean_image
 from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.prepared.source import PreparedSource
+from completesplat.data.processes import batch_per_process, processes
 from completesplat.data.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.settings import check_settings
 from completesplat.data.streaming import StreamedScenes
 from completesplat.data.typical_camera import TypicalCamera
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
@@ -39,8 +41,9 @@ class SceneDataModule(LightningDataModule):
     Args:
         root: folder of the data set, or of its prepared form.
         image_size: side of the square pictures.
-        batch_size: scenes of a training batch.
-        targets: target views of a training scene (not stated by the paper).
+        batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
+        targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which has no use
+            for them.
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
         references_per_sequence: training items of a sequence in one epoch.
         mask_threshold: masks are cut at this probability; None: they stay soft.
@@ -51,7 +54,7 @@ class SceneDataModule(LightningDataModule):
         cache: keep decoded pictures in memory.
         streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
         encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
-            validation and test read pictures.
+            validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         most_bad: skipping more than this share of an epoch's items is an error.
     """
@@ -78,11 +81,7 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         check_policy(on_bad)
-        if mask_threshold is not None and not 0 < mask_threshold <= 1:
-            raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
-        if encoded is not None and (color_jitter is not None or mirroring or streaming):
-            asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
-            raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
+        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring or streaming)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -199,11 +198,13 @@ class SceneDataModule(LightningDataModule):
     def train_dataloader(self) -> SceneLoader:
         """Random views of all training sequences, in random order."""
         scenes = self._training_scenes()
+        accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
+        batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
         if self.streaming:
-            order = StreamedScenes(scenes, self.source("train"), self.batch_size)
+            order = StreamedScenes(scenes, self.source("train"), batch_size)
         items = order if isinstance(order, StreamedScenes) else scenes
-        return SceneLoader(items, self.batch_size, order, self.workers, *self.policy)
+        return SceneLoader(items, batch_size, order, self.workers, *self.policy)
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views

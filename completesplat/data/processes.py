@@ -4,6 +4,8 @@ from typing import Any
 
 import torch
 
+from completesplat.errors import CompleteSplatError
+
 
 def processes() -> tuple[int, int]:
     """This training process's number, and how many there are."""
@@ -21,3 +23,22 @@ def gathered(value: Any) -> list[Any]:
     values: list[Any] = [None] * count
     torch.distributed.all_gather_object(values, value)
     return values
+
+
+def batch_per_process(batch_size: int, count: int, accumulated: int) -> int:
+    """Scenes of one batch of one process, so that an optimizer step sees `batch_size` scenes.
+
+    Args:
+        count: training processes (devices x nodes).
+        accumulated: batches of each whose gradients make one step.
+
+    Raises:
+        CompleteSplatError: `batch_size` cannot be divided so.
+    """
+    share, rest = divmod(batch_size, count * accumulated)
+    if rest:
+        raise CompleteSplatError(
+            f"data.batch_size={batch_size} is the batch of an optimizer step: it must be a multiple of "
+            f"{count} processes (trainer.devices x num_nodes) x {accumulated} (trainer.accumulate_grad_batches)"
+        )
+    return share

@@ -51,6 +51,18 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
     return ReferenceRasterizer(constants)
 
 
+def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
+    """The `cuda` backend, for training that would take far too long without it.
+
+    Raises:
+        CompleteSplatError: it does not work here; the line says what to choose instead.
+    """
+    try:
+        return CudaRasterizer(constants)
+    except CompleteSplatError as error:
+        raise CompleteSplatError(f"{error}; rasterizer=auto takes the fastest one that works here") from error
+
+
 @cache
 def failure(name: str, constants: RenderingConstants | None) -> str | None:
     """Why a backend cannot be used, or None if a tiny scene comes out as it should, with its gradient.

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, WeightAveraging
+from lightning.pytorch.callbacks import WeightAveraging
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -38,14 +38,6 @@ class ExponentialMovingAverage(WeightAveraging):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_end(trainer, pl_module)
-
-
-class Checkpoints(ModelCheckpoint):
-    """Lightning's, and `last.ckpt` at the end of training whatever the interval (Lightning writes it at multiples)."""
-
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.save_last and self._last_global_step_saved != trainer.global_step:
-            self._save_last_checkpoint(trainer, self._monitor_candidates(trainer))
 
 
 class ExportWeights(Callback):

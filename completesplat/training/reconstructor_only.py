@@ -8,7 +8,8 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.baselines.autodecoder import AutoDecoder, optimize_codes
-from completesplat.errors import CompleteSplatError
+from completesplat.data.sequences import SequenceSource
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch, Views
@@ -34,6 +35,12 @@ class ReconstructorOnly(ReconstructionModule):
         super().__init__(model, loss, **reconstruction)
         self.code_steps = code_steps
         self.code_rate = code_rate
+
+    def setup(self, stage: str) -> None:
+        """A code for every picture of the training set, unless a checkpoint brought them."""
+        if stage == "fit" and not len(self.model.codes):
+            source = self.trainer.datamodule.source("train")  # type: ignore[attr-defined]
+            self.model.make_room(sum(_frames(source, name) for name in source.names))
 
     def on_fit_start(self) -> None:
         """Refuse several processes, each of which would give the rows of the codes to other pictures."""
@@ -72,3 +79,11 @@ class ReconstructorOnly(ReconstructionModule):
         images = self.rasterizer(gaussians, views.cameras).over(self.background)
         total, _ = self.loss(Prediction(images, gaussians, None), views, self.global_step)
         return total
+
+
+def _frames(source: SequenceSource, name: str) -> int:
+    """How many there are of a sequence: none of one that cannot be read."""
+    try:
+        return len(source.read(name).frames)
+    except DataError:
+        return 0

@@ -113,7 +113,7 @@ def parameters(*modules) -> int:
 
 
 def test_stable_diffusions_size_is_the_published_one():
-    config = compose_config("fit", "autoreconstructor=stable_diffusion")
+    config = compose_config("fit", "autoreconstructor=stable_diffusion", "autoreconstructor.pretrained=null")
     with torch.device("meta"):
         model = instantiate(config.autoreconstructor, _convert_="all")
         theirs = stable_diffusion_vae((128, 256, 512, 512), layers_per_block=2, norm_groups=32)

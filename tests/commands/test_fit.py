@@ -129,3 +129,43 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(
     )
     assert finished.status == 2
     assert said in finished.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "asked"),
+    [
+        (
+            ["experiment=co3d_var_stage1", "data=toy_objects"],
+            "autoreconstructor.pretrained is needed: give autoreconstructor.pretrained=stabilityai/sd-vae-ft-mse, "
+            "or null for random weights",
+        ),
+        (["experiment=toy_var_masked"], "model.checkpoint is needed: give model.checkpoint=RUN/checkpoints/last.ckpt"),
+        (
+            ["experiment=toy_diffusion"],
+            "model.autoreconstructor_checkpoint is needed: give model.autoreconstructor_checkpoint="
+            "RUN/checkpoints/last.ckpt of stage 1",
+        ),
+        (["experiment=re10k_diffusion"], "data.root is needed: give data.root=DIR"),
+    ],
+    ids=["pretrained", "checkpoint", "stage 1", "data"],
+)
+def test_training_does_not_start_from_random_weights_without_a_word(command, toy_root, tmp_path, settings, asked):
+    given = [] if "data.root" in asked else [f"data.root={toy_root}"]
+    finished = command("fit", *settings, *given, *SMALL, "rasterizer=reference", f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1] == f"error: {asked}"
+    assert not (tmp_path / "run/checkpoints").exists()
+
+
+def test_random_weights_are_had_by_asking_and_a_continued_run_needs_no_other(command, pipeline, tmp_path):
+    settings = [
+        "experiment=co3d_var_stage1", "data=toy_objects", f"data.root={pipeline.toy}", *SMALL, "rasterizer=tiled",
+        "autoreconstructor.encoder.layers_per_block=1", "autoreconstructor.encoder.norm_groups=8", "test=false",
+        "callbacks.pictures=null",
+    ]  # fmt: skip
+    assert command("fit", *settings, "autoreconstructor.pretrained=null", f"out={tmp_path / 'run'}").status == 0
+    resume = f"ckpt_path={tmp_path / 'run/checkpoints/last.ckpt'}"
+    assert command("fit", *settings, resume, "trainer.max_steps=3", f"out={tmp_path / 'more'}").status == 0
+    assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3
+    checkpoint = f"ckpt={tmp_path / 'more/checkpoints/last.ckpt'}"
+    assert command("test", checkpoint, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}").status == 0

@@ -11,8 +11,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from support import SMALL, call, strict_json
+from vgg_weights import blank, saved
 
 from completesplat.commands.sweeps import LONGEST_NAME, job_name, swept_keys
+from completesplat.losses.vgg import load_vgg16
 from completesplat.training.reconstruction import ReconstructionModule
 
 STEPS = 3
@@ -188,7 +190,7 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
     (tmp_path / "process_notes.py").write_text(NOTE)
     sweep = tmp_path / "sweep"
     arguments = [
-        *settings(toy_root, steps=1), "seed=3,4", f"out={sweep}", "trainer.devices=2", "+trainer.strategy=ddp",
+        *settings(toy_root, steps=1), "seed=3,4", f"out={sweep}", "trainer.devices=2", "trainer.strategy=ddp",
         "rasterizer=reference", "test=false",
         "+callbacks.note={_target_: process_notes.Note, folder: '${out}/notes', seed: '${seed}'}",
     ]  # fmt: skip
@@ -211,3 +213,28 @@ def test_submitit_runs_the_jobs_of_a_sweep_in_processes_of_their_own(toy_root, t
     for seed in (0, 1):
         assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
     assert list(sweep.glob(".submitit/**/*_log.out"))
+
+
+@pytest.mark.slow
+def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(command, monkeypatch, toy_root, tmp_path):
+    """The ablation table is two sweeps: without LPIPS differs from the full model in the second part only."""
+    generator = torch.Generator().manual_seed(0)
+    random = {name: 0.05 * torch.randn(value.shape, generator=generator) for name, value in blank().items()}
+    vgg = saved(random, tmp_path / "vgg.pth")  # in the place of the one that would be downloaded
+    monkeypatch.setattr("completesplat.losses.lpips.load_vgg16", lambda weights, sha256: load_vgg16(str(vgg)))
+    shared = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "ablation=full,no_lpips", "seed=choice(0)"]
+    one, two = tmp_path / "PART1", tmp_path / "TABLE"
+    assert command("fit", "-m", "experiment=toy_var", *shared, "test=false", f"out={one}").status == 0
+    start = f"model.checkpoint={one}/ablation-${{hydra:runtime.choices.ablation}}+seed-${{seed}}/{LAST}"
+    assert command("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}").status == 0
+
+    first, second = (
+        [weights(sweep / f"ablation-{row}+seed-0") for row in ("full", "no_lpips")] for sweep in (one, two)
+    )
+    assert all(torch.equal(value, first[1][name]) for name, value in first[0].items())
+    assert any(not torch.equal(value, second[1][name]) for name, value in second[0].items())
+    for job, row in zip(second, ("full", "no_lpips"), strict=True):
+        config = OmegaConf.load(two / f"ablation-{row}+seed-0/config.yaml")
+        assert config.model.checkpoint == str(one / f"ablation-{row}+seed-0" / LAST)
+        assert any(not torch.equal(value, first[0][name]) for name, value in job.items())
+    assert len((two / "summary.csv").read_text().splitlines()) >= 3

@@ -14,6 +14,7 @@ from completesplat.data.co3d import CO3DDataModule
 from completesplat.data.co3d_category import Filters, SplitMembers, read_category
 from completesplat.data.co3d_placement import object_placement
 from completesplat.data.co3d_splits import SeededSplit
+from completesplat.data.scenes import SceneStore
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import DataError
@@ -238,3 +239,15 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
     found.append(fingerprint())
     assert found[0] == found[1]
     assert len(set(found)) == 4
+
+
+def test_without_targets_one_picture_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
+    read, picture = [], SceneStore._picture
+    monkeypatch.setattr(SceneStore, "_picture", lambda *given: read.append(given) or picture(*given))
+    settings = {"references_per_sequence": 4, "mirroring": True, "box_masks": {"probability": 0.5}}
+    without = epoch(module(toy_root, targets=0, **settings).train_dataloader(), 0)
+    assert len(read) == sum(len(batch.names) for batch in without) == 8
+    for batch, other in zip(without, epoch(module(toy_root, targets=1, **settings).train_dataloader(), 0), strict=True):
+        assert batch.targets.images.shape == (2, 0, 3, 16, 16)
+        assert torch.equal(batch.reference.images, other.reference.images)
+        assert torch.equal(batch.visible, other.visible)

@@ -103,7 +103,7 @@ def test_processes_have_their_own_items_and_equally_many(root, monkeypatch, worl
         sampler.set_epoch(2)
         parts.append(list(sampler))
         assert len(sampler) == len(parts[-1]) == 7 // world_size
-        assert len(loader(root)) == -(-(8 // world_size) // 3)
+        assert len(loader(root, batch_size=3 * world_size)) == -(-(8 // world_size) // 3)
     keys = [key for part in parts for key in part]
     assert len(set(keys)) == len(keys) == 7 // world_size * world_size
     assert set(keys) <= {(2, index) for index in range(7)}

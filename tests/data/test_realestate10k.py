@@ -256,3 +256,21 @@ def test_a_model_trains_on_it(root, tmp_path):
     trainer.fit(model, datamodule=data)
     trainer.test(model, datamodule=data, verbose=False)
     assert any(not torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
+
+
+def test_a_scene_can_be_its_reference_alone(tmp_path):
+    clips = [make_clip(f"c{i}") for i in range(2)]
+    data = module(write_tree(tmp_path, "text", clips, clips[:1]), targets=0, mirroring=True, val_fraction=0.0)
+    (batch,) = epoch(data.train_dataloader(), 0)
+    assert batch.targets.images.shape == (len(batch.names), 0, 3, 16, 16)
+    assert torch.equal(batch.all_views().images, batch.reference.images[:, None])
+
+
+@pytest.mark.parametrize("experiment", ["co3d_diffusion", "re10k_diffusion", "toy_diffusion"])
+def test_latent_diffusion_reads_no_targets(experiment):
+    assert compose_config("fit", f"experiment={experiment}").data.targets == 0
+
+
+def test_a_negative_number_of_targets_is_refused(tmp_path):
+    with pytest.raises(CompleteSplatError, match=r"data.targets=-1: must be 0 or more"):
+        module(tmp_path, targets=-1)

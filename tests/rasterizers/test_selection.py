@@ -2,12 +2,19 @@
 
 import logging
 import math
+import shutil
 import sys
 from collections.abc import Iterator
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from support import compose_config
 
+from completesplat.commands import refusal
+from completesplat.commands.trained import config_of_run
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection, tiled
@@ -142,3 +149,21 @@ def test_the_choice_works_where_gradients_are_off() -> None:
 def test_a_gpu_with_gsplat_is_used(gpu: None) -> None:
     pytest.importorskip("gsplat")
     assert isinstance(selection.auto(RenderingConstants(**cuda.compiled_constants())), cuda.CudaRasterizer)
+
+
+def test_where_cuda_is_asked_for_and_does_not_work_the_line_says_what_to_choose():
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(compose_config("fit", "rasterizer=cuda").rasterizer, _convert_="all")
+    line = refusal(caught.value)
+    assert line is not None
+    assert "needs a CUDA device" in line
+    assert line.endswith("; rasterizer=auto takes the fastest one that works here")
+
+
+def test_a_run_that_asked_for_cuda_is_tested_with_what_works(pipeline, tmp_path):
+    run = shutil.copytree(pipeline.var, tmp_path / "run")
+    config = OmegaConf.load(run / "config.yaml")
+    config.model.rasterizer._target_ = compose_config("fit", "rasterizer=cuda").rasterizer._target_
+    OmegaConf.save(config, run / "config.yaml")
+    found = config_of_run(run / "checkpoints/last.ckpt", []).model.rasterizer
+    assert isinstance(instantiate(found, _convert_="all"), TiledRasterizer)

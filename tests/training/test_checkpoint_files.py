@@ -1,13 +1,18 @@
 """A checkpoint is there as a whole or not at all."""
 
 import io
+import itertools
+import os
+from pathlib import Path
 
 import pytest
 import torch
 from hydra.utils import instantiate
+from lightning import LightningModule, Trainer
 from support import compose_config
 
-from completesplat.training.checkpoint_files import CheckpointFiles
+from completesplat.errors import CompleteSplatError
+from completesplat.training.checkpoint_files import CheckpointFiles, Checkpoints
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
@@ -40,3 +45,119 @@ def test_training_writes_its_checkpoints_so_and_not_into_memory_first(tmp_path, 
     trainer.strategy.checkpoint_io.save_checkpoint({}, tmp_path / "last.ckpt")
     assert not any(isinstance(file, io.BytesIO) for file in saved)
     assert (tmp_path / "last.ckpt").is_file()
+
+
+class Line(LightningModule):
+    """Two numbers, trained on one."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(1, 1)
+
+    def training_step(self, batch, index):
+        return self.layer(batch).square().mean()
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def train(folder, steps, accumulated=1, **settings) -> None:
+    """So many optimizer steps, with the configuration's callback."""
+    config = compose_config("fit", f"out={folder}").callbacks.checkpoint
+    callback = instantiate(config, every_n_train_steps=settings.pop("every_n_train_steps", None), **settings)
+    trainer = Trainer(
+        max_steps=steps, accelerator="cpu", logger=False, plugins=[CheckpointFiles()], callbacks=[callback],
+        accumulate_grad_batches=accumulated, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(Line(), torch.utils.data.DataLoader(torch.ones(100, 1)))
+
+
+def step_of(path) -> int:
+    return torch.load(path, weights_only=True)["global_step"]
+
+
+@pytest.fixture
+def written(monkeypatch) -> list[int]:
+    """Sizes of the files that are written, in order."""
+    sizes, save = [], torch.save
+
+    def recorded(contents, file):
+        save(contents, file)
+        sizes.append(Path(file).stat().st_size)
+
+    monkeypatch.setattr(torch, "save", recorded)
+    return sizes
+
+
+def test_an_interval_writes_one_file(tmp_path, written):
+    train(tmp_path, steps=5, every_n_train_steps=2)
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["last.ckpt"]
+    assert step_of(tmp_path / "checkpoints/last.ckpt") == 5
+    assert len(written) == 3  # at 2, at 4 and in the end
+    assert max(written) < 1.1 * min(written)
+
+
+def test_milestones_are_kept_and_written_once(tmp_path, written):
+    train(tmp_path, steps=7, every_n_train_steps=2, keep_every=3)
+    files = {path.name: path for path in (tmp_path / "checkpoints").iterdir()}
+    assert {name: step_of(path) for name, path in files.items()} == {"last.ckpt": 7, "step=3.ckpt": 3, "step=6.ckpt": 6}
+    assert len(written) == 5  # at 2, 3, 4, 6, 7
+
+
+def test_the_last_milestone_is_the_same_file_as_the_last_checkpoint(tmp_path):
+    train(tmp_path, steps=4, keep_every=2)
+    assert (tmp_path / "checkpoints/last.ckpt").samefile(tmp_path / "checkpoints/step=4.ckpt")
+
+
+def test_without_hard_links_milestones_are_copied(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("not permitted")))
+    train(tmp_path, steps=3, keep_every=2)
+    files = {path.name: step_of(path) for path in (tmp_path / "checkpoints").iterdir()}
+    assert files == {"last.ckpt": 3, "step=2.ckpt": 2}
+
+
+def test_intervals_in_minutes(tmp_path, written, monkeypatch):
+    minutes = itertools.count()  # each look at the clock takes one: at the start, then after every step
+    monkeypatch.setattr("completesplat.training.checkpoint_files.now", lambda: 60.0 * next(minutes))
+    train(tmp_path, steps=7, every_minutes=3)
+    assert len(written) == 3  # after 3 steps, after 6, and in the end
+
+
+def test_only_whole_optimizer_steps_are_written(tmp_path, monkeypatch):
+    counts = []
+    monkeypatch.setattr(torch, "save", lambda contents, file: counts.append(contents) or Path(file).touch())
+    train(tmp_path, steps=4, accumulated=3, every_minutes=0)
+    batches = [c["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]["completed"] for c in counts]
+    assert [c["global_step"] for c in counts] == [1, 2, 3, 4]
+    assert all(batch in (3 * n, 3 * n - 1) for n, batch in enumerate(batches, start=1))
+
+
+@pytest.mark.parametrize("survived", range(8))
+def test_a_run_killed_between_any_two_changes_of_files_has_a_whole_last_checkpoint(tmp_path, monkeypatch, survived):
+    """Killed before the file system's change number `survived`; nothing tidies up behind a killed process."""
+    train(tmp_path, steps=1)
+    changes = itertools.count()
+
+    def counted(change):
+        def checked(*arguments):
+            if next(changes) >= survived:
+                raise Killed
+            return change(*arguments)
+
+        return checked
+
+    for place, name in ((torch, "save"), (os, "link"), (os, "replace")):
+        monkeypatch.setattr(place, name, counted(getattr(place, name)))
+    with pytest.raises(Killed):
+        train(tmp_path, steps=9, every_n_train_steps=1, keep_every=2)
+    assert step_of(tmp_path / "checkpoints/last.ckpt") in range(1, 9)
+
+
+class Killed(BaseException):
+    """The end of a process."""
+
+
+def test_intervals_that_mean_nothing_are_refused(tmp_path):
+    for setting in ("every_n_train_steps", "keep_every"):
+        with pytest.raises(CompleteSplatError, match=f"callbacks.checkpoint.{setting}=0: must be at least 1"):
+            Checkpoints(str(tmp_path), **{setting: 0})

@@ -28,7 +28,7 @@ def settings(pipeline, latent_cache):
     """Arguments of `completesplat`, by stage; "encoded" is stage 2 from the latent cache."""
     shared = [f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
-    own = ["sampler.steps=2", "data.targets=1", "callbacks.samples.every_n_steps=2"]
+    own = ["sampler.steps=2", "callbacks.samples.every_n_steps=2"]
     stage2 = ["fit", "experiment=toy_diffusion", *shared, stage1, *own]
     return {
         "var": ["fit", "experiment=toy_var", *shared],

@@ -7,7 +7,7 @@ from support import SMALL, compose_config, strict_json
 
 from completesplat.training.checkpoints import read_checkpoint
 
-SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4", "model.model.rows=20"]
+SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4"]
 
 
 @pytest.fixture
@@ -32,10 +32,11 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path, run):
     assert 0 < strict_json(tmp_path / "scores/metrics.json")["model"]["full"]["novel"]["psnr"] < 100
 
 
-def test_a_full_table_ends_training_with_one_line(command, toy_root, tmp_path):
-    finished = command("fit", *SETTINGS, f"data.root={toy_root}", "model.model.rows=1", f"out={tmp_path / 'run'}")
-    assert finished.status == 2
-    assert "error: all 1 codes are taken" in finished.err.splitlines()[-1]
+def test_the_table_has_a_row_for_every_training_picture(toy_root, run):
+    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
+    source = data.source("train")
+    pictures = sum(len(source.read(name).frames) for name in source.names)
+    assert len(read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]["model.codes"]) == pictures == 8
 
 
 @pytest.mark.parametrize("ablation", ["full", "skips_first_two"])

@@ -1,0 +1,94 @@
+"""data.batch_size is the batch of an optimizer step, however many processes and accumulated batches share it."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import SMALL, compose_config, strict_json
+from torch import distributed, multiprocessing
+
+from completesplat.data.processes import batch_per_process
+from completesplat.errors import CompleteSplatError
+from completesplat.training.reconstruction import ReconstructionModule
+
+SETTINGS = ["data.image_size=32", "data.references_per_sequence=8"]
+
+
+def epoch_of(root: str, batch_size: int) -> list[list[tuple[str, int]]]:
+    """The scenes (sequence and reference frame) of each batch of this process."""
+    config = compose_config("fit", f"data.root={root}", *SETTINGS, f"data.batch_size={batch_size}")
+    data = instantiate(config.data, _convert_="all")
+    batches = data.train_dataloader()
+    return [list(zip(batch.names, batch.reference_frame.tolist(), strict=True)) for batch in batches]
+
+
+def one_of_two(rank: int, root: str, folder: str) -> None:
+    torch.set_num_threads(1)
+    distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
+    batches = epoch_of(root, 4)
+    try:
+        epoch_of(root, 5)
+    except CompleteSplatError as error:
+        (Path(folder) / f"{rank}.json").write_text(json.dumps({"batches": batches, "refusal": str(error)}))
+    distributed.destroy_process_group()
+
+
+def test_two_processes_share_the_batch(toy_root, tmp_path):
+    multiprocessing.spawn(one_of_two, (str(toy_root), str(tmp_path)), nprocs=2)
+    first, second = (strict_json(tmp_path / f"{rank}.json") for rank in (0, 1))
+    alone = epoch_of(str(toy_root), 4)
+    assert len(first["batches"]) == len(second["batches"]) == len(alone)  # as many optimizer steps
+    for one, other, whole in zip(first["batches"], second["batches"], alone, strict=True):
+        assert len(one) == len(other) == 2
+        assert sorted(map(tuple, one + other)) == sorted(whole)  # of the same scenes
+    assert "data.batch_size=5 is the batch of an optimizer step: it must be a multiple of 2 proc" in first["refusal"]
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "count", "accumulated", "share"), [(32, 1, 1, 32), (32, 8, 1, 4), (32, 8, 2, 2), (32, 32, 1, 1)]
+)
+def test_the_share_of_a_process(batch_size, count, accumulated, share):
+    assert batch_per_process(batch_size, count, accumulated) == share
+
+
+@pytest.mark.parametrize(("count", "accumulated"), [(3, 1), (8, 8), (64, 1)])
+def test_what_does_not_divide_is_refused(count, accumulated):
+    with pytest.raises(CompleteSplatError, match=r"data.batch_size=32 .* must be a multiple of"):
+        batch_per_process(32, count, accumulated)
+
+
+def test_accumulated_batches_share_it_and_what_a_process_gets_is_recorded(command, toy_root, tmp_path, monkeypatch):
+    counts, step = [], ReconstructionModule.training_step
+
+    def counted(self, scenes, index):
+        counts.append(len(scenes.names))
+        return step(self, scenes, index)
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", counted)
+    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=4", "test=false"]
+    settings += ["trainer.accumulate_grad_batches=2", "callbacks.pictures=null", "data.references_per_sequence=8"]
+    finished = command("fit", *settings, f"out={tmp_path / 'run'}")
+    assert finished.status == 0
+    assert counts == [2, 2, 2, 2]  # two optimizer steps
+    assert strict_json(tmp_path / "run/metrics.json")["data.batch_per_process"] == 2
+    assert "data.batch_per_process=2" in (tmp_path / "run/commands.log").read_text()
+
+
+def test_a_batch_that_the_devices_do_not_share_is_refused_before_they_start(command, toy_root, tmp_path):
+    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=3", "rasterizer=reference"]
+    finished = command("fit", *settings, "trainer.devices=2", "trainer.strategy=ddp", f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith("error: data.batch_size=3 is the batch of an optimizer step")
+
+
+@pytest.mark.parametrize("variables", [{"LOCAL_RANK": "1", "RANK": "9"}, {"SLURM_STEP_NUM_TASKS": "8"}])
+def test_processes_of_a_launcher_need_one_directory(command, monkeypatch, variables):
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    refused = command("fit", "experiment=toy_var")
+    assert refused.status == 2
+    assert "give them one out=DIR" in refused.err.splitlines()[-1]
+    assert not os.path.exists("outputs")
