@@ -45,26 +45,27 @@ def run(config: Any, out: Path) -> None:
     module = instantiate(config.model, _convert_="all")
     if tested is not None:
         set_scoring(module, config.evaluation)
-    callbacks = [c for c in instantiate(config.callbacks, _convert_="all").values() if c is not None]
-    loggers = [x for x in instantiate(config.logger, _convert_="all").values() if x is not None]
-    trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    parts: dict[str, Any] = {"callbacks": config.callbacks, "logger": config.logger}
+    parts = {name: list(instantiate(part, _convert_="all").values()) for name, part in parts.items()}
+    parts = {name: [one for one in part if one is not None] for name, part in parts.items()}
+    trainer = instantiate(config.trainer, **parts, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
-    with finished(loggers):
+    with finished(trainer.loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train(trainer, module, data, checkpoint)
         if tested is not None:
             metrics |= _test(config, module, tested)
-        for one in loggers:  # a run shorter than the logging interval leaves its figures too
+        for one in trainer.loggers:  # a run shorter than the logging interval leaves its figures too
             one.log_metrics(metrics, step=trainer.global_step)
             one.save()
         scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:
             return
-        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch}
-        results |= {"data.batch_per_process": share, **metrics}
+        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, "data.batch_per_process": share}
+        results |= metrics
         if scores is not None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
