@@ -45,20 +45,18 @@ def run(config: Any, out: Path) -> None:
     module = instantiate(config.model, _convert_="all")
     if tested is not None:
         set_scoring(module, config.evaluation)
-    parts: dict[str, Any] = {"callbacks": config.callbacks, "logger": config.logger}
-    parts = {name: list(instantiate(part, _convert_="all").values()) for name, part in parts.items()}
-    parts = {name: [one for one in part if one is not None] for name, part in parts.items()}
-    trainer = instantiate(config.trainer, **parts, _convert_="all")
+    callbacks, loggers = _parts(config.callbacks), _parts(config.logger)
+    trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
-    with finished(trainer.loggers):
+    with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train(trainer, module, data, checkpoint)
         if tested is not None:
             metrics |= _test(config, module, tested)
-        for one in trainer.loggers:  # a run shorter than the logging interval leaves its figures too
+        for one in loggers:  # a run shorter than the logging interval leaves its figures too
             one.log_metrics(metrics, step=trainer.global_step)
             one.save()
         scores = module.test_results() if tested is not None else None
@@ -73,6 +71,13 @@ def run(config: Any, out: Path) -> None:
         _write(results, out / "metrics.json")
         if scores is not None:
             log_test(scores, shown, trainer, out)
+
+
+def _parts(config: Any) -> list[Any]:
+    """Callbacks or loggers: those that are not null."""
+    from hydra.utils import instantiate
+
+    return [part for part in instantiate(config, _convert_="all").values() if part is not None]
 
 
 def _write(results: dict[str, Any], path: Path) -> None:

@@ -1,0 +1,34 @@
+"""The paper's first experiment from files in CO3D's layout to its figures."""
+
+from co3d_trees import CATEGORY, write_tree
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from pretrained_vaes import random_vae
+from support import strict_json
+
+LISTS = {"train": "abcdef", "val": "g", "test": "hi"}
+
+
+def test_stage1_starts_from_a_vae_and_is_tested_on_sequences_never_seen(command, tmp_path):
+    write_tree(tmp_path / "co3d", dict.fromkeys("abcdefghi", 4), LISTS)
+    random_vae().save_pretrained(tmp_path / "vae")
+    run = tmp_path / "run"
+    fit = ["fit", "experiment=co3d_var_stage1", f"data.root={tmp_path / 'co3d'}", f"data.category={CATEGORY}"]
+    fit += ["data.image_size=32", "data.batch_size=2", "data.workers=0", "rasterizer=tiled", "trainer.accelerator=cpu"]
+    fit += ["trainer.max_steps=2", "trainer.max_epochs=null", "trainer.val_check_interval=2", "callbacks.progress=null"]
+    fit += [f"autoreconstructor.encoder.{name}" for name in ("channels=[8,8,16,16]", "layers_per_block=1")]
+    fit += ["autoreconstructor.encoder.norm_groups=4", f"out={run}"]
+
+    refused = command(*fit)
+    assert refused.status == 2
+    assert "autoreconstructor.pretrained=" in refused.err.splitlines()[-1]
+
+    trained = command(*fit, f"autoreconstructor.pretrained={tmp_path / 'vae'}")
+    assert trained.status == 0, trained.err
+    results = strict_json(run / "metrics.json")
+    protocol = results["test"]["protocol"]
+    assert results["steps"] == 2
+    assert (protocol["subset"], protocol["scenes"], protocol["scenes_listed"]) == ("fewview_dev", 2, 2)
+    data = instantiate(OmegaConf.load(run / "config.yaml").data, _convert_="all")
+    assert data.source("test").names == list(LISTS["test"])
+    assert not set(data.source("train").names) & set(data.source("test").names)
