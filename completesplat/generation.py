@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.data.photograph import Photograph, read_photograph
+from completesplat.data.pictures.photograph import Photograph, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts, joined
 from completesplat.errors import WeightsError
@@ -157,8 +157,8 @@ class CompleteSplat(nn.Module):
         """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
 
         Args:
-            image: a file, or a photograph read with `completesplat.data.photograph.read_photograph`.
-            visible: 0 where it is hidden; see `completesplat.data.masking`.
+            image: a file, or a photograph read with `completesplat.data.pictures.photograph.read_photograph`.
+            visible: 0 where it is hidden; see `completesplat.data.pictures.photograph`.
             **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
 
         Raises:

@@ -6,7 +6,7 @@ from typing import Any
 
 from co3d_trees import FRAMES, SEQUENCES, SET_LIST
 
-from completesplat.data.checks import BadAnnotation, BadCamera, OutsidePath
+from completesplat.data.validation import BadAnnotation, BadCamera, OutsidePath
 from completesplat.errors import DataError
 
 Edit = Callable[[Any], object]

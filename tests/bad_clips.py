@@ -11,8 +11,8 @@ import torch
 from bad_images import png
 from realestate10k_trees import StoredClip, assert_refusal, encode, equal, make_clip, module, same
 
-from completesplat.data.checks import BadAnnotation, BadCamera, BadPicture, TooFewFrames
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.validation import BadAnnotation, BadCamera, BadPicture, TooFewFrames
 from completesplat.errors import DataError
 from completesplat.scene import SceneBatch
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from co3d_trees import CATEGORY, SUBSET, write_tree
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.loading import SceneLoader
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.loading.loader import SceneLoader
 from completesplat.data.sequences import SPLITS, PosedSequence
 from completesplat.scene import SceneBatch
 

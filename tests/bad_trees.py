@@ -12,7 +12,7 @@ import numpy as np
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, change, depth_bits, look, orbit, write_cloud
 from PIL import Image
 
-from completesplat.data.checks import (
+from completesplat.data.validation import (
     BadCamera,
     BadPicture,
     BadPlacement,

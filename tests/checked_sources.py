@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from completesplat.data.checks import BadAnnotation, BadPicture
 from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.validation import BadAnnotation, BadPicture
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, pinhole
 

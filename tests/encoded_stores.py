@@ -8,7 +8,7 @@ from realestate10k_trees import make_clip, module, write_tree
 from support import compose_config
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k.module import RE10KDataModule
 
 FRAMES = 5
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from completesplat.data.checks import BadPicture, TooFewFrames
 from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.validation import BadPicture, TooFewFrames
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, look_at
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from completesplat.data.loading import SceneLoader
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.loading.loader import SceneLoader
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.errors import DataError
 from completesplat.scene import SceneBatch
 

@@ -17,7 +17,7 @@ TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(), str(path
 # A module imports from its own floor and from those before it.
 FLOORS = [
     "errors",
-    "weights_files",
+    "atomic",
     "weights",
     "tensors",
     "geometry",
@@ -35,8 +35,10 @@ FLOORS = [
     "training",
     "export",
     "viewer",
-    "reports",
+    "results",
+    "studies",
     "commands",
+    "benchmarks",
     "cli",
 ]
 LATENTS_ONLY = {"gaussians", "splatter_image", "rasterizers"}

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from completesplat.errors import WeightsError
-from completesplat.weights_files import weights_file
+from completesplat.weights import weights_file
 
 CONTENTS = b"weights"
 HASH = hashlib.sha256(CONTENTS).hexdigest()

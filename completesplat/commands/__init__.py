@@ -9,8 +9,15 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from completesplat.commands.jobs import PROCESS_OF_JOB, run_job, run_process_of_job
-from completesplat.commands.sweeps import is_sweep, job_name, one_of_several, sweep_arguments
+from completesplat.commands.jobs import (
+    PROCESS_OF_JOB,
+    is_sweep,
+    job_name,
+    one_of_several,
+    run_job,
+    run_process_of_job,
+    sweep_arguments,
+)
 from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
 

@@ -15,8 +15,8 @@ from completesplat.errors import CompleteSplatError
 
 def run(config: Any, out: Path) -> None:
     """Write scenes, read them in all their forms; write `data.json`, print tables."""
-    from completesplat.reports.loading import tables
-    from completesplat.reports.machine import machine
+    from completesplat.benchmarks import data
+    from completesplat.results.machine import machine
 
     check_settings(config)
     folder = Path(mkdtemp(prefix="bench_data_", dir=out))
@@ -30,7 +30,7 @@ def run(config: Any, out: Path) -> None:
     if "opening" in figures and "added_mb" not in figures["opening"]:
         results["not_measured"] = {"memory": "this system has no /proc/self/status"}
     (out / "data.json").write_text(json.dumps(results, indent=2) + "\n")
-    tables.show(results)
+    data.show(results)
 
 
 def check_settings(config: Any) -> None:
@@ -39,7 +39,7 @@ def check_settings(config: Any) -> None:
     Raises:
         CompleteSplatError: names the setting and what it may be.
     """
-    from completesplat.data.prepared.pictures import CODECS
+    from completesplat.data.packed.rows import CODECS
 
     for name, example in {"workers": 0, "codecs": "png"}.items():
         if isinstance(config[name], int | str) or not config[name]:
@@ -72,7 +72,7 @@ def _figures(config: Any, folder: Path) -> dict[str, Any]:
 
 def _objects(settings: dict[str, Any], codecs: list[str], folder: Path) -> dict[str, Any]:
     """Makers of data modules by the form they read; the form as published comes first."""
-    from completesplat.reports.loading.forms import prepared
+    from completesplat.benchmarks.data import prepared
 
     settings["write"](out=folder / "objects")
     data = partial(settings["data"], root=str(folder / "objects"))
@@ -82,7 +82,7 @@ def _objects(settings: dict[str, Any], codecs: list[str], folder: Path) -> dict[
 
 
 def _rooms(settings: dict[str, Any], codecs: list[str], folder: Path) -> dict[str, Any]:
-    from completesplat.reports.loading.forms import prepared
+    from completesplat.benchmarks.data import prepared
 
     root = settings["write"](out=folder / "rooms")
     chunks, text = (partial(settings["data"], root=str(root / form)) for form in ("chunks", "text"))
@@ -90,7 +90,7 @@ def _rooms(settings: dict[str, Any], codecs: list[str], folder: Path) -> dict[st
 
 
 def _store(objects: dict[str, Any], config: Any, folder: Path) -> Any:
-    from completesplat.reports.loading.forms import repeated
+    from completesplat.benchmarks.data import repeated
 
     codec = config.codecs[0]
     few = partial(objects[f"prepared {codec}"], references_per_sequence=1)
@@ -100,9 +100,7 @@ def _store(objects: dict[str, Any], config: Any, folder: Path) -> Any:
 def _measure(
     objects: dict[str, Any], rooms: dict[str, Any], store: Any, config: Any, tick: Callable[[str], None]
 ) -> dict[str, Any]:
-    from completesplat.reports.loading.epochs import rows
-    from completesplat.reports.loading.opening import opening
-    from completesplat.reports.loading.watching import chunks, decoding_share
+    from completesplat.benchmarks.data import chunks, decoding_share, opening, rows
 
     figures: dict[str, Any] = {"rows": rows(objects, list(config.workers), config.repeats, tick)}
     for name, make in objects.items():

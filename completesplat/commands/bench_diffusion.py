@@ -18,9 +18,9 @@ def run(config: Any, out: Path) -> None:
     """Compare on random weights; write `diffusion.json`, print a table."""
     from rich.console import Console
 
-    from completesplat.reports.diffusion import tables
-    from completesplat.reports.diffusion.comparing import NotMeasured, measured
-    from completesplat.reports.machine import machine
+    from completesplat.benchmarks import diffusion
+    from completesplat.benchmarks.diffusion import NotMeasured, measured
+    from completesplat.results.machine import machine
 
     device = check_settings(config)
     rows, not_measured = [], {}
@@ -37,7 +37,7 @@ def run(config: Any, out: Path) -> None:
     workload |= {"image_size": config.data.image_size, "batch": config.data.batch_size}
     results = {"machine": machine(), "workload": workload, "rows": rows, "not_measured": not_measured}
     (out / "diffusion.json").write_text(json.dumps(results, indent=2) + "\n")
-    tables.show(results)
+    diffusion.show(results)
 
 
 def check_settings(config: Any) -> Any:
@@ -66,8 +66,8 @@ def _comparisons(config: Any, device: Any, folder: Path) -> dict[str, Callable[[
     from hydra.utils import instantiate
     from omegaconf import OmegaConf
 
+    from completesplat.benchmarks import diffusion
     from completesplat.commands import quieten
-    from completesplat.reports.diffusion import compilation, drawing, training
 
     quieten()
     data = partial(instantiate, config.data, root=str(folder / "scenes"), _convert_="all")
@@ -76,12 +76,12 @@ def _comparisons(config: Any, device: Any, folder: Path) -> dict[str, Callable[[
     module = instantiate(config.model, _convert_="all").to(device)
     batch, precision = config.data.batch_size, config.precision
     few: Any = OmegaConf.to_container(config.few)
-    drawn = drawing.comparisons(module.completesplat, few, config.samples, config.steps, batch)
-    optimized = training.Training(module, precision)
+    drawn = diffusion.comparisons(module.completesplat, few, config.samples, config.steps, batch)
+    optimized = diffusion.Training(module, precision)
     return {
-        "cached_vs_on_the_fly": lambda: training.cached_vs_on_the_fly(optimized, data, folder / "latents"),
+        "cached_vs_on_the_fly": lambda: diffusion.cached_vs_on_the_fly(optimized, data, folder / "latents"),
         **{comparison.name: partial(_same, comparison) for comparison in drawn},
-        "compiled_vs_eager": lambda: compilation.compiled_vs_eager(
+        "compiled_vs_eager": lambda: diffusion.compiled_vs_eager(
             module.completesplat, batch, precision, config.compile_limit
         ),
     }

@@ -22,9 +22,9 @@ def run(config: Any, out: Path) -> None:
     """Measure on random weights; write `paper.json`, print a table."""
     from rich.console import Console
 
-    from completesplat.reports.machine import machine
-    from completesplat.reports.paper_speed import table
-    from completesplat.reports.paper_speed.figures import FIGURES
+    from completesplat.benchmarks import paper
+    from completesplat.benchmarks.paper import FIGURES
+    from completesplat.results.machine import machine
 
     device = _device(config)
     with (
@@ -38,7 +38,7 @@ def run(config: Any, out: Path) -> None:
         found = [FIGURES[row["name"]].durations() | row for row in found]
     results = {"machine": machine(), "workload": workload, "rows": found}
     (out / "paper.json").write_text(json.dumps(results, indent=2) + "\n")
-    table.show(results)
+    paper.show(results)
 
 
 def is_as_in_the_paper(config: Any) -> bool:
@@ -74,9 +74,9 @@ def _rows(config: Any, device: Any, folder: Path, tick: Any) -> list[dict[str, A
     import torch
     from hydra.utils import instantiate
 
+    from completesplat.benchmarks import paper
+    from completesplat.benchmarks.paper import WAYS, compiled
     from completesplat.commands import quieten
-    from completesplat.reports.paper_speed import measuring, works
-    from completesplat.reports.paper_speed.ways import WAYS, compiled
 
     quieten()
     data = instantiate(config.data, root=str(folder / "scenes"), _convert_="all")
@@ -84,13 +84,13 @@ def _rows(config: Any, device: Any, folder: Path, tick: Any) -> list[dict[str, A
     scenes = next(iter(data.train_dataloader())).to(device)
     ways = [way for way in WAYS if config.compile or way.compile is None]
     found = []
-    for name, work in ("stage1", works.stage1), ("stage2", partial(works.stage2, samples=config.samples)):
+    for name, work in ("stage1", paper.stage1), ("stage2", partial(paper.stage2, samples=config.samples)):
         torch.manual_seed(config.seed)
         module = instantiate(config[name], _convert_="all").to(device)
         for way in ways:
-            with compiled(works.networks(module), way):
+            with compiled(paper.networks(module), way):
                 pieces = work(module, scenes, precision=way.precision)
                 if not config.training or way.graphs:  # graphs and optimizer steps do not go together
                     del pieces[f"{name}_step"]
-                found += measuring.rows(way, pieces, config.repeats, device, tick)
+                found += paper.rows(way, pieces, config.repeats, device, tick)
     return found

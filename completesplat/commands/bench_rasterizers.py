@@ -17,10 +17,10 @@ def run(config: Any, out: Path) -> None:
     from hydra.utils import instantiate
     from rich.console import Console
 
-    from completesplat.reports.machine import machine
-    from completesplat.reports.rasterizers import tables
-    from completesplat.reports.rasterizers.backends import working_backends
-    from completesplat.reports.rasterizers.scene_file import read_scene
+    from completesplat.benchmarks import rasterizers
+    from completesplat.benchmarks.rasterizers import working_backends
+    from completesplat.benchmarks.workloads import read_scene
+    from completesplat.results.machine import machine
 
     check_settings(config)
     constants = instantiate(config.constants)
@@ -31,10 +31,10 @@ def run(config: Any, out: Path) -> None:
     results = {"machine": machine(), "not_measured": absent, **figures}
     (out / "rasterizers.json").write_text(json.dumps(results, indent=2) + "\n")
     if results.get("growth"):
-        from completesplat.reports.rasterizers import growth
+        from completesplat.benchmarks import rasterizers
 
-        growth.plot(results["growth"], out / "rasterizers.png")
-    tables.show(results)
+        rasterizers.plot(results["growth"], out / "rasterizers.png")
+    rasterizers.show(results)
 
 
 def check_settings(config: Any) -> None:
@@ -54,14 +54,14 @@ def check_settings(config: Any) -> None:
 def _speed(config: Any, backends: list, tick: Callable[[str], None]) -> dict[str, Any]:
     from hydra.utils import instantiate
 
+    from completesplat.benchmarks import rasterizers, training_step
     from completesplat.commands import quieten
-    from completesplat.reports.rasterizers import growth, speed, training_step
 
     quieten()
-    figures = {"rows": speed.rows(backends, list(config.sizes), list(config.views), config.repeats, tick)}
+    figures = {"rows": rasterizers.speed_rows(backends, list(config.sizes), list(config.views), config.repeats, tick)}
     if config.growth:
         chosen = [backend for backend in backends if backend.name in config.growth.backends]
-        figures["growth"] = growth.rows(chosen, tick, config.growth.most_gaussians)
+        figures["growth"] = rasterizers.growth_rows(chosen, tick, config.growth.most_gaussians)
     if config.training_step:
         workload = {key: config.training_step[key] for key in ("size", "batch", "targets", "precision")}
         make_module = partial(instantiate, config.model, _convert_="all")
@@ -77,8 +77,8 @@ def _scene(
     gaussians: Any, cameras: Any, defaults: list[str], constants: Any, config: Any, backends: list,
     tick: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
-    from completesplat.reports.rasterizers import agreement, speed
-    from completesplat.reports.rasterizers.scene_file import DEFAULTS
+    from completesplat.benchmarks import rasterizers
+    from completesplat.benchmarks.workloads import DEFAULTS
 
     if defaults:
         values = ", ".join(f"{name}={DEFAULTS[name]}" for name in defaults)
@@ -86,9 +86,9 @@ def _scene(
     views, (height, width) = cameras.intrinsics.shape[1], cameras.image_size
     tick(f"{gaussians.count} Gaussians in {views} views")
     workload = {"size": max(height, width), "gaussians": gaussians.count, "views": views, "opacity": "file"}
-    timed = speed.side_by_side(backends, gaussians, cameras, config.repeats)
+    timed = rasterizers.side_by_side(backends, gaussians, cameras, config.repeats)
     return {
         "rows": [{"backend": name} | workload | figures for name, figures in timed.items()],
         "scene": {"file": str(config.scene), "height": height, "width": width, "defaults": defaults},
-        "agreement": agreement.rows(backends, gaussians, cameras, constants, tick),
+        "agreement": rasterizers.agreement_rows(backends, gaussians, cameras, constants, tick),
     }

@@ -12,17 +12,10 @@ from completesplat.errors import CompleteSplatError, DataError, WeightsError
 logger = logging.getLogger(__name__)
 
 
-def run(config: Any, out: Path) -> None:
-    """Do the chosen task (`conf/data_task/`)."""
-    from hydra.utils import instantiate
-
-    instantiate(config.task, out=out, _convert_="all")
-
-
 def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
-    from completesplat.data.checking import Findings, show
-    from completesplat.data.checking import check as check_sources
+    from completesplat.data.audit import Findings, show
+    from completesplat.data.audit import check as check_sources
 
     try:
         findings = check_sources(_sources(data, splits), workers)
@@ -39,8 +32,7 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
-    from completesplat.reports.data_sets.statistics import show_statistics, statistics
-    from completesplat.reports.data_sets.statistics_plot import plot_statistics
+    from completesplat.studies.statistics import plot_statistics, show_statistics, statistics
 
     sources = _sources(data, splits)
     shown = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
@@ -52,8 +44,8 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
 
 def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
     """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
-    from completesplat.reports.data_sets.contact_sheet import MOST_SEQUENCES
-    from completesplat.reports.data_sets.contact_sheet import show as draw
+    from completesplat.studies.contact_sheet import MOST_SEQUENCES
+    from completesplat.studies.contact_sheet import show as draw
 
     if not 1 <= scenes <= MOST_SEQUENCES or pictures < 1:
         raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SEQUENCES} and 1 <= pictures")
@@ -67,9 +59,9 @@ def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
 
 
 def prepare(data: Any, splits: Sequence[str], out: Path, **settings: Any) -> None:
-    """Write the prepared form into `out`; see `completesplat.data.prepared.writing.prepare`."""
-    from completesplat.data.prepared.manifest import is_prepared
-    from completesplat.data.prepared.writing import prepare as prepare_sources
+    """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
+    from completesplat.data.packed.manifest import is_prepared
+    from completesplat.data.packed.writing import prepare as prepare_sources
 
     if is_prepared(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")

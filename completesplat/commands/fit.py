@@ -6,7 +6,32 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from rich.table import Table
+from torch import nn
+
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.results.tables import table
+
+COLUMNS = [("part", "part", ""), ("parameters, millions", "millions", ".2f"), ("of these trained", "trained", ".2f")]
+
+
+def parameter_table(module: nn.Module) -> Table:
+    """One line for each network of a module, and one for each part of a network that has several."""
+    return table("Model", COLUMNS, parameter_rows(module))
+
+
+def parameter_rows(module: nn.Module) -> list[dict[str, Any]]:
+    """Names, and numbers of parameters in millions, of parts down to two levels; parts without any are left out."""
+    rows = []
+    for name, child in module.named_children():
+        parts = [(f"  {part}", grandchild) for part, grandchild in child.named_children()]
+        for label, network in [(name, child), *(parts if len(parts) > 1 else [])]:
+            sizes = [(parameter.numel(), parameter.requires_grad) for parameter in network.parameters()]
+            if sizes:
+                millions, trained = sum(n for n, _ in sizes) / 1e6, sum(n for n, learns in sizes if learns) / 1e6
+                rows.append({"part": label, "millions": millions, "trained": trained})
+    return rows
+
 
 logger = logging.getLogger(__name__)
 
@@ -27,13 +52,12 @@ def run(config: Any, out: Path) -> None:
     from lightning import seed_everything
 
     from completesplat.commands import quieten
+    from completesplat.commands.evaluate import scored_data, set_scoring
     from completesplat.commands.protocol import protocol
-    from completesplat.commands.scoring import scored_data, set_scoring
-    from completesplat.data.processes import batch_per_process
-    from completesplat.reports.dashboard.logging import begin, log_test
-    from completesplat.reports.evaluation_table import evaluation_table, show
-    from completesplat.reports.parameters import parameter_table
-    from completesplat.training.wandb_run import finished
+    from completesplat.data.loading.distributed import batch_per_process
+    from completesplat.results.tables import evaluation_table, show
+    from completesplat.results.wandb import begin, log_test
+    from completesplat.training.loggers import finished
 
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
@@ -82,7 +106,7 @@ def _parts(config: Any) -> list[Any]:
 
 def _write(results: dict[str, Any], path: Path) -> None:
     """At once, since the file also tells that the job is done."""
-    from completesplat.export.atomic import atomic_path
+    from completesplat.atomic import atomic_path
 
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(results, indent=2) + "\n")
@@ -134,7 +158,7 @@ def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
     """Score as `completesplat test` does; everything that was logged."""
     from hydra.utils import instantiate
 
-    from completesplat.commands.scoring import scoring_trainer
+    from completesplat.commands.evaluate import scoring_trainer
 
     progress = instantiate(config.callbacks.progress, _convert_="all")
     callbacks = [] if progress is None else [progress]

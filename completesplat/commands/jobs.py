@@ -1,7 +1,9 @@
-"""One job: a directory, its configuration, and the processes that work on it."""
+"""The jobs of a sweep and single runs: their folders, what is recorded of them, what continues."""
 
+import hashlib
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -11,8 +13,63 @@ from pathlib import Path
 from typing import Any
 
 from completesplat import __version__
-from completesplat.commands.source import git_commit
+from completesplat.commands.protocol import git_commit
 from completesplat.errors import CompleteSplatError
+
+LONGEST_NAME = 120
+
+
+def is_sweep(arguments: list[str]) -> bool:
+    """Whether Hydra will start several jobs."""
+    return "-m" in arguments or "--multirun" in arguments
+
+
+def one_of_several() -> bool:
+    """Whether a launcher started several of this process: torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`)."""
+    return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
+
+
+def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
+    """What a sweep needs besides its own arguments: one directory, and in it one for each job, named by what is swept.
+
+    Raises:
+        CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
+    """
+    if one_of_several():
+        raise CompleteSplatError(
+            "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
+        )
+    keys = [override.split("=")[0] for override in arguments]
+    added = [] if "out" in keys else [f"out=outputs/{verb}/{run_name}"]
+    if verb == "fit" and "ckpt_path" not in keys:
+        added.append("ckpt_path=last")
+    swept = swept_keys(arguments)
+    if swept and "hydra.sweep.subdir" not in keys:
+        added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}")
+    return added
+
+
+def swept_keys(arguments: list[str]) -> list[str]:
+    """Keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    return [override.key_or_group for override in parsed if override.is_sweep_override()]
+
+
+def job_name(*keys: str, _root_: Any) -> str:
+    """A directory's name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
+
+    Without equals signs and commas, so that paths into it need no quotes in Hydra's overrides.
+    """
+    values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
+    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values)
+    name = re.sub(r"[^\w.+-]+", "_", full)
+    if name == full and len(name) <= LONGEST_NAME:
+        return name
+    return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
+
 
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
@@ -35,7 +92,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
-    from completesplat.export.atomic import atomic_path
+    from completesplat.atomic import atomic_path
 
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
@@ -54,7 +111,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
         if OmegaConf.select(config, f"model.{key}") is not None:
             config.model[key] = resolved["model"][key]
     with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
-        import_module(f"completesplat.commands.{verb}").run(config, out)
+        start(verb, config, out)
     print(out)
 
 
@@ -62,7 +119,20 @@ def run_process_of_job(verb: str, out: Path) -> None:
     """Work on a job whose first process is another one: Lightning starts one process for each device."""
     from omegaconf import OmegaConf
 
-    import_module(f"completesplat.commands.{verb}").run(OmegaConf.load(out / CONFIG), out)
+    start(verb, OmegaConf.load(out / CONFIG), out)
+
+
+def start(verb: str, config: Any, out: Path) -> None:
+    """Do what the configuration names as its task, else what the verb's module runs."""
+    from hydra.utils import get_method, instantiate
+
+    task = config.get("task")
+    if task is None:
+        import_module(f"completesplat.commands.{verb}").run(config, out)
+    elif isinstance(task, str):
+        get_method(task)(config, out)
+    else:
+        instantiate(task, out=out, _convert_="all")
 
 
 def is_first_process() -> bool:

@@ -1,9 +1,251 @@
-"""`completesplat predict`: photographs to complete scenes."""
+"""`completesplat predict`: complete scenes from photographs."""
 
+import logging
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
+from rich.console import Console
+from rich.progress import Progress
+
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.data.pictures.photograph import Photograph
+from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.errors import CompleteSplatError
+from completesplat.export.formats import CONVERTED, FORMATS
+from completesplat.export.prediction import Wanted, write_prediction
+from completesplat.export.splat_transform import find_splat_transform
+from completesplat.generation import CompleteSplat
+from completesplat.geometry.trajectories import PATHS
+
+
+def open_generator(config: Any) -> Any:
+    """The generator of `weights`, with the sampler that is wanted; says so if they are the package's own.
+
+    Raises:
+        WeightsError: no weights, or not readable.
+    """
+    from omegaconf import OmegaConf
+
+    from completesplat.generation import CompleteSplat
+    from completesplat.weights import in_the_box
+
+    if config.weights in in_the_box():
+        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
+    model = CompleteSplat.from_pretrained(config.weights)
+    if config.get("sampler") is not None:
+        sampler: Any = OmegaConf.to_container(config.sampler)
+        model.replace_sampler(sampler)
+    return model
+
+
+FAR = 1.5
+
+
+def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
+    """What to tell if the field of view is far from training's: if the tangents of half of it differ 1.5 times or more.
+
+    The networks see pixels, not angles, and put them at the depths that they have learnt. Across the picture lengths
+    go with the tangent, along the depth they do not: so the ratio of the tangents is that of the wrong proportions.
+    """
+    own, trained = (math.tan(math.radians(fov) / 2) for fov in (photograph.fov_degrees, trained_degrees))
+    ratio = own / trained
+    if 1 / FAR < ratio < FAR:
+        return None
+    wrong = f"{ratio:.1f} times too flat" if ratio > 1 else f"{1 / ratio:.1f} times too deep"
+    source = "given" if photograph.fov_source == "given" else "from EXIF; fov=DEGREES overrides it"
+    return (
+        f"the field of view is {photograph.fov_degrees:.0f} degrees ({source}), {trained_degrees:.0f} in training:"
+        f" expect shapes about {wrong}"
+    )
+
+
+SUFFIXES = (
+    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif"),
+    *(".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm"),
+)
+
+
+def find_pictures(image: Any) -> list[Path]:
+    """The files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its pictures, sorted by name.
+
+    A folder's pictures are known by their suffix, and its folders are left alone. Files that are named themselves are
+    taken as they are, missing ones too: reading them says what is wrong.
+
+    Raises:
+        CompleteSplatError: a folder without a picture, or an empty list.
+    """
+    found: list[Path] = []
+    for path in [Path(image)] if isinstance(image, str) else [Path(str(one)) for one in image]:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        pictures = sorted(one for one in path.iterdir() if one.is_file() and one.suffix.lower() in SUFFIXES)
+        if not pictures:
+            raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
+        found += pictures
+    if not found:
+        raise CompleteSplatError("image=[]: name at least one picture")
+    return found
+
+
+def folder_names(pictures: Sequence[Path]) -> list[str]:
+    """A name for each picture's folder: its stem, and for a stem that is taken `_2`, `_3` and so on behind it.
+
+    Capitals do not tell names apart, because they do not on every file system.
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for picture in pictures:
+        name, number = picture.stem, 2
+        while name.casefold() in taken:
+            name, number = f"{picture.stem}_{number}", number + 1
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def check_settings(config: Any) -> None:
+    """Refuse settings without a meaning.
+
+    Raises:
+        CompleteSplatError: names the setting and its range.
+    """
+    allowed_skip_weight(config.skip_weight)
+    check_guidance_weight(config.guidance_weight)
+    if not 0 <= config.background <= 1:
+        raise CompleteSplatError(f"background={config.background}: must lie between 0 and 1")
+    for name in ("samples", "frames", "batch"):
+        if config[name] is not None and config[name] < 1:
+            raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")
+    if config.steps is not None and not 1 <= config.steps <= 1000:
+        raise CompleteSplatError(f"steps={config.steps}: must lie between 1 and 1000")
+
+
+def wanted_files(config: Any) -> Wanted:
+    """What to write of each picture; looks for the converter if a format needs it.
+
+    Raises:
+        CompleteSplatError: no such format or camera path, no format at all, or no converter.
+    """
+    formats = _chosen("formats", config.formats, FORMATS)
+    if not formats:
+        raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
+    return Wanted(
+        formats=formats,
+        videos=_chosen("video", config.video, tuple(PATHS)),
+        frames=config.frames,
+        background=config.background,
+        maps=config.maps,
+        widen=config.widen,
+        converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
+    )
+
+
+def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
+    """One name or a list of them, each once."""
+    names = [value] if isinstance(value, str) else list(value or [])
+    for one in names:
+        if one not in choice:
+            raise CompleteSplatError(f"{name}={one}: choose from {', '.join(choice)}")
+    return tuple(dict.fromkeys(names))
+
+
+def visible_part(config: Any, image: Path, size: int) -> Any:
+    """[1 size size], 0 where `mask` or `box` hide the photograph; None without them.
+
+    Raises:
+        ImageError: the mask is not a readable picture.
+        CompleteSplatError: mask and box at once, a box that is none, or a mask that hides nothing.
+    """
+    from completesplat.data.pictures.photograph import outside_of_box, outside_of_mask
+
+    if config.mask is not None and config.box is not None:
+        raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
+    if config.mask is not None:
+        return outside_of_mask(image, Path(config.mask), size)
+    if config.box is None:
+        return None
+    if isinstance(config.box, str | int | float) or not all(isinstance(edge, int | float) for edge in config.box):
+        raise CompleteSplatError(f"box={config.box}: give [x0,y0,x1,y1]")
+    return outside_of_box(image, list(config.box), size)
+
+
+log = logging.getLogger(__name__)
+
+
+def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+    """Write each picture's files into a folder of its own below `out`.
+
+    A bar shows how many samples are done; where nobody watches (no terminal), a line is printed for every picture.
+
+    Raises:
+        CompleteSplatError: what is wrong with the only picture, or how many of several failed, and which.
+    """
+    console, failed = Console(), []
+    rasterizer = instantiate(config.rasterizer, _convert_="all")
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=len(pictures) * config.samples)
+        for index, (picture, name) in enumerate(zip(pictures, folder_names(pictures), strict=True)):
+            bar.update(task, description=picture.name, completed=index * config.samples)
+            start = time.perf_counter()
+            try:
+                _predict(config, model, picture, rasterizer, wanted, out / name, lambda: bar.advance(task))
+            except (CompleteSplatError, OSError) as error:
+                if len(pictures) == 1:
+                    raise CompleteSplatError(_one_line(picture, error)) from error
+                failed.append(picture.name)
+                print(f"error: {_one_line(picture, error)}", file=sys.stderr, flush=True)
+                continue
+            if not console.is_terminal:
+                seconds = time.perf_counter() - start
+                print(f"{index + 1}/{len(pictures)} {picture.name}: {out / name} ({seconds:.0f} s)", flush=True)
+    if failed:
+        share = f"{len(failed)} of {len(pictures)} pictures failed ({', '.join(failed)})"
+        raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
+
+
+def _predict(
+    config: Any,
+    model: CompleteSplat,
+    image: Path,
+    rasterizer: Any,
+    wanted: Wanted,
+    folder: Path,
+    on_sample: Callable[[], None],
+) -> None:
+    photograph = model.read(image, config.fov)
+    warning = unusual_field_of_view(photograph, model.fov_degrees.item())
+    if warning is not None:
+        log.warning("%s: %s", image.name, warning)
+    visible = visible_part(config, image, model.image_size)
+    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
+    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
+    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+    scenes = model(photograph, visible, batch=config.batch, **settings)
+    recorded = {
+        **settings,
+        "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
+        "image": image.name,
+        "widened": config.widen,
+        "mask": None if config.mask is None else Path(config.mask).name,
+        "box": None if config.box is None else list(config.box),
+        "fov_degrees": photograph.fov_degrees,
+        "fov_source": photograph.fov_source,
+        "depth_range": model.depth_range.tolist(),
+    }
+    shown = photograph.image if visible is None else photograph.image * visible
+    camera = model.camera(photograph)
+    write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
+
+
+def _one_line(picture: Path, error: Exception) -> str:
+    message = " ".join(str(error).split())
+    return message if picture.name in message else f"{picture}: {message}"
 
 
 def run(config: Any, out: Path) -> None:
@@ -12,10 +254,6 @@ def run(config: Any, out: Path) -> None:
     Raises:
         CompleteSplatError: settings without a meaning, or at least one picture of which nothing could be made.
     """
-    from completesplat.commands.generator import open_generator
-    from completesplat.commands.pictures import find_pictures
-    from completesplat.commands.predict_pictures import predict_pictures
-    from completesplat.commands.predict_settings import check_settings, wanted_files
 
     check_settings(config)
     pictures = find_pictures(config.image)

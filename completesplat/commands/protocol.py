@@ -1,12 +1,28 @@
 """What figures were measured of, and how: without it they say nothing."""
 
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 from completesplat import __version__
-from completesplat.commands.source import git_commit
-from completesplat.weights_files import sha256_of
+from completesplat.weights import sha256_of
+
+
+def git_commit() -> str | None:
+    """The commit of the source, marked when there are changes on top; None where there is no repository."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout
+
+    try:
+        if not git("ls-files", "."):  # an installed package inside somebody else's repository
+            return None
+        return git("rev-parse", "HEAD").strip() + ("-dirty" if git("status", "--porcelain") else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
 
 LPIPS = {"net": "vgg", "version": "0.1", "range": [-1, 1]}
 METRICS: dict[str, dict[str, Any]] = {
@@ -23,7 +39,7 @@ def protocol(asked: Any, module: Any, data: Any, results: dict[str, Any]) -> dic
         asked: the configuration of the protocol (`conf/evaluation/`).
         results: of the module's test.
     """
-    from completesplat.reports.machine import machine
+    from completesplat.results.machine import machine
 
     evaluation, model = module.evaluation, results["model"]
     described = {

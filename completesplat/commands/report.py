@@ -1,19 +1,13 @@
-"""`completesplat report`: tables of results, and what samplers, controls and masks do to a trained model's samples."""
+"""`completesplat report`: tables, a page, and studies of a trained model's samples."""
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from completesplat.errors import CompleteSplatError
-
-
-def run(config: Any, out: Path) -> None:
-    """Do the chosen task (`conf/report_task/`)."""
-    from hydra.utils import get_method
-
-    get_method(config.task)(config, out)
 
 
 def samplers(config: Any, out: Path) -> None:
@@ -23,11 +17,9 @@ def samplers(config: Any, out: Path) -> None:
 
     from completesplat.autoreconstructor.skips import allowed_skip_weight
     from completesplat.diffusion.guidance import check_guidance_weight
-    from completesplat.reports.machine import machine
-    from completesplat.reports.sampling.samplers import CLOSE, REFERENCE, fewest, rows
-    from completesplat.reports.sampling.samplers_plot import plot_samplers
-    from completesplat.reports.sweeps.headline import SSIM_NOTE
-    from completesplat.reports.tables import table
+    from completesplat.results.machine import machine
+    from completesplat.results.tables import SSIM_NOTE, table
+    from completesplat.studies.samplers import CLOSE, REFERENCE, fewest, plot_samplers, rows
 
     configs: Any = OmegaConf.to_container(config.samplers)
     for name, counts in config.steps.items():
@@ -60,10 +52,9 @@ def controls(config: Any, out: Path) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table."""
     from rich.console import Console
 
-    from completesplat.reports.sampling.controls import grid, rows, strips
-    from completesplat.reports.sampling.controls_plot import plot_controls
-    from completesplat.reports.sampling.strips import draw_strips
-    from completesplat.reports.tables import table
+    from completesplat.results.tables import table
+    from completesplat.studies.controls import grid, plot_controls, rows, strips
+    from completesplat.studies.samples import draw_strips
 
     for name in ("skip_weights", "guidance_weights"):
         _require_list(name, config[name])
@@ -92,8 +83,8 @@ def controls(config: Any, out: Path) -> None:
 def masked(config: Any, out: Path) -> None:
     """Write `masked.png`: inputs with boxes over them, several completions of each."""
     from completesplat.diffusion.guidance import check_guidance_weight
-    from completesplat.reports.sampling.masked import strips
-    from completesplat.reports.sampling.strips import draw_strips
+    from completesplat.studies.masked import strips
+    from completesplat.studies.samples import draw_strips
 
     for box in config.boxes:
         if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
@@ -118,7 +109,7 @@ def open_run(config: Any) -> tuple[Any, list[Any]]:
 
     from completesplat.commands import quieten
     from completesplat.commands.trained import config_of_run, diffusion_of
-    from completesplat.reports.sampling.drawing import Artist, first_scenes
+    from completesplat.studies.samples import Artist, first_scenes
     from completesplat.training.checkpoints import load_part
 
     for name, least in (("scenes", 1), ("samples", 2)):
@@ -157,3 +148,86 @@ def _status() -> Iterator[Callable[[str], None]]:
 
     with Console(stderr=True).status("drawing") as status:
         yield lambda text: status.update(f"drawing: {text}")
+
+
+def depth(config: Any, out: Path) -> None:
+    """Write `depth.json` and `depth.png`, and print the table."""
+    from rich.console import Console
+
+    from completesplat.results.tables import table
+    from completesplat.studies.controls import grid
+    from completesplat.studies.depth import rows, strips
+    from completesplat.studies.samples import draw_strips
+
+    check_settings(config)
+    weights = config.skip_weight, config.guidance_weight
+    settings = grid(weights[:1], weights[1:])
+    artist, scenes = open_run(config)
+    with Console(stderr=True).status("drawing") as status:
+        found = rows(artist, settings, scenes, config.far_degrees, lambda text: status.update(f"drawing: {text}"))
+        status.update("drawing: the figure")
+        pictures = strips(artist, scenes[: config.shown_scenes], *weights, config.shown)
+    described = {key: config[key] for key in ("scenes", "samples", "seed", "far_degrees")}
+    text = json.dumps({"settings": described, "rows": found}, indent=2, allow_nan=False)
+    (out / "depth.json").write_text(text + "\n")
+    names = [scene.names[0] for scene in scenes[: config.shown_scenes]]
+    title = f"Render, depth and normals in a far view, and deviation of {config.samples} samples' depth"
+    title += f" in the reference and the far view; skip {weights[0]:g}, guidance {weights[1]:g}"
+    draw_strips(pictures, names, out / "depth.png", title)
+    columns = [("skip", "skip_weight", "g"), ("guidance", "guidance_weight", "g")]
+    for view in ("reference", "far"):
+        columns += [(view, f"{view}_deviation", ".4f"), ("object", f"{view}_object_deviation", ".4f")]
+        columns += [("measured", f"{view}_measured", ".0%")]
+    Console(width=120).print(table("Deviation of depth over samples, scene units", columns, found))
+
+
+def check_settings(config: Any) -> None:
+    """Refuse settings without a meaning.
+
+    Raises:
+        CompleteSplatError: names the setting and its range.
+    """
+    if not 0 <= config.far_degrees <= 180:
+        raise CompleteSplatError(f"far_degrees={config.far_degrees}: must lie between 0 and 180")
+    for name in ("shown", "shown_scenes"):
+        if config[name] < 1:
+            raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")
+
+
+logger = logging.getLogger(__name__)
+LIMITS = ("frames", "samples", "predictions", "runs", "pictures", "megabytes")
+
+
+def write(config: Any, out: Path) -> None:
+    """Write `report.html` and say how large it is.
+
+    Raises:
+        CompleteSplatError: a limit below 1, no such folder, or nothing to show in it.
+    """
+    limits = {name: config.most[name] for name in LIMITS}
+    for name, value in limits.items():
+        if value < 1:
+            raise CompleteSplatError(f"most.{name}={value}: must be at least 1")
+
+    from completesplat.atomic import atomic_path
+    from completesplat.results.page import Limits, page
+    from completesplat.results.runs import origin
+
+    text, warnings = page(Path(config.runs), out, Limits(**limits), origin(out, levels=0))
+    with atomic_path(out / "report.html") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    for warning in warnings:
+        logger.warning(warning)
+    print(f"{out / 'report.html'}: {(out / 'report.html').stat().st_size / 1e6:.1f} MB")
+
+
+def tables(config: Any, out: Path) -> None:
+    """Write `tables.md`, `tables.csv` and `tables.tex`, and print the tables."""
+    from completesplat.results.published import tables as made_of
+    from completesplat.results.tables import show_tables, write_tables
+
+    made, warnings = made_of(None if config.runs is None else Path(config.runs))
+    write_tables(made, out)
+    show_tables(made)
+    for warning in warnings:
+        logger.warning(warning)

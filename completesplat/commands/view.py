@@ -80,12 +80,10 @@ def make_page(config: Any, out: Path) -> Any:
     import torch
     from hydra.utils import instantiate
 
-    from completesplat.commands.generator import open_generator
+    from completesplat.commands.predict import open_generator
     from completesplat.viewer.completion import Completion
-    from completesplat.viewer.page import Page
+    from completesplat.viewer.page import Page, Saver, start_server, stop_server
     from completesplat.viewer.samples import read_scene
-    from completesplat.viewer.saving import Saver
-    from completesplat.viewer.server import start_server, stop_server
     from completesplat.viewer.stage import Stage
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -145,7 +143,7 @@ def export(page: Any, path: Path) -> None:
     Raises:
         CompleteSplatError: it shows nothing.
     """
-    from completesplat.viewer.saving import write_page
+    from completesplat.viewer.page import write_page
 
     page.worker.wait()
     if not page.stage.samples:

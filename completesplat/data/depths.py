@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.data.module import SceneDataModule
+from completesplat.data.loading.module import SceneDataModule
 
 
 def evaluation_depths(data: SceneDataModule, split: str, name: str) -> Float[Tensor, "view 1 height width"] | None:

@@ -1,5 +1,6 @@
 """Sequences of pictures with cameras: what a data set is, once its own files and conventions are behind it."""
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -72,3 +73,15 @@ class SequenceSource(Protocol):
     def fingerprint(self) -> str:
         """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
         ...
+
+
+def split_by_hash(names: Sequence[str], fraction: float, seed: int) -> tuple[list[str], list[str]]:
+    """Training and held-out sequences, in the given order.
+
+    A sequence's side depends on its name and the seed only, so that it stays where it is when others come; only where
+    none would be held out is it the one with the smallest hash.
+    """
+    position = {name: int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8]) / 2**64 for name in names}
+    held_out = {name for name in names if position[name] < fraction}
+    held_out = held_out or set(sorted(names, key=position.__getitem__)[:1])
+    return [name for name in names if name not in held_out], [name for name in names if name in held_out]

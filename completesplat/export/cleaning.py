@@ -1,16 +1,16 @@
-"""The Gaussians that can be stored and drawn: what is broken is taken out here, before any file or video is made.
-
-Viewers hang on a single value that is not a number, and show nothing where one splat is endless.
-"""
+"""Gaussians for files: without what is broken, and as wide as training saw them."""
 
 import logging
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, transform_points
+from completesplat.rasterizers.protocol import RenderingConstants
 
 # Renderers square scales and positions, in float32.
 LARGEST = 1e18
@@ -43,3 +43,22 @@ def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
         raise CompleteSplatError(f"{name}: all {broken} Gaussians are broken (not finite, or no extent)")
     log.warning("%s: left out %d of %d Gaussians (not finite, or no extent)", name, broken, gaussians.count)
     return gaussians.keep(kept)
+
+
+def widened(gaussians: Gaussians, reference: Cameras, blur: float = RenderingConstants().blur) -> Gaussians:
+    """Gaussians that hold the rasterizer's blur, as it is in the reference view.
+
+    A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
+    makes Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian
+    at depth z gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes.
+
+    Args:
+        gaussians: [gaussian], in the world of the camera.
+        reference: the photograph's camera, unbatched, at the size that the model was trained at.
+    """
+    variance = blur * (_depth(gaussians, reference) / reference.intrinsics[0, 0]).square()
+    return replace(gaussians, scales=(gaussians.scales.square() + variance[:, None]).sqrt())
+
+
+def _depth(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, " gaussian"]:
+    return torch.as_tensor(transform_points(camera.world_to_camera, gaussians.means)[:, 2])

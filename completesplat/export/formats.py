@@ -1,15 +1,49 @@
-"""One scene in all the file formats that are wanted."""
+"""One scene in all the file formats that are wanted; `.splat`, the smallest of them, is written here."""
 
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError
-from completesplat.export.page import PageView, write_page
+from completesplat.export.cleaning import cleaned
 from completesplat.export.ply import write_ply
-from completesplat.export.splat import write_splat
-from completesplat.export.splat_transform import SplatTransform
+from completesplat.export.splat_transform import PageView, SplatTransform, write_page
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.rotations import normalize_quaternion
+
+RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
+
+
+def write_splat(path: str | Path, gaussians: Gaussians) -> int:
+    """Write one unbatched set of Gaussians, in its order; the file appears whole or not at all.
+
+    Colours beyond 0 to 1 are clamped.
+
+    Returns:
+        How many Gaussians the file holds; see `completesplat.export.cleaning` for what is left out.
+
+    Raises:
+        CompleteSplatError: none of the Gaussians can be stored.
+    """
+    kept = cleaned(gaussians, path).detach()
+    records = np.zeros(kept.count, RECORD)
+    records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
+    records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
+    records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(records.tobytes())
+    return kept.count
+
+
+def _bytes(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
+    return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()
+
 
 FORMATS = ("ply", "splat", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")

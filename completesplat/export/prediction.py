@@ -1,28 +1,150 @@
 """All files of one prediction: splats, videos, a contact sheet and a description."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from completesplat.export.cleaning import cleaned
-from completesplat.export.contact_sheet import Row, contact_sheet
+from completesplat.atomic import atomic_path
+from completesplat.export.cleaning import cleaned, widened
 from completesplat.export.formats import write_formats
-from completesplat.export.maps import write_maps
-from completesplat.export.page import PageView
-from completesplat.export.scene_json import write_scene_json
-from completesplat.export.splat_transform import SplatTransform
-from completesplat.export.video import write_video
-from completesplat.export.views import orbit_views, render_views
-from completesplat.export.widening import widened
+from completesplat.export.pictures import color_depth, enlarge, to_bytes, write_maps
+from completesplat.export.splat_transform import PageView, SplatTransform
+from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
+
+CONVENTIONS = {
+    "axes": "OpenCV: +x right, +y down, +z forward, seen from the reference camera",
+    "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
+    "intrinsics": "3 x 3, rows first, in pixels; pixel (column i, row j) has its centre at (i + 0.5, j + 0.5)",
+    "image_size": "(height, width) in pixels",
+    "units": "the data set's or model's own scale; not metres",
+    "quaternions": "(w, x, y, z), unit length",
+    "colors": "sRGB, 0 to 1, the same from every direction",
+}
+
+
+def write_scene_json(
+    path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
+) -> None:
+    """Write the scene description as plain JSON; the file appears whole or not at all.
+
+    Args:
+        path: the file.
+        reference: the reference camera, unbatched.
+        settings: what the scene was made with, as plain values.
+        seed: of the random numbers.
+        files: what each file beside this one is called, by purpose.
+
+    Raises:
+        ValueError: a number that is not finite (JSON has none).
+        TypeError: a setting that JSON cannot express.
+    """
+    camera = {
+        "world_to_camera": reference.world_to_camera.tolist(),
+        "intrinsics": reference.intrinsics.tolist(),
+        "image_size": list(reference.image_size),
+    }
+    scene = {
+        "format": "completesplat scene 1",
+        "reference_camera": camera,
+        "conventions": CONVENTIONS,
+        "settings": dict(settings),
+        "seed": seed,
+        "files": dict(files),
+    }
+    text = json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+READABLE_SIDE = 144
+GAP, LINE, MARGIN = 6, 20, 12
+INK, PAPER = "black", "white"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One sample: its renderings from several directions, and the depth seen from the first of them."""
+
+    label: str
+    images: Float[Tensor, "view 3 height width"]
+    depth: Float[Tensor, "1 height width"]
+
+
+def contact_sheet(
+    path: str | Path,
+    title: str,
+    reference: Float[Tensor, "3 height width"],
+    rows: Sequence[Row],
+    angles: Sequence[float],
+) -> None:
+    """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
+
+    All images share one size and are enlarged by a whole factor to cells of about 144 px. Depth is coloured on one
+    scale for all rows (near bright, far dark); places that show nothing are grey.
+
+    Args:
+        path: the file.
+        title: its first line.
+        reference: the input image.
+        rows: the samples, at least one.
+        angles: of the views in degrees, the same for all rows.
+
+    Raises:
+        ValueError: images that are not finite, or numbers of views and angles that differ.
+    """
+    if any(len(row.images) != len(angles) for row in rows):
+        raise ValueError(f"{len(angles)} angles given for rows of {[len(row.images) for row in rows]} views")
+    factor = max(1, round(READABLE_SIDE / max(reference.shape[-2:])))
+    height, width = (side * factor for side in reference.shape[-2:])
+    sheet = Image.new("RGB", _sheet_size(height, width, len(rows), len(angles) + 2), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=13)
+    depth_pictures, (near, far) = color_depth(torch.stack([row.depth for row in rows]))
+
+    draw.text((MARGIN, MARGIN), title, INK, ImageFont.load_default(size=16))
+    headings = ["input", *(f"{angle:g}°" for angle in angles), f"depth {near:.3g} to {far:.3g}"]
+    for column, heading in enumerate(headings):
+        draw.text((_left(column, width), MARGIN + 1.5 * LINE), heading, INK, font)
+    for index, (row, depth_picture) in enumerate(zip(rows, depth_pictures, strict=True)):
+        top = _top(index, height)
+        draw.text((_left(1, width), top - LINE), row.label, INK, font)
+        cells = [*row.images, depth_picture]
+        if index == 0:
+            _paste(sheet, reference, factor, _left(0, width), top)
+        for column, cell in enumerate(cells, start=1):
+            _paste(sheet, cell, factor, _left(column, width), top)
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="PNG")
+
+
+def _sheet_size(height: int, width: int, rows: int, columns: int) -> tuple[int, int]:
+    return _left(columns, width) - GAP + MARGIN, _top(rows, height) - LINE - GAP + MARGIN
+
+
+def _left(column: int, width: int) -> int:
+    return MARGIN + column * (width + GAP)
+
+
+def _top(row: int, height: int) -> int:
+    """Upper edge of a row's cells; above it stands its label, above the first row also the title and headings."""
+    return MARGIN + int(2.5 * LINE) + LINE + row * (height + LINE + GAP)
+
+
+def _paste(sheet: Image.Image, image: Float[Tensor, "3 height width"], factor: int, left: int, top: int) -> None:
+    sheet.paste(Image.fromarray(np.ascontiguousarray(to_bytes(enlarge(image, factor)))), (left, top))
+
 
 DIRECTIONS = 8
 
@@ -36,7 +158,7 @@ class Wanted:
         videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`.
         frames: of each video.
         background: grey value where a scene leaves a pixel open.
-        maps: depth, normals and opacity of the reference view, see `completesplat.export.maps`.
+        maps: depth, normals and opacity of the reference view, see `completesplat.export.pictures`.
         converter: writes the formats that need one.
         widen: store Gaussians `widened` for viewers, which draw larger pictures than training.
     """

@@ -1,14 +1,67 @@
-"""What happens around training."""
+"""What happens around training: averaged weights, seeds of each step, the progress bar."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
 from lightning import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
+from rich import get_console
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.training.latent_diffusion import LatentDiffusion
+
+
+class StepSeeds(Callback):
+    """Seeds torch's global generators anew before every training batch.
+
+    Posterior noise, skip dropout and the noise of the diffusion then depend on (seed, epoch, batch, process) alone, not
+    on what was drawn before: a run that is resumed, in the middle of an epoch too, draws what it would have drawn.
+    Batches are counted, not optimizer steps, which several batches share where gradients are accumulated.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        torch.manual_seed(step_seed(self.seed, trainer.current_epoch, batch_idx, trainer.global_rank))
+
+
+def step_seed(*place: int) -> int:
+    """64 bits that are different and unrelated for different places (NumPy's `SeedSequence`)."""
+    return int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
+
+
+logger = logging.getLogger(__name__)
+
+
+class Progress(RichProgressBar):
+    """Lightning's bar, with optimizer steps; where nobody watches (no terminal), a line after every validation."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+        """What stands behind the bar."""
+        metrics = super().get_metrics(trainer, pl_module)
+        metrics.pop("v_num", None)
+        return {"step": _steps(trainer), **metrics}
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_validation_end(trainer, pl_module)
+        if get_console().is_terminal or not trainer.is_global_zero:
+            return
+        shown = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
+        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        """Lightning's speaks of -2 epochs where there is no limit to them."""
+        return f"Epoch {current_epoch}"
+
+
+def _steps(trainer: Trainer) -> str:
+    return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
 
 
 class ExponentialMovingAverage(WeightAveraging):

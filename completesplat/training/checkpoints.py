@@ -1,12 +1,134 @@
-"""Reading checkpoints: plain tensors and containers only, so `weights_only=True` always."""
+"""Checkpoints: when they are written, how they get onto the disk, how they are read."""
 
+import os
+import shutil
+import time
 from pathlib import Path
 from typing import Any
 
 import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
+
+LAST = "last.ckpt"
+
+
+class CheckpointFiles(TorchCheckpointIO):
+    """Writes straight into a file beside the final place and renames it: there is a whole checkpoint or none.
+
+    Lightning's own first makes the whole file in memory, which for a model of 860 million parameters with its optimizer
+    and its average takes 15 GB more. The unfinished file always has the same name, so that a run which is killed while
+    it saves, again and again, leaves one of them and not many.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None) -> None:
+        """Replace what is at this path."""
+        final = Path(path)
+        final.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = _unfinished(final)
+        try:
+            torch.save(checkpoint, unfinished)
+            with unfinished.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(unfinished, final)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+class Checkpoints(Checkpoint):
+    """Writes `last.ckpt` anew at intervals and at the end of training, and milestones that are kept.
+
+    Every time one file is written: at a milestone `step=N.ckpt`, and `last.ckpt` becomes a second name (hard link) of
+    it. A run that is killed at any moment leaves a whole `last.ckpt`. (Lightning's `ModelCheckpoint` writes the whole
+    contents twice.)
+
+    Args:
+        folder: of the files.
+        every_n_train_steps: optimizer steps between them; None: they do not matter.
+        every_minutes: the next is due so long after the one before; None: time does not matter.
+        keep_every: optimizer steps between milestones; None: none are kept.
+
+    Raises:
+        CompleteSplatError: an interval of steps below 1.
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        every_n_train_steps: int | None = None,
+        every_minutes: float | None = None,
+        keep_every: int | None = None,
+    ) -> None:
+        for name, steps in (("every_n_train_steps", every_n_train_steps), ("keep_every", keep_every)):
+            if steps is not None and steps < 1:
+                raise CompleteSplatError(f"callbacks.checkpoint.{name}={steps}: must be at least 1")
+        self.folder = Path(folder)
+        self.every_n_train_steps = every_n_train_steps
+        self.every_minutes = every_minutes
+        self.keep_every = keep_every
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.step = self.saved_step = trainer.global_step
+        self.saved_at = now()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        # Several batches share an optimizer step where gradients are accumulated; these are not in a checkpoint.
+        stepped, self.step = trainer.global_step != self.step, trainer.global_step
+        if stepped and (self._is_milestone() or self._is_due(trainer)):
+            self._save(trainer)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step != self.saved_step:
+            self._save(trainer)
+
+    def _is_milestone(self) -> bool:
+        return self.keep_every is not None and self.step % self.keep_every == 0
+
+    def _is_due(self, trainer: Trainer) -> bool:
+        if self.every_n_train_steps is not None and self.step % self.every_n_train_steps == 0:
+            return True
+        if self.every_minutes is None:
+            return False
+        # All processes save together, and their clocks differ.
+        return trainer.strategy.broadcast(now() - self.saved_at >= 60 * self.every_minutes)
+
+    def _save(self, trainer: Trainer) -> None:
+        self.step = self.saved_step = trainer.global_step
+        self.saved_at = now()
+        last = self.folder / LAST
+        if not self._is_milestone():
+            return trainer.save_checkpoint(last)
+        milestone = self.folder / f"step={self.step}.ckpt"
+        trainer.save_checkpoint(milestone)
+        if trainer.is_global_zero:
+            link(milestone, last)
+        trainer.strategy.barrier("Checkpoints")
+
+
+def link(source: Path, target: Path) -> None:
+    """Give a file a second name, which may belong to another file until then; a copy where there are no hard links."""
+    unfinished = _unfinished(target)
+    unfinished.unlink(missing_ok=True)
+    try:
+        os.link(source, unfinished)
+    except OSError:
+        shutil.copyfile(source, unfinished)
+    os.replace(unfinished, target)
+
+
+def now() -> float:
+    """Seconds, of a clock that is never set."""
+    return time.monotonic()
+
+
+def _unfinished(final: Path) -> Path:
+    return final.with_name(f".{final.name}.unfinished")
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:

@@ -17,12 +17,11 @@ from completesplat import __version__
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.encoded.arrays import ArrayWriter
-from completesplat.data.encoded.manifest import Array, Manifest, Origin, is_encoded, write_manifest
-from completesplat.data.encoded.pictures import Picture, Reading, check_space
-from completesplat.data.encoded.store import EncodedStore
-from completesplat.data.module import SceneDataModule
-from completesplat.data.prepared.manifest import Refusal
+from completesplat.data.latent_cache.manifest import Array, Manifest, Origin, is_encoded, write_manifest
+from completesplat.data.latent_cache.pictures import Picture, Reading, check_space
+from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.packed.manifest import Refusal
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import EncodedScene

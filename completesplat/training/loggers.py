@@ -1,13 +1,24 @@
-"""`metrics.csv`, also of a run that was interrupted and goes on."""
+"""`metrics.csv`, also of a run that goes on, and runs of Weights & Biases, whatever happens to its server."""
 
 import csv
-from collections.abc import Iterable, Mapping
+import logging
+import os
+import secrets
+import threading
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from ssl import SSLError
 from typing import Any
+from urllib.error import HTTPError, URLError
+from urllib.request import urlopen
 
 from lightning.fabric.loggers.logger import rank_zero_experiment
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from lightning.pytorch.utilities import rank_zero_only
+
+from completesplat.errors import CompleteSplatError
 
 
 class ContinuedCSVLogger(CSVLogger):
@@ -70,3 +81,181 @@ class MetricsFile(ExperimentWriter):
             writer.writeheader()
             writer.writerows(rows)
         temporary.replace(self.path)
+
+
+log = logging.getLogger(__name__)
+MODES = ("online", "offline", "disabled")
+ANSWER_SECONDS, START_SECONDS = 4, 6
+"""How long a server may take to answer at all, and to start a run: together the longest that it can delay training."""
+AXIS = "trainer/global_step"
+SWEEP = "multirun.yaml"  # hydra's, in a sweep's folder
+ID = "wandb_id"
+DATA = "WANDB_DATA_DIR"
+GATEWAY_ERRORS = 502
+
+
+class WandbRun(WandbLogger):
+    """Logs to the one run of a directory: its id is in `save_dir/wandb_id`, so that a run that goes on stays one run.
+
+    `mode=online` becomes `offline`, with a warning, where the server does not answer or refuses; `wandb sync` uploads
+    what was logged later. If W&B's own process dies, training goes on without it.
+
+    Args:
+        mode: online, offline or disabled.
+        group: by default the sweep's folder, in a sweep.
+        name: by default the name of the directory.
+        job_type: fit or test.
+        scenes: shown of a test.
+
+    Raises:
+        CompleteSplatError: another mode, or wandb is not installed.
+    """
+
+    def __init__(
+        self,
+        save_dir: str,
+        mode: str,
+        project: str,
+        group: str | None = None,
+        name: str | None = None,
+        job_type: str | None = None,
+        scenes: int = 16,
+    ) -> None:
+        if mode not in MODES:
+            raise CompleteSplatError(f"wandb.mode={mode}: choose one of {', '.join(MODES)}")
+        folder = Path(save_dir).absolute()
+        if group is None and (folder.parent / SWEEP).is_file():
+            group = folder.parent.name
+        about = {"mode": mode, "group": group, "job_type": job_type}
+        try:
+            super().__init__(name=name or folder.name, save_dir=save_dir, project=project, **about)  # type: ignore[arg-type]
+        except ModuleNotFoundError as error:
+            raise CompleteSplatError("logger=wandb needs wandb: pip install wandb, or leave it out") from error
+        self._wandb_init.pop("anonymous", None)  # W&B would warn that Lightning gives it
+        self.scenes = scenes
+        self.lost = False
+
+    @property
+    @rank_zero_experiment
+    def experiment(self) -> Any:
+        """W&B's run (Lightning's name for what a logger writes to), which begins when it is first asked for."""
+        if self._experiment is None:
+            self._experiment = self._begin()
+            self._experiment.define_metric(AXIS)
+            self._experiment.define_metric("*", step_metric=AXIS, step_sync=True)
+        return self._experiment
+
+    def _begin(self) -> Any:
+        import wandb
+
+        settings = self._wandb_init | {
+            "id": self._id_of_folder(),
+            "settings": wandb.Settings(init_timeout=START_SECONDS),
+        }
+        if settings["mode"] == "online":
+            server = wandb.setup().settings.base_url
+            try:
+                if answers(server, ANSWER_SECONDS):
+                    return wandb.init(**settings)
+                reason = f"{server} does not answer"
+            except wandb.Error as error:
+                reason = str(error).partition("\n")[0]
+            log.warning("W&B: %s; the run is kept offline, `wandb sync` uploads it later", reason)
+            settings["mode"] = "offline"
+        return wandb.init(**settings)
+
+    def _id_of_folder(self) -> str:
+        path = Path(self._save_dir) / ID  # type: ignore[arg-type]
+        known = path.read_text().strip() if path.is_file() else ""
+        if not known:
+            known = secrets.token_hex(4)
+            path.write_text(known + "\n")
+        return known
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any) -> None:
+        """Add settings to the run's."""
+        with self._dispensable():
+            self.experiment.config.update(params, allow_val_change=True)
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
+        """Numbers, or W&B's pictures, histograms, tables and videos."""
+        with self._dispensable(), self._files_beside():
+            self.experiment.log({**metrics, **({} if step is None else {AXIS: step})})
+
+    @rank_zero_only
+    def finish(self, exit_code: int) -> None:
+        """Close the run, if it was begun."""
+        import wandb
+
+        if self._experiment is None:
+            return
+        with self._dispensable():
+            self._experiment.finish(exit_code=exit_code)
+        self._experiment = None
+        if self.lost:
+            with suppress(ConnectionError):
+                wandb.teardown()  # so that the next job of a sweep gets a process of its own
+
+    @contextmanager
+    def _files_beside(self) -> Iterator[None]:
+        """W&B copies what tables show to a folder of the user's, which would outgrow the home; here, to the run's."""
+        given = os.environ.get(DATA)
+        os.environ[DATA] = given or str(Path(self._save_dir).absolute() / "wandb")  # type: ignore[arg-type]
+        try:
+            yield
+        finally:
+            if given is None:
+                del os.environ[DATA]
+
+    @contextmanager
+    def _dispensable(self) -> Iterator[None]:
+        try:
+            yield
+        except ConnectionError as error:
+            if not self.lost:
+                log.warning("W&B: its process ended (%s); metrics.csv goes on without it", error)
+            self.lost = True
+
+
+@contextmanager
+def finished(loggers: Iterable[Logger]) -> Iterator[None]:
+    """Close W&B's runs in the end, with exit code 0, or with 1 after an error or Ctrl-C.
+
+    They outlive a job: what the next one of a sweep logs must not go there.
+    """
+    exit_code = 1
+    try:
+        yield
+        exit_code = 0
+    finally:
+        for logger in wandb_runs(loggers):
+            logger.finish(exit_code)
+
+
+def wandb_runs(loggers: Iterable[Logger]) -> list[WandbRun]:
+    """Those of the loggers that log to W&B."""
+    return [logger for logger in loggers if isinstance(logger, WandbRun)]
+
+
+def answers(url: str, seconds: float) -> bool:
+    """Whether there is a server that says anything, if only no, within a time that also covers looking up its name."""
+    found: list[bool] = []
+    # Left behind if it takes longer: a look-up of a name cannot be interrupted.
+    asking = threading.Thread(target=lambda: found.append(_asked(url, seconds)), daemon=True)
+    asking.start()
+    asking.join(seconds)
+    return found == [True]
+
+
+def _asked(url: str, seconds: float) -> bool:
+    try:
+        urlopen(url, timeout=seconds).close()
+    except HTTPError as error:
+        return error.code < GATEWAY_ERRORS  # which a proxy reports of a server that it does not reach
+    except URLError as error:
+        return isinstance(error.reason, SSLError)  # W&B may trust more certificates than Python
+    except OSError:
+        return False
+    return True

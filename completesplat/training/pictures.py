@@ -1,22 +1,189 @@
 """What a model makes of a few fixed scenes while it trains: pictures, and how its Gaussians are distributed."""
 
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from lightning import Trainer
+from jaxtyping import Float, UInt8
+from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
+from PIL import Image, ImageDraw
+from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.gaussians import Gaussians
+from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
-from completesplat.training.fixed_scenes import DrawsFixedScenes
-from completesplat.training.panels import scene_panels, sheet
+from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.scene_module import SceneModule
+
+
+class DrawsFixedScenes(Callback):
+    """Draws the first scenes of the validation set.
+
+    The model is in evaluation mode, with averaged weights if training keeps them. Training is the same without.
+
+    Args:
+        folder: of the pictures.
+        every_n_steps: optimizer steps between them; there is another one at the end of training.
+        scenes: how many.
+        views: targets of a scene, evenly spread over those that it has; all, if these are fewer.
+    """
+
+    def __init__(self, folder: str, every_n_steps: int, scenes: int, views: int) -> None:
+        self.folder = Path(folder)
+        self.every_n_steps = every_n_steps
+        self.count = scenes
+        self.views = views
+
+    @abstractmethod
+    def draw(self, trainer: Trainer, module: SceneModule, scenes: list[SceneBatch]) -> None:
+        """Write and log what the model makes of the scenes [view], which are on the CPU."""
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.scenes: list[SceneBatch] = []
+        self.drawn = trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if trainer.global_step % self.every_n_steps == 0:
+            self._draw_once(trainer, pl_module)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._draw_once(trainer, pl_module)
+
+    def _draw_once(self, trainer: Trainer, module: LightningModule) -> None:
+        if trainer.global_step == self.drawn or not trainer.is_global_zero:
+            return
+        assert isinstance(module, SceneModule)
+        self.drawn = trainer.global_step
+        with untouched(trainer, module):
+            if not self.scenes:
+                self.scenes = fixed_scenes(trainer.datamodule, self.count, self.views)  # type: ignore[attr-defined]
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.draw(trainer, module, self.scenes)
+
+
+@contextmanager
+def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
+    """Evaluation with averaged weights if there are any; afterwards all is as it was, random numbers too."""
+    modes = {part: part.training for part in module.modules()}
+    with ExitStack() as contexts:
+        contexts.enter_context(torch.no_grad())
+        contexts.enter_context(torch.random.fork_rng([module.device] if module.device.type == "cuda" else []))
+        for callback in trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, ExponentialMovingAverage):
+                contexts.enter_context(callback.in_place(module))
+        module.eval()
+        try:
+            yield
+        finally:
+            for part, mode in modes.items():
+                part.training = mode
+
+
+def fixed_scenes(data: Any, count: int, views: int = 1) -> list[SceneBatch]:
+    """The first validation scenes, with some of their targets."""
+    found: list[SceneBatch] = []
+    for batch in data.val_dataloader():
+        for index in range(len(batch.names)):
+            scene = batch[index]
+            targets = len(scene.targets.images)
+            chosen = [i * targets // views for i in range(views)] if targets > views else list(range(targets))
+            found.append(replace(scene, targets=scene.targets[chosen]))
+        if len(found) >= count:
+            break
+    return found[:count]
+
+
+ERROR_GAIN = 4
+READABLE_SIDE = 128
+GAP, LINE, MARGIN = 4, 16, 72
+INK, PAPER = "black", "white"
+
+
+def scene_panels(
+    rasterizer: Rasterizer, gaussians: Gaussians, scenes: SceneBatch, background: float
+) -> dict[str, Float[Tensor, "batch 3 height width"]]:
+    """Input and first target, what the Gaussians [batch] show from the target's camera, and each layer by itself.
+
+    A layer is as many Gaussians as there are pixels (see `completesplat.splatter_image`). The error is the mean
+    absolute difference of the colours, times 4.
+    """
+    target = scenes.targets[:, :1]
+
+    def seen(part: Gaussians) -> Rendering:
+        return rasterizer(part, target.cameras)[:, 0]
+
+    whole = seen(gaussians)
+    image = whole.over(background).clamp(0, 1)
+    error = (image - target.images[:, 0]).abs().mean(1, keepdim=True)
+    panels = {
+        "input": scenes.reference.images,
+        "target": target.images[:, 0],
+        "render": image,
+        f"error x{ERROR_GAIN}": _grey(ERROR_GAIN * error),
+        "depth": depth_panels(whole.expected_depth()[:, None])[:, 0],
+        "opacity": _grey(whole.alpha),
+    }
+    pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
+    for layer in range(gaussians.count // pixels):
+        part = gaussians[:, layer * pixels : (layer + 1) * pixels]
+        panels[f"layer {layer + 1}"] = seen(part).over(background)
+    return {name: panel.clamp(0, 1) for name, panel in panels.items()}
+
+
+def _grey(values: Float[Tensor, "batch 1 height width"]) -> Float[Tensor, "batch 3 height width"]:
+    return values.expand(-1, 3, -1, -1)
+
+
+def depth_panels(depth: Float[Tensor, "batch view 1 height width"]) -> Float[Tensor, "batch view 3 height width"]:
+    """Linear in inverse depth, near bright, on one scale for the views of a scene; black where nothing is seen.
+
+    The scale leaves the nearest and the farthest 2 % of the pixels out: single Gaussians before a camera are common.
+    """
+    inverse = torch.where(depth > 0, 1 / depth, torch.nan)
+    limits = torch.nanquantile(inverse.flatten(1), torch.tensor([0.02, 0.98]).to(inverse), dim=1)
+    farthest, nearest = limits[:, :, None, None, None, None]
+    # From dark grey to white, so that what is far is not nothing.
+    share = 0.2 + 0.8 * ((inverse - farthest) / (nearest - farthest).clamp(min=1e-6)).clamp(0, 1)
+    return share.nan_to_num(0).expand(-1, -1, 3, -1, -1)
+
+
+def sheet(panels: Mapping[str, Float[Tensor, "row 3 height width"]], rows: Sequence[str] = ()) -> Image.Image:
+    """All panels, each enlarged by a whole factor to about 128 px, a column for each name, as many rows as they have.
+
+    Args:
+        rows: names of the rows, in a margin at the left; none by default, and no margin.
+    """
+    height, width = next(iter(panels.values())).shape[-2:]
+    factor = max(1, round(READABLE_SIDE / max(height, width)))
+    cells = {name: _bytes(panel).repeat(factor, 1).repeat(factor, 2) for name, panel in panels.items()}
+    tall, wide = height * factor + GAP, width * factor + GAP
+    margin = MARGIN if rows else GAP
+    picture = Image.new("RGB", (margin + wide * len(cells), LINE + tall * len(next(iter(cells.values())))), PAPER)
+    draw = ImageDraw.Draw(picture)
+    for row, name in enumerate(rows):
+        draw.text((GAP, LINE + row * tall), name, INK)
+    for column, (name, images) in enumerate(cells.items()):
+        left = margin + column * wide
+        draw.text((left, 2), name, INK)
+        for row, image in enumerate(images):
+            picture.paste(Image.fromarray(image), (left, LINE + row * tall))
+    return picture
+
+
+def _bytes(images: Float[Tensor, "batch 3 height width"]) -> UInt8[np.ndarray, "batch height width 3"]:
+    return images.nan_to_num().mul(255).round().byte().movedim(1, -1).cpu().numpy()
+
 
 PERCENTILES = (10, 50, 90)
 

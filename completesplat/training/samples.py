@@ -12,13 +12,12 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
-from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import psnr
+from completesplat.metrics.samples import diversity
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
-from completesplat.training.fixed_scenes import DrawsFixedScenes
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.panels import depth_panels, sheet
+from completesplat.training.pictures import DrawsFixedScenes, depth_panels, sheet
 from completesplat.training.scene_module import SceneModule
 
 

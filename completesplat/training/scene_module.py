@@ -1,10 +1,13 @@
-"""What both training stages share: rendering a batch of scenes, and scoring the renders."""
+"""What both training stages share: rendering a batch of scenes, scoring the renders, timing it."""
 
+import statistics
+import time
 from abc import abstractmethod
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +18,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.depths import evaluation_depths
+from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -22,7 +26,39 @@ from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.training.timing import Timings
+
+Result = TypeVar("Result")
+
+
+class Timings:
+    """Seconds for each scene, by the name of the work."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, list[float]] = defaultdict(list)
+
+    def of(self, name: str, work: Callable[[], Result], scenes: int = 1) -> Result:
+        """Do the work for so many scenes at once."""
+        start = _now()
+        result = work()
+        self.seconds[name].append((_now() - start) / scenes)
+        return result
+
+    def gather(self) -> None:
+        """Know the durations of all processes; each of them must call it."""
+        own, self.seconds = self.seconds, defaultdict(list)
+        for other in gathered(dict(own)):
+            for name, values in other.items():
+                self.seconds[name] += values
+
+    def results(self) -> dict[str, float]:
+        """Medians; the first duration is left out where there are others: it includes what happens only once."""
+        return {name: statistics.median(values[1:] or values) for name, values in self.seconds.items()}
+
+
+def _now() -> float:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> None:

@@ -1,23 +1,44 @@
-"""The page's controls of drawing: a photograph in, samples out, again and again."""
+"""Pictures that come through the page."""
 
+import tempfile
 import time
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import viser
 
-from completesplat.data.photograph import Photograph
-from completesplat.errors import CompleteSplatError
-from completesplat.export.pixels import to_bytes
+from completesplat.data.pictures.photograph import Photograph
+from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
-from completesplat.viewer.controls import MOST_SAMPLES, add_drawing
+from completesplat.viewer.controls import MOST_SAMPLES, add_drawing, nearest_steps
 from completesplat.viewer.page import Page
 from completesplat.viewer.samples import Sample
-from completesplat.viewer.steps import nearest_steps
-from completesplat.viewer.uploads import read_upload
+
+MOST_BYTES = 32 * 2**20
+
+
+def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
+    """The picture at the model's size. Its name is used in refusals only, never as a path.
+
+    Raises:
+        ImageError: more than 32 MiB, or what `read_photograph` refuses: no image, damaged, too many pixels, ...
+    """
+    shown = "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
+    if len(content) > MOST_BYTES:
+        raise ImageError(f"{shown}: {len(content) / 2**20:.0f} MiB; at most {MOST_BYTES // 2**20} MiB are taken")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "upload"
+        file.write_bytes(content)
+        try:
+            return model.read(file)
+        except ImageError as error:
+            raise ImageError(str(error).replace(str(file), shown)) from error
+
 
 PAUSE = 0.2  # seconds between two pictures of a scene that forms
 

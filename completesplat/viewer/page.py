@@ -1,18 +1,114 @@
-"""The page: what its controls of looking and saving do."""
+"""The page: its server, what its controls of looking do, and the files that it saves."""
 
+import contextlib
+import io
 import logging
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from pathlib import Path
 
+import numpy as np
 import viser
 
+from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import write_ply
+from completesplat.export.video import orbit_views, write_video
+from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.controls import SIDE_BY_SIDE, add_looking, add_saving
 from completesplat.viewer.samples import Sample
-from completesplat.viewer.saving import Saver
-from completesplat.viewer.server import stop_server
 from completesplat.viewer.stage import Stage
 from completesplat.viewer.worker import Worker
+
+HOST = "127.0.0.1"
+
+
+def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
+    """Listen on the port or, if it is taken, on the next free one; 0 takes any.
+
+    Args:
+        background: grey value where a scene leaves a pixel open.
+    """
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(HOST, port, verbose=False)
+    server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
+    server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would lead through the internet
+    server.gui.set_panel_label("completesplat")
+    server.gui.main_panel.dock_right()
+    return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """End it, and with it what browsers show."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+class Saver:
+    """Writes numbered files into a folder; nothing is overwritten.
+
+    Args:
+        make_rasterizer: called when the first video is wanted, as it may have to be compiled.
+        frames: of a video.
+        background: its grey value where a scene leaves a pixel open.
+    """
+
+    def __init__(
+        self, folder: Path, stage: Stage, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
+    ) -> None:
+        self.folder, self.stage, self.frames, self.background = folder, stage, frames, background
+        self._make_rasterizer = make_rasterizer
+
+    @cached_property
+    def rasterizer(self) -> Rasterizer:
+        return self._make_rasterizer()
+
+    def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
+        """Write these samples as `ply` or `video`, or the page as it stands as `html`.
+
+        Raises:
+            CompleteSplatError: nothing is shown yet.
+        """
+        if not samples:
+            raise CompleteSplatError("there is nothing to save yet: draw samples first")
+        if kind == "html":
+            return [self.html(self._next("page", ".html"))]
+        return [self.ply(sample) if kind == "ply" else self.video(sample) for sample in samples]
+
+    def ply(self, sample: Sample) -> Path:
+        """All layers of the sample, in its reference camera's frame."""
+        path = self._next("sample", ".ply")
+        write_ply(path, sample.for_viewers(), [f"{name} {value}" for name, value in sample.settings.items()])
+        return path
+
+    def video(self, sample: Sample) -> Path:
+        """A turn about the sample."""
+        path = self._next("orbit", ".mp4")
+        reference = sample.reference
+        up = reference.intrinsics.new_tensor(self.stage.up.tolist())
+        frames, _ = orbit_views(
+            self.rasterizer, sample.gaussians, reference, sample.pivot(), self.frames, self.background, up
+        )
+        write_video(path, frames)
+        return path
+
+    def html(self, path: Path) -> Path:
+        """The scene as one file that needs no server, without the controls."""
+        return write_page(self.stage.server, path)
+
+    def _next(self, stem: str, suffix: str) -> Path:
+        taken = {path.name for path in self.folder.glob(f"{stem}_*{suffix}")}
+        return self.folder / next(name for i in range(10**6) if (name := f"{stem}_{i:02}{suffix}") not in taken)
+
+
+def write_page(server: viser.ViserServer, path: Path) -> Path:
+    """What the server shows, as one offline HTML file."""
+    text = server.get_scene_serializer().as_html()
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
 
 log = logging.getLogger(__name__)
 

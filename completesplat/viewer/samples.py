@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
+from completesplat.export.cleaning import widened
 from completesplat.export.ply import read_ply
-from completesplat.export.widening import widened
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 

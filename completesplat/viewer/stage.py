@@ -1,18 +1,128 @@
-"""The three-dimensional part of the page."""
+"""The three-dimensional part of the page: splats, where samples stand, from where one looks."""
 
 import math
 import threading
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import torch
 import viser
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from completesplat.export.pictures import color_depth
+from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import matrix_to_quaternion
 from completesplat.geometry.trajectories import orbit
-from completesplat.viewer.framing import Framing, framing_of
 from completesplat.viewer.samples import Sample
-from completesplat.viewer.splats import depth_colored, layer_of, to_splats
+
+LARGEST_COVARIANCE = 3e4
+
+
+class Splats(NamedTuple):
+    """What `add_gaussian_splats` takes, in units of `scale` scene units.
+
+    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: the unit is chosen so that
+    the largest one is just below that end, and thin Gaussians keep their shape.
+    """
+
+    centers: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colors: UInt8[np.ndarray, "gaussian 3"]
+    opacities: UInt8[np.ndarray, "gaussian 1"]
+    scale: float
+
+
+def to_splats(gaussians: Gaussians) -> Splats:
+    """One unbatched set. Gaussians that are not finite are left out, and colours above 1 become 1."""
+    kept = gaussians.keep(gaussians.finite()).to("cpu")
+    largest = kept.scales.max().item() if kept.count else 1.0
+    scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
+    unit = replace(kept, means=kept.means / scale, scales=kept.scales / scale)
+    return Splats(
+        unit.means.float().numpy(),
+        unit.covariances().float().numpy(),
+        _bytes(kept.colors),
+        _bytes(kept.opacities[:, None]),
+        scale,
+    )
+
+
+def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
+    """One layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
+    size = gaussians.count // layers
+    return gaussians[layer * size : (layer + 1) * size]
+
+
+def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
+    """The scenes in the colours of their depths (z), near bright and far dark, on one scale for all of them."""
+    depths = torch.cat([scene.means[:, 2] for scene in scenes])
+    colors, _ = color_depth(depths[None, None, :])
+    parts = colors[:, 0].T.split([scene.count for scene in scenes])
+    return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]
+
+
+def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
+    return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
+
+
+GAP = 1.25
+NARROWEST_WINDOW = 1.1
+SAME = 0.15
+
+
+@dataclass(frozen=True)
+class Framing:
+    """One row of samples. A single one is seen exactly as its reference camera sees it.
+
+    Attributes:
+        pivots: the point that each sample turns about, before it is moved to its place.
+        right: the direction of the row.
+        spacing: between neighbours, in scene units: 1.25 times the width of the picture at the pivot.
+        position, look_at: of the page's camera.
+        fov: vertical, of the page's camera, in radians.
+    """
+
+    pivots: list[Float[Tensor, "3"]]
+    right: Float[np.ndarray, "3"]
+    spacing: float
+    position: Float[np.ndarray, "3"]
+    look_at: Float[np.ndarray, "3"]
+    fov: float
+
+    @property
+    def distance(self) -> float:
+        """From the camera to what it looks at."""
+        return float(np.linalg.norm(self.look_at - self.position))
+
+    def shift(self, index: int) -> Float[np.ndarray, "3"]:
+        """How a sample is moved: the row has its middle where the first sample was."""
+        return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
+
+    def looks_like(self, other: "Framing") -> bool:
+        """Whether a camera that was put there may stay: as many samples, about as far away."""
+        apart = np.linalg.norm(self.look_at - other.look_at) + np.linalg.norm(self.position - other.position)
+        return len(self.pivots) == len(other.pivots) and float(apart) < SAME * other.distance
+
+
+def framing_of(samples: Sequence[Sample]) -> Framing:
+    """The row of these samples, looked at by the first one's reference camera, moved back until all are seen."""
+    reference = samples[0].reference
+    pivots = [sample.pivot() for sample in samples]
+    pose = reference.camera_to_world.cpu().numpy()
+    pivot, eye = pivots[0].cpu().numpy(), pose[:3, 3]
+    forward, distance = pose[:3, 2], float(np.linalg.norm(pivot - eye))
+    height, width = reference.image_size
+    tangent = height / 2 / reference.intrinsics[1, 1].item()
+    picture = 2 * distance * width / 2 / reference.intrinsics[0, 0].item()
+    spacing = GAP * picture
+    if len(samples) > 1:
+        distance = max(distance, len(samples) * spacing / 2 / (tangent * NARROWEST_WINDOW))
+    return Framing(pivots, pose[:3, 0], spacing, pivot - forward * distance, pivot, 2 * math.atan(tangent))
+
 
 ORBIT_CAMERAS = 12
 REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from support import strict_json
 
-from completesplat.reports.rasterizers import growth, training_step
-from completesplat.reports.rasterizers.workloads import splatter_scene
+from completesplat.benchmarks import rasterizers, training_step
+from completesplat.benchmarks.workloads import splatter_scene
 
 QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
 
@@ -49,7 +49,7 @@ def test_speed_is_written_and_shown(command, tmp_path):
 
 def test_growth_and_the_share_of_a_step_are_written_and_plotted(command, tmp_path, monkeypatch):
     for name, value in {"SOURCE_SIZES": (4, 6), "IMAGE_SIZE": 8, "VIEWS": (1, 2), "IMAGE_SIZES": (4, 8)}.items():
-        monkeypatch.setattr(growth, name, value)
+        monkeypatch.setattr(rasterizers, name, value)
     monkeypatch.setattr(training_step, "UNTIMED_STEPS", 0)
     monkeypatch.setattr(training_step, "TIMED_STEPS", 1)
     small = ["training_step.size=32", "training_step.batch=1", "training_step.targets=1", "growth.most_gaussians=40"]

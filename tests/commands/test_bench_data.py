@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from support import strict_json
 
-from completesplat.data.toy import realestate10k_files
+from completesplat.data.toy import rooms
 
 QUICK = [
     *("bench", "data", "repeats=1"),
@@ -38,7 +38,7 @@ class Benchmark:
 @pytest.fixture
 def quick(command, tmp_path, monkeypatch):
     # Twelve clips that are not for testing, one of which is for validation, in three chunks.
-    monkeypatch.setattr(realestate10k_files, "CLIPS_PER_CHUNK", 4)
+    monkeypatch.setattr(rooms, "CLIPS_PER_CHUNK", 4)
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # so few files are sooner written by this process alone
 
     def run(*arguments: str) -> Benchmark:

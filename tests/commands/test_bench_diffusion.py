@@ -4,7 +4,7 @@ import pytest
 import torch
 from support import strict_json
 
-from completesplat.reports.diffusion import comparing
+from completesplat.benchmarks import diffusion
 
 CHANNELS = "channels=[8,8,16,16]"
 QUICK = [
@@ -19,7 +19,7 @@ NAMES = ["cached_vs_on_the_fly", "batch_vs_one_by_one_k3", "unguided_vs_guided",
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # so few pictures are sooner written by this process alone
-    monkeypatch.setattr(comparing, "WARM_UP", 1)
+    monkeypatch.setattr(diffusion, "WARM_UP", 1)
 
 
 @pytest.mark.slow

@@ -4,11 +4,9 @@ import pytest
 import torch
 from support import compose_config, strict_json
 
+from completesplat.benchmarks import diffusion, paper
+from completesplat.benchmarks.paper import FIGURES, WAYS, compiled
 from completesplat.commands.bench_paper import is_as_in_the_paper
-from completesplat.reports.diffusion import comparing
-from completesplat.reports.paper_speed import measuring
-from completesplat.reports.paper_speed.figures import FIGURES
-from completesplat.reports.paper_speed.ways import WAYS, compiled
 
 CHANNELS = "channels=[8,8,16,16]"
 QUICK = [
@@ -22,7 +20,7 @@ QUICK = [
 @pytest.mark.slow
 def test_both_stages_are_measured_written_and_shown(command, tmp_path, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # so few pictures are sooner written by this process alone
-    monkeypatch.setattr(measuring, "WARM_UP", 0)
+    monkeypatch.setattr(paper, "WARM_UP", 0)
     finished = command(*QUICK, f"out={tmp_path / 'out'}")
     assert finished.status == 0, finished.err
     results = strict_json(tmp_path / "out/paper.json")
@@ -60,12 +58,12 @@ def test_networks_are_compiled_within_the_context_only(monkeypatch):
 
 
 def test_what_fails_has_the_reason_in_its_row(monkeypatch):
-    monkeypatch.setattr(comparing, "WARM_UP", 0)
+    monkeypatch.setattr(diffusion, "WARM_UP", 0)
 
     def fail() -> None:
         raise RuntimeError("out of memory\nand a long story")
 
-    (row,) = measuring.rows(WAYS[0], {"samples": fail}, 1, torch.device("cpu"), lambda _: None)
+    (row,) = paper.rows(WAYS[0], {"samples": fail}, 1, torch.device("cpu"), lambda _: None)
     assert row == {"name": "samples", "way": "float32", "not_measured": "RuntimeError: out of memory"}
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support import SMALL, strict_json
 
-from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.latent_cache.store import EncodedStore
 from completesplat.generation import CompleteSplat
 
 

@@ -1,9 +1,12 @@
 """`completesplat doctor`: one table, one file, one exit status."""
 
+from functools import partial
+from importlib import import_module
+
 from support import strict_json
 
+from completesplat.commands import doctor_checks
 from completesplat.commands.doctor import findings_of
-from completesplat.reports.doctor import rendering
 
 PARTS = ["packages", "extras", "imports", "device", "rasterizers", "weights", "data", "tools"]
 
@@ -20,7 +23,7 @@ def test_a_machine_that_can_complete_a_photograph_gives_status_0(command, tmp_pa
 
 
 def test_something_broken_gives_status_1_and_one_line_that_names_it(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(rendering, "wrong", lambda rasterizer: "it is upside down")
+    monkeypatch.setattr(doctor_checks, "wrong", lambda rasterizer: "it is upside down")
     finished = command("doctor", f"out={tmp_path / 'out'}")
     assert finished.status == 1
     assert finished.out.splitlines()[-2] == "broken: rasterizers, reference: it is upside down"
@@ -28,6 +31,6 @@ def test_something_broken_gives_status_1_and_one_line_that_names_it(command, tmp
 
 
 def test_what_cannot_be_imported_is_a_finding_and_no_traceback():
-    (finding,) = findings_of("no_such_part", "check", ())
+    (finding,) = findings_of("device", partial(import_module, "no_such_module"))
     assert finding.state == "broken"
     assert "ModuleNotFoundError" in finding.said

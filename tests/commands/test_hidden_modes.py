@@ -4,7 +4,7 @@ import imageio.v3 as imageio
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.commands.test_hidden_modes import run
+from completesplat.commands.evaluate_hidden_modes import run
 from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=3", "batch=2", "views=1", "spread_views=2", "shown_samples=2"]

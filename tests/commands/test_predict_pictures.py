@@ -11,10 +11,8 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json, tiny_generator
 
-from completesplat.commands.field_of_view import unusual_field_of_view
-from completesplat.commands.pictures import find_pictures, folder_names
-from completesplat.commands.predict_settings import check_settings
-from completesplat.data.photograph import Photograph
+from completesplat.commands.predict import check_settings, find_pictures, folder_names, unusual_field_of_view
+from completesplat.data.pictures.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.generation import CompleteSplat

@@ -9,7 +9,7 @@ from PIL import Image
 from report_pages import FRAMES, HOSTILE, SAMPLES, Page, grey, picture, write_results
 from support import call
 
-from completesplat.reports.html.turntables import strip
+from completesplat.results.page_parts import strip
 
 
 @pytest.fixture(scope="module")

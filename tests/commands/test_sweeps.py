@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from support import SMALL, call, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.sweeps import LONGEST_NAME, job_name, swept_keys
-from completesplat.losses.vgg import load_vgg16
+from completesplat.commands.jobs import LONGEST_NAME, job_name, swept_keys
+from completesplat.losses.lpips import load_vgg16
 from completesplat.training.reconstruction import ReconstructionModule
 
 STEPS = 3

@@ -9,7 +9,7 @@ from support import strict_json
 
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
-from completesplat.reports.sweeps.headline import SSIM_NOTE
+from completesplat.results.tables import SSIM_NOTE
 from completesplat.training.scene_module import SceneModule
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from completesplat.data.augmentation import BoxMasks, ColorJitter, augment, mirrored
+from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment, mirrored
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 from completesplat.scene import SceneBatch, Views
 

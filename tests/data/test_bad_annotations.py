@@ -7,9 +7,8 @@ import pytest
 from bad_annotations import BAD_ENTRIES, BAD_FILES, BAD_FRAMES, NAN, drop, put
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, write_tree
 
-from completesplat.data.checks import BadAnnotation, MissingFile, OutsidePath, UnreadableFile
-from completesplat.data.co3d_category import Category, Filters, read_category
-from completesplat.data.co3d_splits import SeededSplit
+from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
+from completesplat.data.validation import BadAnnotation, MissingFile, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
 
 # Who an entry without a name was of is not known, so what it leaves behind is told as well.

@@ -19,8 +19,8 @@ import torch
 from bad_clips import BAD, BAD_CLIPS, CLIPS, HELD_OUT, INTACT, SETTINGS, changed, check_policies, read_tree
 from realestate10k_trees import assert_refusal, chunk_entry, module, write_chunk_form, write_tree
 
-from completesplat.data.checks import BadAnnotation, OutsidePath, UnreadableFile
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k.module import RE10KDataModule
+from completesplat.data.validation import BadAnnotation, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
 
 CHUNK = "000000.torch"

@@ -10,9 +10,15 @@ import pytest
 from bad_clips import BAD, BAD_CLIPS, CLIPS, SETTINGS, changed, check_policies
 from realestate10k_trees import assert_refusal, module, write_text_form, write_tree
 
-from completesplat.data import realestate10k_text
-from completesplat.data.checks import BadAnnotation, BadCamera, BadPicture, MissingFile, TooFewFrames, UnreadableFile
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k.module import RE10KDataModule, clips
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    BadPicture,
+    MissingFile,
+    TooFewFrames,
+    UnreadableFile,
+)
 from completesplat.errors import DataError
 
 TEXT, SECOND = f"{BAD}.txt", f"{BAD}/66000.jpg"
@@ -145,12 +151,12 @@ def test_a_folder_without_any_use_is_raised_under_either_policy(name, policy, tm
 
 def test_a_text_may_be_large_but_not_endless(tmp_path, monkeypatch):
     write_text_form(tmp_path, CLIPS)
-    clips, size = realestate10k_text.TextClips(tmp_path), (tmp_path / TEXT).stat().st_size
-    monkeypatch.setattr(realestate10k_text, "MOST_BYTES", size)
-    assert len(clips.clip(BAD).timestamps) == 4
-    monkeypatch.setattr(realestate10k_text, "MOST_BYTES", size - 1)
+    texts, size = clips.TextClips(tmp_path), (tmp_path / TEXT).stat().st_size
+    monkeypatch.setattr(clips, "MOST_BYTES", size)
+    assert len(texts.clip(BAD).timestamps) == 4
+    monkeypatch.setattr(clips, "MOST_BYTES", size - 1)
     with pytest.raises(DataError) as caught:
-        clips.clip(BAD)
+        texts.clip(BAD)
     assert_refusal(caught.value, UnreadableFile, tmp_path / TEXT, BAD, None)
 
 

@@ -11,8 +11,8 @@ import pytest
 from bad_images import BAD_DEPTHS, BAD_IMAGES, RGB, cut, saved
 from PIL import ImageFile
 
-from completesplat.data.checks import BadPicture, MissingFile
-from completesplat.data.images import decode, read_depth
+from completesplat.data.pictures.files import decode, read_depth
+from completesplat.data.validation import BadPicture, MissingFile
 from completesplat.errors import DataError
 
 

@@ -11,8 +11,8 @@ from bad_annotations import BAD_ENTRIES, BAD_FILES, BAD_FRAMES
 from bad_inputs import Seen, epoch, intact_pictures, module, write_three
 from co3d_trees import CATEGORY, FRAMES, change
 
-from completesplat.data.checks import BadAnnotation
-from completesplat.data.module import SceneDataModule
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.validation import BadAnnotation
 from completesplat.errors import DataError
 
 FRAME_CASES, ENTRY_CASES, FILE_CASES = 47, 22, 5

@@ -11,7 +11,7 @@ from bad_images import BAD_DEPTHS, BAD_IMAGES
 from bad_inputs import ITEMS, Seen, count_readings, epoch, intact_pictures, module, write_three
 from co3d_trees import FRAMES, SEQUENCES, change
 
-from completesplat.data.checks import BadAnnotation, BadPicture
+from completesplat.data.validation import BadAnnotation, BadPicture
 from completesplat.errors import DataError
 
 PICTURES, DEPTHS = 46, 13

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from completesplat.data.augmentation import BoxMasks
+from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.errors import CompleteSplatError
 
 

@@ -6,8 +6,8 @@ import pytest
 from checked_sources import Prepared, Source
 from support import strict_json
 
-from completesplat.data.checking import Findings, check, show
-from completesplat.data.checks import BadPicture, ChangedFile, MissingFile, TooFewFrames
+from completesplat.data.audit import Findings, check, show
+from completesplat.data.validation import BadPicture, ChangedFile, MissingFile, TooFewFrames
 
 
 def check_quietly(**sources: Source) -> Findings:

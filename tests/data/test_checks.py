@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from completesplat.data.checks import field, finite_array, inside, read_json, require_rotation
+from completesplat.data.validation import field, finite_array, inside, read_json, require_rotation
 from completesplat.errors import DataError
 
 CONTENT = [{"name": "Bär", "numbers": [1, 2.5, None]}] * 50

@@ -10,11 +10,10 @@ from lightning import LightningModule, Trainer
 from PIL import Image
 from plyfile import PlyData
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.co3d_category import Filters, SplitMembers, read_category
-from completesplat.data.co3d_placement import object_placement
-from completesplat.data.co3d_splits import SeededSplit
-from completesplat.data.scenes import SceneStore
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.co3d.selection import Filters, SeededSplit, SplitMembers, read_category
+from completesplat.data.co3d.source import object_placement
+from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import DataError

@@ -5,9 +5,9 @@ import pytest
 import torch
 from co3d_trees import pytorch3d_pixels
 
-from completesplat.data.checks import BadAnnotation, BadCamera
-from completesplat.data.co3d_annotations import camera_from_viewpoint
-from completesplat.data.transforms import principal_square
+from completesplat.data.co3d.annotations import camera_from_viewpoint
+from completesplat.data.pictures.crop import principal_square
+from completesplat.data.validation import BadAnnotation, BadCamera
 from completesplat.geometry.cameras import crop_resize, project
 
 LAYOUTS = ["ndc_norm_image_bounds", "ndc_isotropic"]

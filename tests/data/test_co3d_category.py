@@ -22,11 +22,10 @@ from co3d_trees import (
     write_tree,
 )
 
-from completesplat.data.checks import BadCamera, OutsidePath
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.co3d_category import Category, Filters, read_category
-from completesplat.data.co3d_placement import from_depth_maps, upright_axes
-from completesplat.data.co3d_splits import SeededSplit
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
+from completesplat.data.co3d.source import from_depth_maps, upright_axes
+from completesplat.data.validation import BadCamera, OutsidePath
 from completesplat.errors import CompleteSplatError, DataError
 
 SPLITS = ("train", "val", "test")

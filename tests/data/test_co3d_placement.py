@@ -8,18 +8,17 @@ import torch
 from co3d_trees import OCTAHEDRON, depth_bits, look, orbit, splatter_image, write_cloud
 from PIL import Image
 
-from completesplat.data.checks import BadPicture, BadPlacement, MissingFile, UnreadableFile
-from completesplat.data.co3d_annotations import CO3DFrame, DepthMap, camera_from_viewpoint
-from completesplat.data.co3d_category import Filters, read_category
-from completesplat.data.co3d_placement import (
+from completesplat.data.co3d.annotations import CO3DFrame, DepthMap, camera_from_viewpoint
+from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
+from completesplat.data.co3d.source import (
     from_cameras,
     from_depth_maps,
     from_point_cloud,
     object_placement,
     upright_axes,
 )
-from completesplat.data.co3d_splits import SeededSplit
 from completesplat.data.toy.objects import SUBSET
+from completesplat.data.validation import BadPicture, BadPlacement, MissingFile, UnreadableFile
 
 CENTER = np.array([3.0, -2.0, 5.0])
 AXES = np.eye(3)

@@ -19,7 +19,7 @@ from co3d_trees import (
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
 

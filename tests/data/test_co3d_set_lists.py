@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from co3d_trees import CATEGORY, SET_LIST, write_tree
 
-from completesplat.data.co3d import CO3DDataModule
+from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.errors import DataError
 
 COUNTS = dict.fromkeys("abcdefgh", 3)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from completesplat.data.augmentation import ColorJitter
+from completesplat.data.loading.augmentation import ColorJitter
 from completesplat.errors import CompleteSplatError
 
 STRONG = ColorJitter(brightness=0.4, contrast=0.4, saturation=0.4, hue=0.5)

@@ -7,16 +7,14 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from completesplat.data import co3d_depth
-from completesplat.data.co3d_annotations import CO3DFrame, DepthMap
-from completesplat.data.co3d_category import Filters, read_category
-from completesplat.data.co3d_placement import object_placement
-from completesplat.data.co3d_source import OBJECT_HALF_SIZE
-from completesplat.data.co3d_splits import SeededSplit
+from completesplat.data.co3d.annotations import CO3DFrame, DepthMap
+from completesplat.data.co3d.module import source
+from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
+from completesplat.data.co3d.source import OBJECT_HALF_SIZE, object_placement
 from completesplat.data.depths import evaluation_depths
+from completesplat.data.pictures.crop import Square
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.objects import SUBSET
-from completesplat.data.transforms import Square
 from completesplat.geometry.cameras import Cameras, pinhole, project
 
 
@@ -59,12 +57,12 @@ def test_maps_of_any_size_are_cut_as_the_picture_is(monkeypatch, shape):
     """A picture of 8 x 12; the square of 4 x 4 at (left 6, top 2), in 2 x 2 pixels, has centres at columns 7 and 9."""
     columns = (torch.arange(shape[1]) + 0.5) * 12 / shape[1]
     depth = columns.expand(1, *shape)
-    monkeypatch.setattr(co3d_depth, "read_depth", lambda *_: depth)
+    monkeypatch.setattr(source, "read_depth", lambda *_: depth)
     camera = Cameras(torch.eye(4), pinhole(50.0, 8), (8, 12))
     frame = CO3DFrame(1, Path("image"), Path("mask"), DepthMap(Path("depth"), 1.0), camera)
-    found = co3d_depth.square_depth(frame, Square(6, 2, 4), 2, factor=10.0)
+    found = source.square_depth(frame, Square(6, 2, 4), 2, factor=10.0)
     half_pixel = 12 / shape[1] / 2
     assert found.shape == (1, 2, 2)
     assert found[0].flatten().tolist() == pytest.approx([70, 90, 70, 90], abs=10 * half_pixel)
-    unknown = co3d_depth.square_depth(replace(frame, depth=None), Square(6, 2, 4), 2, factor=10.0)
+    unknown = source.square_depth(replace(frame, depth=None), Square(6, 2, 4), 2, factor=10.0)
     assert not unknown.any()

@@ -9,8 +9,8 @@ import torch
 from encoded_stores import FRAMES, broken_rooms, rooms, small_autoreconstructor, sound_rooms
 from realestate10k_trees import FORMS
 
-from completesplat.data.encoded.store import EncodedStore
-from completesplat.data.loading import SceneLoader
+from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import EncodedScene
 from completesplat.training.encoding import encode_training_set

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from encoded_stores import rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.encoded.arrays import ArrayWriter, open_array
-from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore, open_array
 from completesplat.errors import DataError
 from completesplat.training.encoding import encode_training_set
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from PIL import Image, ImageCms
 
-from completesplat.data.exif import ORIENTATION
-from completesplat.data.images import decode, read_depth
-from completesplat.data.transforms import Square, read_square
+from completesplat.data.pictures.crop import Square, read_square
+from completesplat.data.pictures.exif import ORIENTATION
+from completesplat.data.pictures.files import decode, read_depth
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
 GREY = RGB[..., 0]

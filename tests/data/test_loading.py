@@ -7,7 +7,7 @@ import pytest
 import torch
 from realestate10k_trees import FORMS, epoch, equal, make_clip, module, same, write_tree
 
-from completesplat.data.loading import EpochSampler, SceneLoader
+from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.scene import SceneBatch
 
 AUGMENTED = {

@@ -7,7 +7,7 @@ import pytest
 from lightning import LightningModule, Trainer
 from realestate10k_trees import assert_refusal, epoch, make_clip, module, write_tree
 
-from completesplat.data.checks import BadCamera, BadPicture
+from completesplat.data.validation import BadCamera, BadPicture
 from completesplat.errors import CompleteSplatError, DataError
 
 KEYS = [f"c{i}" for i in range(9)]
@@ -106,5 +106,5 @@ def test_lightning_hears_it_at_the_end_of_each_epoch(tmp_path, caplog, limit):
     )  # fmt: skip
     with caplog.at_level(logging.WARNING, logger="completesplat"):
         trainer.fit(Listener(), data.train_dataloader())
-    messages = [record.getMessage() for record in caplog.records if record.name == "completesplat.data.loading"]
+    messages = [record.getMessage() for record in caplog.records if record.name == "completesplat.data.loading.loader"]
     assert [message[:7] for message in messages] == ["skipped", "skipped"]

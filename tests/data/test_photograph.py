@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image, ImageCms
 
-from completesplat.data.photograph import read_photograph
+from completesplat.data.pictures.photograph import read_photograph
 from completesplat.errors import ImageError
 
 SIZE = 16

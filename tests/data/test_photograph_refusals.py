@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image, ImageFile
 
-from completesplat.data.photograph import read_photograph
+from completesplat.data.pictures.photograph import read_photograph
 from completesplat.errors import ImageError
 
 SIZE = 48

@@ -8,10 +8,10 @@ import pytest
 import torch
 from realestate10k_trees import FORMS, make_clip
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.module import SceneDataModule
-from completesplat.data.prepared.writing import prepare
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.packed.writing import prepare
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import SceneBatch

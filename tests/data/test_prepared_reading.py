@@ -13,7 +13,13 @@ import pytest
 import torch
 from prepared_sequences import SIZE, ListedSource, make_sequence, smooth_picture
 
-from completesplat.data.checks import (
+from completesplat.data.packed.manifest import is_prepared, read_manifest, settings_must_match
+from completesplat.data.packed.rows import EncodedPicture, decode, encode, from_row, to_row
+from completesplat.data.packed.source import PreparedSource
+from completesplat.data.packed.streaming import stream
+from completesplat.data.packed.writing import prepare
+from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.validation import (
     BadAnnotation,
     BadPicture,
     ChangedFile,
@@ -21,13 +27,6 @@ from completesplat.data.checks import (
     OutsidePath,
     UnreadableFile,
 )
-from completesplat.data.prepared.manifest import is_prepared, read_manifest, settings_must_match
-from completesplat.data.prepared.pictures import decode, encode
-from completesplat.data.prepared.rows import EncodedPicture, from_row, to_row
-from completesplat.data.prepared.source import PreparedSource
-from completesplat.data.prepared.streaming import stream
-from completesplat.data.prepared.writing import prepare
-from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.errors import DataError
 
 NAMES = ["s3", "s1", "s4", "s0", "s5", "s9", "s2"]
@@ -352,8 +351,8 @@ def test_reading_and_streaming_need_no_network_and_write_nothing_into_the_home_f
     code = (
         "import socket; socket.socket.connect = None\n"
         "from pathlib import Path\n"
-        "from completesplat.data.prepared.source import PreparedSource\n"
-        "from completesplat.data.prepared.streaming import stream\n"
+        "from completesplat.data.packed.source import PreparedSource\n"
+        "from completesplat.data.packed.streaming import stream\n"
         f"root = Path({str(store)!r})\n"
         "PreparedSource(root, 'train').read('s0').read(0)\n"
         "print(*[sequence.name for sequence in stream(root, 'train', 1, 2, 5)])\n"

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from prepared_sequences import ListedSource, contents
 
-from completesplat.data.checks import BadPicture, TooFewFrames
-from completesplat.data.prepared import estimate
-from completesplat.data.prepared.manifest import read_manifest
-from completesplat.data.prepared.source import PreparedSource
-from completesplat.data.prepared.writing import prepare
+from completesplat.data.packed import writing
+from completesplat.data.packed.manifest import read_manifest
+from completesplat.data.packed.source import PreparedSource
+from completesplat.data.packed.writing import prepare
+from completesplat.data.validation import BadPicture, TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError
 
 SETTINGS = {"image_size": 16, "category": "chair", "crop": None}
@@ -176,7 +176,7 @@ def test_too_little_space_is_noticed_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = namedtuple("usage", ["total", "used", "free"])
-    monkeypatch.setattr(estimate.shutil, "disk_usage", lambda path: usage(10**6, 0, 5000))
+    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: usage(10**6, 0, 5000))
     with pytest.raises(DataError, match=r"not enough space: about .* 32 frames of 8 sequences in 4 shards"):
         make(ListedSource(NAMES), tmp_path / "store")
     assert not list((tmp_path / "store").glob("*.arrow*"))

@@ -12,7 +12,7 @@ from lightning import Trainer
 from realestate10k_trees import FORMS, HEIGHT, WIDTH, encode, epoch, equal, make_clip, module, same, write_tree
 from support import SMALL, compose_config
 
-from completesplat.data.splits import split_by_hash
+from completesplat.data.sequences import split_by_hash
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
 

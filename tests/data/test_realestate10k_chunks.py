@@ -10,10 +10,9 @@ import pytest
 import torch
 from realestate10k_trees import assert_refusal, chunk_entry, make_clip, write_chunk_form
 
-from completesplat.data import realestate10k_chunks
-from completesplat.data.checks import BadAnnotation, OutsidePath, UnreadableFile
-from completesplat.data.realestate10k import RE10KDataModule
-from completesplat.data.realestate10k_chunks import ChunkedClips, read_chunk
+from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
+from completesplat.data.realestate10k.module import RE10KDataModule, chunks
+from completesplat.data.validation import BadAnnotation, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
 
 
@@ -100,7 +99,7 @@ def test_a_clip_in_another_chunk_than_the_index_says_is_refused(tmp_path):
 def loads(monkeypatch):
     """Names of the chunks in the order they are read, and the largest number of them alive at once."""
     names, alive, counts = [], [], []
-    original = realestate10k_chunks.read_chunk
+    original = chunks.read_chunk
 
     def watched(path: Path):
         chunk = original(path)
@@ -109,7 +108,7 @@ def loads(monkeypatch):
         names.append(path.name)
         return chunk
 
-    monkeypatch.setattr(realestate10k_chunks, "read_chunk", watched)
+    monkeypatch.setattr(chunks, "read_chunk", watched)
     return names, counts
 
 

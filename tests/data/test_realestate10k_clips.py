@@ -13,11 +13,11 @@ from realestate10k_trees import (
     write_text_form,
 )
 
-from completesplat.data.checks import BadAnnotation, BadCamera, BadPicture, MissingFile, TooFewFrames
-from completesplat.data.realestate10k_chunks import ChunkedClips
-from completesplat.data.realestate10k_source import Framing, RE10KSource, open_clips
-from completesplat.data.realestate10k_text import TextClips
-from completesplat.data.transforms import Square
+from completesplat.data.pictures.crop import Square
+from completesplat.data.realestate10k.chunks import ChunkedClips
+from completesplat.data.realestate10k.clips import TextClips
+from completesplat.data.realestate10k.module import Framing, RE10KSource, open_clips
+from completesplat.data.validation import BadAnnotation, BadCamera, BadPicture, MissingFile, TooFewFrames
 from completesplat.errors import DataError
 
 WHOLE = Square(0, 0, 18)

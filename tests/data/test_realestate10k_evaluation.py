@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from realestate10k_trees import make_clip, module, same, write_tree
 
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.errors import DataError
 
 PAIR = {"context": [2, 7], "target": [3, 5]}

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.prepared.writing import prepare
-from completesplat.data.scenes import TrainingScenes
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.loading.scenes import TrainingScenes
+from completesplat.data.packed.writing import prepare
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET
 from completesplat.errors import CompleteSplatError, DataError
@@ -81,7 +81,7 @@ def test_a_resumed_epoch_goes_on_exactly(store, workers, done):
 
 def test_training_processes_read_disjoint_parts(store, monkeypatch):
     def of_process(rank: int) -> list[SceneBatch]:
-        monkeypatch.setattr("completesplat.data.streaming.processes", lambda: (rank, 2))
+        monkeypatch.setattr("completesplat.data.loading.streaming.processes", lambda: (rank, 2))
         return epoch(module(store, references_per_sequence=1), 0)
 
     first, second = names(of_process(0)), names(of_process(1))
@@ -119,7 +119,7 @@ def test_what_cannot_be_read_is_counted_and_left_out(store, monkeypatch):
 
 
 def test_more_processes_than_sequences_are_refused(store, monkeypatch):
-    monkeypatch.setattr("completesplat.data.streaming.processes", lambda: (9, 10))
+    monkeypatch.setattr("completesplat.data.loading.streaming.processes", lambda: (9, 10))
     with pytest.raises(DataError, match="no sequences"):
         list(module(store, references_per_sequence=20).train_dataloader())
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from completesplat.data.transforms import Square, read_square
+from completesplat.data.pictures.crop import Square, read_square
 from completesplat.errors import DataError
 
 

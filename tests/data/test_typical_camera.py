@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from completesplat.data.typical_camera import typical_camera, world_up
+from completesplat.data.loading.training_statistics import typical_camera, world_up
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
 

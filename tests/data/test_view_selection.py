@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from completesplat.data.view_selection import (
+from completesplat.data.loading.view_selection import (
     draws,
     evaluation_views,
     evaluation_views_within,

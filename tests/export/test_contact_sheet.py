@@ -3,7 +3,7 @@ import pytest
 import torch
 from PIL import Image
 
-from completesplat.export.contact_sheet import Row, contact_sheet
+from completesplat.export.prediction import Row, contact_sheet
 
 
 def occurrences(sheet, image):

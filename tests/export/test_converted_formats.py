@@ -10,9 +10,8 @@ import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import write_formats
-from completesplat.export.page import PageView
 from completesplat.export.ply import read_ply
-from completesplat.export.splat_transform import SplatTransform, find_splat_transform
+from completesplat.export.splat_transform import PageView, SplatTransform, find_splat_transform
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 

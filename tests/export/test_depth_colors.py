@@ -1,6 +1,6 @@
 import torch
 
-from completesplat.export.depth_colors import color_depth
+from completesplat.export.pictures import color_depth
 
 
 def lightness(colors):

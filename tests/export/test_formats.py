@@ -9,9 +9,8 @@ from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS, write_formats
-from completesplat.export.page import PageView, upright, viewer_settings
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.export.splat_transform import SplatTransform
+from completesplat.export.splat_transform import PageView, SplatTransform, upright, viewer_settings
 from completesplat.geometry.cameras import Cameras, pinhole
 
 UP = torch.tensor([0.1, -0.9, -0.4])

@@ -1,8 +1,7 @@
 import numpy as np
 import torch
 
-from completesplat.export.grid import image_grid
-from completesplat.export.pixels import to_bytes
+from completesplat.export.pictures import image_grid, to_bytes
 
 
 def test_images_stand_where_they_were_given():

@@ -5,7 +5,7 @@ import torch
 from PIL import Image
 from support import some_gaussians
 
-from completesplat.export.maps import surface_depth, write_maps
+from completesplat.export.pictures import surface_depth, write_maps
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from completesplat.export.depth_colors import NOTHING
-from completesplat.export.normal_colors import color_normals
+from completesplat.export.pictures import NOTHING, color_normals
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,15 @@ import torch
 from PIL import Image
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.page import LARGEST_FOV, PageView, upright, viewer_settings, write_page
-from completesplat.export.pixels import to_bytes
-from completesplat.export.splat_transform import find_splat_transform
+from completesplat.export.pictures import to_bytes
+from completesplat.export.splat_transform import (
+    LARGEST_FOV,
+    PageView,
+    find_splat_transform,
+    upright,
+    viewer_settings,
+    write_page,
+)
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer

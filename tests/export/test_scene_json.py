@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from completesplat.export.scene_json import write_scene_json
+from completesplat.export.prediction import write_scene_json
 from completesplat.geometry.cameras import Cameras, pinhole
 
 

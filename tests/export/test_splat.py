@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.splat import write_splat
+from completesplat.export.formats import write_splat
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 

@@ -2,7 +2,7 @@ import dataclasses
 
 import torch
 
-from completesplat.export.views import orbit_views
+from completesplat.export.video import orbit_views
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support import some_gaussians
 
-from completesplat.export.widening import widened
+from completesplat.export.cleaning import widened
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import RenderingConstants

@@ -12,8 +12,7 @@ from vgg_weights import CONVOLUTIONS, digest
 
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction
-from completesplat.losses.lpips import LearnedPerceptualSimilarity, load_heads
-from completesplat.losses.vgg import URL, load_vgg16
+from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity, load_heads, load_vgg16
 from completesplat.scene import Views
 
 POOLINGS = (4, 9, 16, 23, 30)

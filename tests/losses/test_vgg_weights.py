@@ -7,8 +7,7 @@ import torch
 from vgg_weights import blank, digest, saved
 
 from completesplat.errors import WeightsError
-from completesplat.losses.lpips import LearnedPerceptualSimilarity
-from completesplat.losses.vgg import URL, load_vgg16
+from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity, load_vgg16
 
 
 def test_the_right_hash_or_its_first_digits_are_accepted(vgg_file, weights):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.linalg import sqrtm
 
-from completesplat.metrics.distribution import frechet_distance, kernel_distance
+from completesplat.metrics.image_sets import frechet_distance, kernel_distance
 
 
 @pytest.fixture(scope="module")

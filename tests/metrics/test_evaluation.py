@@ -6,8 +6,8 @@ import torch
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.evaluation import DepthViews, Evaluation
+from completesplat.metrics.image_sets import Patches
 from completesplat.metrics.missing import Missing
-from completesplat.metrics.set_metrics import Patches
 from completesplat.scene import SceneBatch, Views
 
 

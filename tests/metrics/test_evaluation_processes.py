@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import distributed, multiprocessing
 
-from completesplat.data.scenes import EvaluationScenes, SceneStore
+from completesplat.data.loading.scenes import EvaluationScenes, SceneStore
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.evaluation import Evaluation
-from completesplat.metrics.set_metrics import Patches
+from completesplat.metrics.image_sets import Patches
 from completesplat.scene import Views
 
 COUNTS = range(1, 10)

@@ -6,7 +6,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from completesplat.commands.protocol import METRICS
 from completesplat.metrics.images import PSNR_LIMIT, object_only, psnr, ssim
-from completesplat.reports.sweeps.headline import SSIM_NOTE
+from completesplat.results.tables import SSIM_NOTE
 
 
 @pytest.fixture(scope="module")

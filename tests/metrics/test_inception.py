@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from completesplat.errors import WeightsError
-from completesplat.metrics.inception import SHA256, URL, load_inception
+from completesplat.metrics.image_sets import SHA256, URL, load_inception
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from support import strict_json
 
-from completesplat.reports.machine import machine
+from completesplat.results.machine import machine
 
 
 def test_the_machine_can_be_written_as_json(tmp_path: Path) -> None:

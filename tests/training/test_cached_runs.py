@@ -7,7 +7,7 @@ import pytest
 import torch
 from support import SMALL, call
 
-from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.latent_cache.store import EncodedStore
 
 STEPS = 3
 QUICK = [

@@ -12,7 +12,7 @@ from lightning import LightningModule, Trainer
 from support import compose_config
 
 from completesplat.errors import CompleteSplatError
-from completesplat.training.checkpoint_files import CheckpointFiles, Checkpoints
+from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
@@ -118,7 +118,7 @@ def test_without_hard_links_milestones_are_copied(tmp_path, monkeypatch):
 
 def test_intervals_in_minutes(tmp_path, written, monkeypatch):
     minutes = itertools.count()  # each look at the clock takes one: at the start, then after every step
-    monkeypatch.setattr("completesplat.training.checkpoint_files.now", lambda: 60.0 * next(minutes))
+    monkeypatch.setattr("completesplat.training.checkpoints.now", lambda: 60.0 * next(minutes))
     train(tmp_path, steps=7, every_minutes=3)
     assert len(written) == 3  # after 3 steps, after 6, and in the end
 

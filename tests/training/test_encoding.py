@@ -14,8 +14,8 @@ from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.encoded import pictures
-from completesplat.data.encoded.store import EncodedStore
+from completesplat.data.latent_cache import pictures
+from completesplat.data.latent_cache.store import EncodedStore
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import EncodedScene
 from completesplat.tensors import stack

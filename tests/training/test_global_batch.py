@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 from torch import distributed, multiprocessing
 
-from completesplat.data.processes import batch_per_process
+from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.training.reconstruction import ReconstructionModule
 

@@ -15,9 +15,15 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.fixed_scenes import fixed_scenes
-from completesplat.training.panels import depth_panels, scene_panels, sheet
-from completesplat.training.pictures import distributions, latent_bits, percentiles
+from completesplat.training.pictures import (
+    depth_panels,
+    distributions,
+    fixed_scenes,
+    latent_bits,
+    percentiles,
+    scene_panels,
+    sheet,
+)
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:

@@ -10,9 +10,9 @@ from hydra.utils import instantiate
 from PIL import Image
 from support import SMALL, compose_config
 
-from completesplat.metrics.diversity import diversity
 from completesplat.metrics.images import PSNR_LIMIT, psnr
-from completesplat.training.fixed_scenes import fixed_scenes
+from completesplat.metrics.samples import diversity
+from completesplat.training.pictures import fixed_scenes
 from completesplat.training.samples import SceneDrawings, evenly_spaced, samples_sheet, strip_sheet
 
 MARGIN, LINE, CELL, GAP, SIDE = 72, 16, 128, 4, 32

@@ -5,7 +5,7 @@ import itertools
 import torch
 from lightning import LightningModule, Trainer
 
-from completesplat.training.step_seeds import StepSeeds, step_seed
+from completesplat.training.callbacks import StepSeeds, step_seed
 
 
 class Drawer(LightningModule):

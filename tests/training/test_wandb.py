@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from completesplat.results.dashboard.panels import FIT, MODES, PANELS, STAGE1, STAGE2, TEST
 from PIL import Image
 from support import SMALL, call, strict_json
 from wandb_files import offline_runs, shown_by
 
-from completesplat.reports.dashboard.panels import FIT, MODES, PANELS, STAGE1, STAGE2, TEST
 from completesplat.training.reconstruction import ReconstructionModule
 
 pytest.importorskip("wandb")

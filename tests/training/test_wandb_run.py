@@ -12,8 +12,8 @@ from support import SMALL
 from wandb_files import offline_runs
 
 from completesplat.errors import CompleteSplatError
-from completesplat.training import wandb_run
-from completesplat.training.wandb_run import ANSWER_SECONDS, START_SECONDS, WandbRun, answers, finished
+from completesplat.training import loggers
+from completesplat.training.loggers import ANSWER_SECONDS, START_SECONDS, WandbRun, answers, finished
 
 wandb = pytest.importorskip("wandb")
 
@@ -80,7 +80,7 @@ def test_a_server_delays_the_start_by_ten_seconds_at_most(online, tmp_path, monk
 
     start = wandb.init
     monkeypatch.setattr(wandb, "init", refuse)
-    monkeypatch.setattr(wandb_run, "answers", lambda url, seconds: asked.append(seconds) or True)
+    monkeypatch.setattr(loggers, "answers", lambda url, seconds: asked.append(seconds) or True)
     one = logger(tmp_path)
     one.log_metrics({"a": 1.0}, step=3)
     one.finish(0)

@@ -19,9 +19,12 @@ viser = pytest.importorskip("viser", reason="the viewer's extra is not installed
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import Page  # noqa: E402
-from completesplat.viewer.saving import Saver, write_page  # noqa: E402
-from completesplat.viewer.server import start_server  # noqa: E402
+from completesplat.viewer.page import (  # noqa: E402
+    Page,
+    Saver,
+    start_server,
+    write_page,
+)
 from completesplat.viewer.stage import Stage  # noqa: E402
 
 CHROMIUM = shutil.which("chromium")

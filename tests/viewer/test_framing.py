@@ -6,7 +6,7 @@ import torch
 from viewer_scenes import balls_sample
 
 from completesplat.geometry.cameras import Cameras, invert_rigid, look_at
-from completesplat.viewer.framing import framing_of
+from completesplat.viewer.stage import framing_of
 
 
 def test_one_sample_is_seen_as_its_reference_camera_sees_it():

@@ -14,17 +14,15 @@ from support import tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.errors import CompleteSplatError
+from completesplat.export.cleaning import widened
 from completesplat.export.ply import read_ply
-from completesplat.export.widening import widened
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
-from completesplat.viewer import saving  # noqa: E402
+from completesplat.viewer import page as page_module  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import Page  # noqa: E402
-from completesplat.viewer.saving import Saver  # noqa: E402
-from completesplat.viewer.server import start_server  # noqa: E402
+from completesplat.viewer.page import Page, Saver, start_server  # noqa: E402
 from completesplat.viewer.stage import Stage  # noqa: E402
 
 START = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
@@ -285,7 +283,7 @@ def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page,
     sample, drawn = replace(balls_sample(), exact=exact), []
     page.show([sample])
     monkeypatch.setattr(
-        saving,
+        page_module,
         "orbit_views",
         lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None),
     )

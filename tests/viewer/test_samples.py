@@ -7,7 +7,7 @@ from viewer_scenes import balls, balls_sample, reference_camera
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.export.scene_json import write_scene_json
+from completesplat.export.prediction import write_scene_json
 from completesplat.geometry.cameras import project
 from completesplat.viewer.samples import UP, Sample, framing_camera, read_scene
 

@@ -6,7 +6,7 @@ import torch
 from viewer_scenes import balls
 
 from completesplat.gaussians import concatenate
-from completesplat.viewer.splats import depth_colored, layer_of, to_splats
+from completesplat.viewer.stage import depth_colored, layer_of, to_splats
 
 
 def test_covariances_stretch_directions_as_the_axes_say():

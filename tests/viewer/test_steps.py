@@ -4,7 +4,7 @@ from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
-from completesplat.viewer.steps import nearest_steps, possible_steps
+from completesplat.viewer.controls import nearest_steps, possible_steps
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ from PIL import Image
 from support import tiny_generator
 
 from completesplat.errors import ImageError
-from completesplat.viewer import uploads
-from completesplat.viewer.uploads import read_upload
+from completesplat.viewer import completion
+from completesplat.viewer.completion import read_upload
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def test_too_many_pixels_are_refused(model):
 
 
 def test_too_many_bytes_are_refused_before_they_are_read(model, monkeypatch):
-    monkeypatch.setattr(uploads, "MOST_BYTES", 2**20)
+    monkeypatch.setattr(completion, "MOST_BYTES", 2**20)
     with pytest.raises(ImageError, match=r"^big\.png: 2 MiB; at most 1 MiB"):
         read_upload(model, "big.png", png(50, 40) + bytes(2**21))
 

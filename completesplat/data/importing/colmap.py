@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from completesplat.data.checks import BadCamera, MissingFile, UnreadableFile, at, finite_array, inside, require_file
 from completesplat.data.importing.capture import Capture, CapturedFrame, Lens, check_lens, in_order, make_cloud
+from completesplat.data.validation import BadCamera, MissingFile, UnreadableFile, at, finite_array, inside, require_file
 from completesplat.errors import CompleteSplatError
 
 # Number of parameters by the id that binary models use (colmap, `src/colmap/sensor/models.h`); other ids are refused.

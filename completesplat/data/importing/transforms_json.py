@@ -12,7 +12,17 @@ import numpy as np
 from jaxtyping import Float
 from plyfile import PlyData
 
-from completesplat.data.checks import (
+from completesplat.data.importing.capture import (
+    Capture,
+    CapturedFrame,
+    Lens,
+    PointCloud,
+    check_lens,
+    in_order,
+    make_cloud,
+    picture_size,
+)
+from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     MissingFile,
@@ -25,16 +35,6 @@ from completesplat.data.checks import (
     require_file,
     require_rotation,
 )
-from completesplat.data.importing.capture import (
-    Capture,
-    CapturedFrame,
-    Lens,
-    PointCloud,
-    check_lens,
-    in_order,
-    make_cloud,
-)
-from completesplat.data.importing.pictures import picture_size
 from completesplat.errors import DataError
 
 logger = logging.getLogger(__name__)

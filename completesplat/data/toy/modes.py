@@ -1,7 +1,4 @@
-"""The toy objects' hidden modes: every colour that the patch on the back could have had, rendered.
-
-A set's scenes are drawn again from the seed in its `toy.json`, and rendered once for each colour of the patch.
-"""
+"""The toy objects' hidden modes: every colour that the patch could have had, and what a frame shows of it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,19 +10,44 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.checks import at, field, read_json
 from completesplat.data.hidden_modes import HiddenModes
-from completesplat.data.scenes import Choice, SceneStore
+from completesplat.data.loading.scenes import Choice, SceneStore
+from completesplat.data.loading.view_selection import evaluation_views
+from completesplat.data.pictures.crop import cut_square, principal_square
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.toy.co3d_files import CATEGORY
-from completesplat.data.toy.objects import FORMAT_VERSION
-from completesplat.data.toy.scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
-from completesplat.data.toy.visibility import unseen
-from completesplat.data.transforms import cut_square, principal_square
-from completesplat.data.view_selection import evaluation_views
+from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
+from completesplat.data.toy.objects import CATEGORY, FORMAT_VERSION
+from completesplat.data.toy.raytracing import trace
+from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
+
+# Of the distance: what is seen at this much less is something else, in front.
+CLOSER = 1e-3
+
+
+def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tensor, "size size"]:
+    """The pixels of `frame` whose middle shows a point that is hidden in the picture of `reference`, or outside it."""
+    camera, other = (frame_camera(scene, index, size) for index in (frame, reference))
+    depth = torch.from_numpy(render_frame(scene, frame, size)[2]).flatten()
+    points = unproject(camera, pixel_centers(size, size, dtype=torch.float64).flatten(0, 1), depth)
+    pixels, distance_ahead = project(other, points)
+    within = (distance_ahead > 0) & (pixels > 0).all(-1) & (pixels < size).all(-1)
+    offsets = points - other.centers
+    distances = offsets.norm(dim=-1)
+    rays = (offsets / distances[:, None]) @ other.world_to_camera[:3, :3].mT
+    pose = scene.camera_to_world[reference]
+    met = trace(scene.geometry, scene.surroundings, scene.patch, pose, np.ascontiguousarray(rays.numpy()[:, None]))[2]
+    return ~(within & (torch.from_numpy(met) > (1 - CLOSER) * distances)).unflatten(0, (size, size))
+
+
+def frame_camera(scene: ToyScene, frame: int, size: int) -> Cameras:
+    """The camera of a frame, float64, in the scene's own lengths."""
+    pose = torch.from_numpy(scene.camera_to_world[frame])
+    return Cameras(invert_rigid(pose), pinhole(scene.fov_degrees, size).double(), (size, size))
+
 
 # A channel of two modes must differ by more than this for a pixel to be of the patch; less is its blurred edge.
 DIFFERENCE = 0.1

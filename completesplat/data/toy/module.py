@@ -4,9 +4,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.data.prepared.manifest import is_prepared
-from completesplat.data.realestate10k import RE10KDataModule
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.packed.manifest import is_prepared
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import CATEGORY, SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms

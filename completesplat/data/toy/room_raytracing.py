@@ -1,15 +1,45 @@
-"""Ray tracer for toy rooms: a box seen from inside, rectangles on its faces, boxes and ellipsoids in it, a point light.
-
-Shading is Lambertian, so a point looks the same from everywhere. All kernels are in this file, for the reason that
-`raytracing` gives.
-"""
+"""Ray tracer for toy rooms: a box seen from inside, rectangles on its faces, boxes and ellipsoids."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from completesplat.data.toy.raytracing import inlined, kernel
-from completesplat.data.toy.room_ingredients import BALL, RIPPLES, STRIPES, TILES
+from completesplat.data.toy.raytracing import Array, inlined, kernel
+
+BOX, BALL = 0, 1
+# What the first number of a texture says; the others are its frequency (radians per unit of length) and phase.
+PLAIN, STRIPES, TILES, RIPPLES = 0, 1, 2, 3
+FLOOR, CEILING = 2, 3
+WALLS = (0, 1, 4, 5)
+
+
+class Room(NamedTuple):
+    """Everything that a ray in the room can hit, and the light.
+
+    `size`: along x, y and z. `colors` [face 2 3] and `textures` [face 3]: looks of the room's faces. `decals` [decal 6]
+    are rectangles on faces: face, range of the first coordinate, range of the second, width of the rim; the coordinates
+    are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3]: rim and two inner colours.
+    Solids are the cube [-1, 1]^3 or the unit ball in their local frames; `to_local` [solid 3 4] maps room points there.
+    `bounding_balls` [solid 4]: centre and squared radius of a ball that holds each.
+    """
+
+    size: Array
+    colors: Array
+    textures: Array
+    decals: Array
+    decal_colors: Array
+    decal_textures: Array
+    solid_kinds: NDArray[np.int64]
+    to_local: Array
+    bounding_balls: Array
+    solid_half_sizes: Array
+    solid_colors: Array
+    solid_textures: Array
+    light: Array
+    ambient: float
+
 
 SELF_INTERSECTION = 1e-6
 SHADOW = 0.45

@@ -1,15 +1,273 @@
-"""Draws one toy room: its size, the looks of its faces, windows, doors and pictures, furniture and a light."""
+"""Draws one toy room: size, looks, furniture, and how a camera moves through it."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
-from completesplat.data.toy.ingredients import Array
-from completesplat.data.toy.room_camera import CameraMove, draw_move
-from completesplat.data.toy.room_furniture import Solid, furnish
-from completesplat.data.toy.room_ingredients import CEILING, FLOOR, PLAIN, RIPPLES, STRIPES, TILES, WALLS, Room
-from completesplat.data.toy.room_raytracing import trace_room
-from completesplat.data.toy.shapes import color
+from completesplat.data.toy.object_scene import color, rotation_about
+from completesplat.data.toy.raytracing import Array
+from completesplat.data.toy.room_raytracing import (
+    BALL,
+    BOX,
+    CEILING,
+    FLOOR,
+    PLAIN,
+    RIPPLES,
+    STRIPES,
+    TILES,
+    WALLS,
+    Room,
+    trace_room,
+)
+from completesplat.geometry.cameras import invert_rigid, look_at
+
+GAP = 0.05
+ATTEMPTS = 100
+
+
+@dataclass(frozen=True)
+class Solid:
+    """One box or ellipsoid: its centre, half sizes, turn about the vertical, its look."""
+
+    kind: int
+    center: Array
+    half_sizes: Array
+    yaw: float
+    colors: Array
+    texture: Array
+
+    def to_local(self) -> Array:
+        """[3 4] map from the room's frame to the unit shape's."""
+        linear = rotation_about("y", self.yaw).T / self.half_sizes[:, None]
+        return np.concatenate([linear, -linear @ self.center[:, None]], axis=1)
+
+    def bounding_ball(self) -> Array:
+        """Centre and squared radius [4]."""
+        return np.append(self.center, (self.half_sizes**2).sum())
+
+    def distances(self, points: Array) -> Array:
+        """How far the points [n 3] are from the (bounding) box; 0 inside."""
+        outside = np.abs((points - self.center) @ rotation_about("y", self.yaw)) - self.half_sizes
+        return np.linalg.norm(outside.clip(0), axis=-1)
+
+    def ground_extent(self) -> tuple[Array, Array]:
+        """Lower and upper corner (x, z) of the rectangle that its shadow at noon lies in."""
+        reach = np.abs(rotation_about("y", self.yaw)) @ self.half_sizes
+        return (self.center - reach)[[0, 2]], (self.center + reach)[[0, 2]]
+
+    def moved(self, yaw: float, shift: Array) -> "Solid":
+        """After a turn about the vertical axis through the origin, then a shift."""
+        return replace(self, center=rotation_about("y", yaw) @ self.center + shift, yaw=self.yaw + yaw)
+
+
+Piece = list[Solid]
+Look = tuple[Array, Array]
+
+
+def _look(rng: np.random.Generator) -> Look:
+    hue, saturation = rng.uniform(), rng.uniform(0.2, 0.8)
+    first = color(hue, saturation, rng.uniform(0.6, 0.95))
+    second = color(hue + rng.uniform(-0.08, 0.08), saturation, rng.uniform(0.3, 0.55))
+    pattern = rng.choice([PLAIN, STRIPES, TILES, RIPPLES])
+    return np.stack([first, second]), np.array([pattern, rng.uniform(10, 22), rng.uniform(0, 2 * np.pi)])
+
+
+def _solid(kind: int, center: tuple[float, float, float], half: tuple[float, float, float], look: Look) -> Solid:
+    return Solid(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), 0.0, *look)
+
+
+def cabinet(rng: np.random.Generator) -> Piece:
+    """One box, from a chest to a wardrobe."""
+    half = (rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.0), rng.uniform(0.18, 0.3))
+    return [_solid(BOX, (0, half[1], 0), half, _look(rng))]
+
+
+def table(rng: np.random.Generator) -> Piece:
+    """A slab on four legs."""
+    wide, deep, top = rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.45), rng.uniform(0.45, 0.75)
+    look, leg = _look(rng), _look(rng)
+    legs = [
+        _solid(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
+        for x in (-1, 1)
+        for z in (-1, 1)
+    ]
+    return [_solid(BOX, (0, top, 0), (wide, 0.03, deep), look), *legs]
+
+
+def sofa(rng: np.random.Generator) -> Piece:
+    """A seat, a back and two arms."""
+    wide, deep, seat = rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.45), rng.uniform(0.18, 0.23)
+    look, back = _look(rng), rng.uniform(0.35, 0.45)
+    arms = [_solid(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
+    rest = _solid(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
+    return [_solid(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
+
+
+def pouf(rng: np.random.Generator) -> Piece:
+    """An ellipsoid."""
+    half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
+    return [_solid(BALL, (0, half[1], 0), half, _look(rng))]
+
+
+def lamp(rng: np.random.Generator) -> Piece:
+    """A foot, a pole and an ellipsoid on top."""
+    top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
+    look = _look(rng)
+    foot = [
+        _solid(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look),
+        _solid(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look),
+    ]
+    return [*foot, _solid(BALL, (0, top + shade[1], 0), shade, _look(rng))]
+
+
+PIECES = (cabinet, table, sofa, pouf, lamp)
+
+
+def furnish(rng: np.random.Generator, size: Array) -> list[Piece]:
+    """3 to 6 pieces that do not overlap, most of them along the walls."""
+    count = int(rng.integers(3, 7))
+    taken: list[tuple[Array, Array]] = []
+    pieces: list[Piece] = []
+    for _ in range(ATTEMPTS):
+        piece = _placed(rng, PIECES[rng.integers(len(PIECES))](rng), size)
+        low, high = _ground_extent(piece)
+        inside = (np.abs(np.stack([low, high])) <= size[[0, 2]] / 2 - GAP + 1e-9).all()
+        if inside and not any((low < other[1] + GAP).all() and (other[0] < high + GAP).all() for other in taken):
+            taken.append((low, high))
+            pieces.append(piece)
+        if len(pieces) == count:
+            break
+    return pieces
+
+
+def _ground_extent(piece: Piece) -> tuple[Array, Array]:
+    lows, highs = zip(*(solid.ground_extent() for solid in piece), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
+
+
+def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
+    """With the back to a wall in four cases of five, anywhere and turned freely otherwise; it may overlap others."""
+    along_wall = rng.uniform() < 0.8
+    yaw = float(rng.integers(4) * np.pi / 2) if along_wall else float(rng.uniform(0, 2 * np.pi))
+    turned = [solid.moved(yaw, np.zeros(3)) for solid in piece]
+    low, high = _ground_extent(turned)
+    free = size[[0, 2]] / 2 - GAP
+    shift = rng.uniform(-free - low, free - high)
+    if along_wall:
+        back = rotation_about("y", yaw)[[0, 2], 2] * -1
+        axis = int(np.abs(back).argmax())
+        shift[axis] = free[axis] - high[axis] if back[axis] > 0 else -free[axis] - low[axis]
+    return [solid.moved(0.0, np.array([shift[0], 0.0, shift[1]])) for solid in turned]
+
+
+MARGIN = 0.3
+LOWEST, HIGHEST = 1.0, 1.7
+# A video of 30 frames a second, taken at a slow walk.
+STEPS = (0.012, 0.032)
+LARGEST_TURN = np.radians(3.0)
+WAYPOINTS = 4
+FIELD_OF_VIEW = (55, 75)
+DENSE = 400
+ASPECT = 16 / 9
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class CameraMove:
+    """Poses in the room ([frame 4 4], OpenCV axes), the lens, and the world that the files speak of.
+
+    `focal`: in widths of the picture. `principal_point`: (x, y) in widths and heights. A point of the room lies in the
+    world at `unit` * `rotation` @ point + `origin`; as in RealEstate10K, the world's +y points down.
+    """
+
+    camera_to_room: Array
+    focal: float
+    principal_point: Array
+    unit: float
+    rotation: Array
+    origin: Array
+
+    def intrinsics(self, height: int, width: int) -> Array:
+        """fx, fy, cx, cy in shares of width, height, width, height, for square pixels."""
+        return np.array([self.focal, self.focal * width / height, *self.principal_point])
+
+    def world_to_camera(self) -> Array:
+        """[frame 3 4], in the world and its unit."""
+        rotation = np.swapaxes(self.camera_to_room[:, :3, :3], 1, 2) @ self.rotation.T
+        centers = self.unit * self.camera_to_room[:, :3, 3] @ self.rotation.T + self.origin
+        return np.concatenate([rotation, -rotation @ centers[:, :, None]], axis=2)
+
+
+def image_width(height: int) -> int:
+    """The even number next to 16 / 9 of the height."""
+    return 2 * round(height * ASPECT / 2)
+
+
+def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> CameraMove:
+    """A walk through the free space of a room, MARGIN away from everything."""
+    centers, tangents = _path(rng, frames, size, furniture)
+    yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2])) + rng.normal(0, 0.2)
+    swing = 2 * np.pi * (np.linspace(0, rng.uniform(0.2, 1.0), frames) + rng.uniform())
+    pitch = np.radians(rng.uniform(-16, -2) + 2 * np.sin(swing))
+    forward = np.stack([np.cos(pitch) * np.sin(yaw), np.sin(pitch), np.cos(pitch) * np.cos(yaw)], axis=1)
+    room_to_camera = look_at(torch.from_numpy(centers), torch.from_numpy(centers + forward), UP)
+    return CameraMove(
+        camera_to_room=invert_rigid(room_to_camera).numpy(),
+        focal=float(0.5 / np.tan(np.radians(rng.uniform(*FIELD_OF_VIEW)) / 2)),
+        principal_point=0.5 + (rng.uniform(-0.03, 0.03, 2) if rng.uniform() < 0.25 else np.zeros(2)),
+        unit=float(rng.uniform(0.5, 2.0)),
+        rotation=rotation_about("y", rng.uniform(0, 2 * np.pi)) @ rotation_about("x", np.pi),
+        origin=rng.normal(size=3),
+    )
+
+
+def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> tuple[Array, Array]:
+    """Places [frame 3] at equal steps along a cubic through random waypoints, and tangents [frame 3].
+
+    Paths that come too near to something or turn too fast are drawn anew, shorter and shorter, so that one is found.
+    """
+    stride, step = 1.2, rng.uniform(*STEPS)
+    while True:
+        waypoints = _waypoints(rng, size, stride)
+        parameters = np.linspace(0, 1, WAYPOINTS)
+        cubic = np.polynomial.polynomial.polyfit(parameters, waypoints, WAYPOINTS - 1)
+        dense = np.linspace(0, 1, DENSE)
+        points = np.polynomial.polynomial.polyval(dense, cubic).T
+        lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+        reached = np.linspace(0, min(step * (frames - 1), lengths[-1]), frames)
+        times = np.interp(reached, lengths, dense)
+        centers = np.polynomial.polynomial.polyval(times, cubic).T
+        slopes = np.polynomial.polynomial.polyval(times, np.polynomial.polynomial.polyder(cubic)).T
+        if _is_free(centers, size, furniture) and _largest_turn(slopes) < LARGEST_TURN:
+            return np.ascontiguousarray(centers), slopes
+        stride *= 0.99
+
+
+def _waypoints(rng: np.random.Generator, size: Array, stride: float) -> Array:
+    """[waypoint 3]: about `stride` apart, first towards the middle, then bending by at most 60 degrees each time."""
+    start = rng.uniform(-0.5, 0.5, 2) * (size[[0, 2]] - 2 * MARGIN)
+    first = np.arctan2(-start[0], -start[1]) + rng.uniform(-np.pi / 4, np.pi / 4)
+    heading = np.cumsum(np.append(first, rng.uniform(-np.pi / 3, np.pi / 3, WAYPOINTS - 2)))
+    steps = stride * rng.uniform(0.7, 1.3, WAYPOINTS - 1)
+    x, z = np.cumsum(
+        np.stack([start, *np.stack([np.sin(heading), np.cos(heading)], axis=1) * steps[:, None]]), axis=0
+    ).T
+    heights = rng.uniform(1.1, 1.6) + rng.normal(0, 0.05, WAYPOINTS)
+    return np.stack([x, heights, z], axis=1)
+
+
+def _is_free(centers: Array, size: Array, furniture: Sequence[Solid]) -> bool:
+    inside = np.abs(centers[:, [0, 2]]) <= size[[0, 2]] / 2 - MARGIN
+    high = (centers[:, 1] >= LOWEST) & (centers[:, 1] <= HIGHEST)
+    return bool(inside.all() and high.all() and all((s.distances(centers) >= MARGIN).all() for s in furniture))
+
+
+def _largest_turn(tangents: Array) -> float:
+    yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2]))
+    return float(np.abs(np.diff(yaw)).max())
+
 
 SAMPLES = 3
 

@@ -1,24 +1,130 @@
-"""The kernels in their order, over all scenes and views of a batch, on several threads."""
+"""The kernels in their order, over all scenes and views of a batch, on several threads, in reused memory."""
 
 import math
+import os
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from completesplat.rasterizers.kernels import layout
 from completesplat.rasterizers.kernels.blocks import WORD_BITS
-from completesplat.rasterizers.kernels.buffers import Buffers
-from completesplat.rasterizers.kernels.camera_backward import camera_backward
-from completesplat.rasterizers.kernels.composite import STATE_VECTORS, composite
-from completesplat.rasterizers.kernels.composite_backward import STATE_VECTORS as BACKWARD_STATE_VECTORS
-from completesplat.rasterizers.kernels.composite_backward import composite_backward
-from completesplat.rasterizers.kernels.project import prepare, project
-from completesplat.rasterizers.kernels.project_backward import project_backward
+from completesplat.rasterizers.kernels.composite import (
+    BACKWARD_STATE_VECTORS,
+    FORWARD_STATE_VECTORS,
+    composite,
+    composite_backward,
+)
+from completesplat.rasterizers.kernels.project import prepare, project, project_backward
 from completesplat.rasterizers.kernels.simd import LANES
-from completesplat.rasterizers.kernels.threads import parallel
+from completesplat.rasterizers.kernels.splat_backward import camera_backward
 from completesplat.rasterizers.protocol import RenderingConstants
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+_pool_lock = threading.Lock()
+
+
+def parallel(task: Callable[[int], None], count: int) -> None:
+    """Run task(0), ..., task(count - 1), each on whichever thread is free, and wait for all of them."""
+    helpers = min(torch.get_num_threads(), count) - 1
+    if helpers < 1:
+        for i in range(count):
+            task(i)
+        return
+    remaining = iter(range(count))
+    lock = threading.Lock()
+
+    def work() -> None:
+        while True:
+            with lock:
+                i = next(remaining, None)
+            if i is None:
+                return
+            task(i)
+
+    futures = [_pool(helpers).submit(work) for _ in range(helpers)]
+    try:
+        work()
+    finally:
+        for future in futures:
+            future.result()
+
+
+def _pool(size: int) -> ThreadPoolExecutor:
+    with _pool_lock:
+        if size not in _pools:
+            _pools[size] = ThreadPoolExecutor(size, thread_name_prefix="rasterizer")
+        return _pools[size]
+
+
+def _forget_pools() -> None:
+    """Threads do not survive a fork: the child would wait forever for those of its parent."""
+    global _pool_lock
+    _pools.clear()
+    _pool_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pools)
+
+
+ALIGNMENT = 64  # bytes, one cache line
+MOST_FREE_BYTES = 512 * 2**20
+
+_free: list[np.ndarray] = []  # of uint8, oldest first
+_buffers_lock = threading.Lock()
+
+
+class Buffers:
+    """Arrays that are handed back for reuse when this object is deleted (with the autograd node that owns it)."""
+
+    def __init__(self) -> None:
+        self._blocks: list[np.ndarray] = []
+
+    def empty(self, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+        """An uninitialised array at an aligned address."""
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        block = _take(size)
+        self._blocks.append(block)
+        start = -block.ctypes.data % ALIGNMENT
+        return block[start : start + size].view(dtype).reshape(shape)
+
+    def __del__(self) -> None:
+        # No lock: the garbage collector may come here while `_take` of the same thread holds it. extend is atomic.
+        _free.extend(self._blocks)
+
+
+def _take(size: int) -> np.ndarray:
+    """A free block that is large enough, but not wastefully so, or a new one."""
+    needed = size + ALIGNMENT
+    with _buffers_lock:
+        while sum(block.nbytes for block in _free) > MOST_FREE_BYTES:
+            del _free[0]
+        for i, block in enumerate(_free):
+            if needed <= block.nbytes <= 2 * needed:
+                return _free.pop(i)
+    return np.empty(needed, np.uint8)
+
+
+def release() -> None:
+    """Give the memory that is not in use back to the system."""
+    with _buffers_lock:
+        _free.clear()
+
+
+def _forget_lock() -> None:
+    """Another thread of the parent may have held the lock at the moment of a fork."""
+    global _buffers_lock
+    _buffers_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_lock)
+
 
 # A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
 # sums over bands depend on where the bands end, and results must not depend on the number of threads.
@@ -146,7 +252,7 @@ class Drawing:
 
     def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
-        self._run(composite, STATE_VECTORS, slot, band, images.view(*divmod(start + slot, self.views)))
+        self._run(composite, FORWARD_STATE_VECTORS, slot, band, images.view(*divmod(start + slot, self.views)))
 
     def _composite_backward(self, images: Images, gradients: Images, sums: np.ndarray, task: int) -> None:
         slot, band = divmod(task, len(self.bands))

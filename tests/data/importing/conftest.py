@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from completesplat.data.co3d_annotations import camera_from_viewpoint
+from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.geometry.cameras import project
 
 RNG = np.random.default_rng(7)

@@ -8,8 +8,7 @@ import torch
 
 from completesplat.data.importing import import_capture
 from completesplat.data.importing.capture import Lens
-from completesplat.data.importing.layout import held_out_frames
-from completesplat.data.importing.undistortion import Undistortion, _source_positions
+from completesplat.data.importing.layout import Undistortion, _source_positions, held_out_frames
 
 
 def test_every_eighth_frame_is_held_out():

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from completesplat.data.checks import (
+from completesplat.data.importing import import_capture
+from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     BadPicture,
@@ -13,7 +14,6 @@ from completesplat.data.checks import (
     TooFewFrames,
     UnreadableFile,
 )
-from completesplat.data.importing import import_capture
 from completesplat.errors import CompleteSplatError, DataError
 
 

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 from plyfile import PlyData
 
-from completesplat.data.checks import MissingFile
 from completesplat.data.importing import import_capture
+from completesplat.data.validation import MissingFile
 
 LENSES = {
     "a pinhole off the centre": {},

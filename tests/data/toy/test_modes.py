@@ -10,7 +10,7 @@ import torch
 from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.toy.modes import DIFFERENCE, SAME_PICTURE
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
-from completesplat.data.toy.scene import PATCH_COLORS
+from completesplat.data.toy.object_scene import PATCH_COLORS
 from completesplat.errors import CompleteSplatError, DataError
 
 

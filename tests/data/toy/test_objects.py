@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from completesplat.data.co3d_annotations import camera_from_viewpoint
+from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.toy import write_objects
-from completesplat.data.toy.scene import PATCH_COLORS, draw_scene, render_frame
+from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from completesplat.data.toy.room_camera import HIGHEST, LOWEST, MARGIN, image_width
-from completesplat.data.toy.room_scene import draw_room_scene
+from completesplat.data.toy.room_scene import HIGHEST, LOWEST, MARGIN, draw_room_scene, image_width
 
 
 def scene(index: int, frames: int = 60):

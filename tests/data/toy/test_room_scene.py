@@ -9,10 +9,8 @@ import pytest
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.room_camera import image_width
-from completesplat.data.toy.room_furniture import furnish
-from completesplat.data.toy.room_ingredients import BALL
-from completesplat.data.toy.room_scene import draw_room_scene, render_room_frame
+from completesplat.data.toy.room_raytracing import BALL
+from completesplat.data.toy.room_scene import draw_room_scene, furnish, image_width, render_room_frame
 
 Pinhole = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 

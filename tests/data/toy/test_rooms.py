@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.realestate10k_files import (
+from completesplat.data.toy.rooms import (
     CLIPS_PER_CHUNK,
     clip_files,
     write_chunks,

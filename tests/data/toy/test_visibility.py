@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from completesplat.data.toy.scene import draw_scene, render_frame
-from completesplat.data.toy.visibility import frame_camera, unseen
+from completesplat.data.toy.modes import frame_camera, unseen
+from completesplat.data.toy.object_scene import draw_scene, render_frame
 from completesplat.geometry.cameras import pixel_centers, project, unproject
 
 SIZE, FRAMES = 48, 8

@@ -14,8 +14,8 @@ import torch
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.rasterizers.kernels import buffers, compilation
-from completesplat.rasterizers.kernels.threads import parallel
+from completesplat.rasterizers.kernels import compilation, drawing
+from completesplat.rasterizers.kernels.drawing import parallel
 from completesplat.rasterizers.tiled import TiledRasterizer
 
 TIMEOUT = 120
@@ -116,8 +116,8 @@ def _double(x: int) -> int:
 
 
 def test_buffers_are_aligned_reused_and_not_shared() -> None:
-    buffers.release()
-    owner, other = buffers.Buffers(), buffers.Buffers()
+    drawing.release()
+    owner, other = drawing.Buffers(), drawing.Buffers()
     first, second = owner.empty((1000, 7)), other.empty((1000, 7))
     assert first.ctypes.data % 64 == second.ctypes.data % 64 == 0
     assert not np.shares_memory(first, second)

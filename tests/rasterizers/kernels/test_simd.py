@@ -7,7 +7,7 @@ import pytest
 
 from completesplat.rasterizers.kernels import blocks, simd
 from completesplat.rasterizers.kernels.compilation import kernel
-from completesplat.rasterizers.kernels.vectors import LANES
+from completesplat.rasterizers.kernels.simd import LANES
 
 exp2, keep, lane_sums, load, store = simd.exp2, simd.keep, simd.lane_sums, simd.load, simd.store
 any_lane, lowest_bit, gather, transpose = simd.any_lane, simd.lowest_bit, simd.gather, simd.transpose

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from completesplat.reports.comparison.building import tables
-from completesplat.reports.comparison.cells import Table
+from completesplat.results.published import tables
+from completesplat.results.tables import Table
 
 PROTOCOL = {"data_set": "toy_objects", "resolution": 32, "scenes": 9, "missing": {"lpips": "missing: no weights"}}
 

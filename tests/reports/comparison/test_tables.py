@@ -5,10 +5,9 @@ import json
 import pytest
 
 from completesplat.errors import CompleteSplatError
-from completesplat.reports.comparison.building import tables
-from completesplat.reports.comparison.cells import Table
-from completesplat.reports.comparison.entries import duration
-from completesplat.reports.sweeps.headline import SSIM_NOTE
+from completesplat.results.published import tables
+from completesplat.results.rows import duration
+from completesplat.results.tables import SSIM_NOTE, Table
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
 HYDRANTS |= {"subset": "fewview_dev", "scenes_listed": 77}

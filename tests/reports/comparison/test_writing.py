@@ -5,10 +5,8 @@ import re
 
 import pytest
 
-from completesplat.reports.comparison.building import tables
-from completesplat.reports.comparison.cells import Cell, Heading, Row, Table
-from completesplat.reports.comparison.writing import as_latex, as_markdown, show_tables, write_tables
-from completesplat.reports.published.figures import published
+from completesplat.results.published import published, tables
+from completesplat.results.tables import Cell, Heading, Row, Table, as_latex, as_markdown, show_tables, write_tables
 
 ENVIRONMENT = re.compile(r"\\(begin|end)\{(\w+\*?)\}")
 

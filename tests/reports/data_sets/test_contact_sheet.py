@@ -5,12 +5,11 @@ import pytest
 import torch
 from PIL import Image
 
-from completesplat.data.checks import BadPicture, OutsidePath
 from completesplat.data.sequences import Picture
+from completesplat.data.validation import BadPicture, OutsidePath
 from completesplat.geometry.cameras import project
-from completesplat.reports.data_sets.contact_sheet import CELL, GAP, MARGIN, MASK, MOST_SEQUENCES, show
-from completesplat.reports.data_sets.cross import place_cross
-from completesplat.reports.data_sets.frusta import CROSS_COLORS
+from completesplat.studies.contact_sheet import CELL, GAP, MARGIN, MASK, MOST_SEQUENCES, show
+from completesplat.studies.frusta import CROSS_COLORS, place_cross
 
 SIZE = 24
 

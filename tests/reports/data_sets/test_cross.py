@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from completesplat.geometry.cameras import Cameras, pinhole, project
-from completesplat.reports.data_sets.cross import level_axes, place_cross, visible_segments
+from completesplat.studies.frusta import level_axes, place_cross, visible_segments
 
 
 def close(first, second, tolerance=1e-9):

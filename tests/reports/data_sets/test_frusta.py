@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from completesplat.geometry.cameras import project
-from completesplat.reports.data_sets.cross import place_cross
-from completesplat.reports.data_sets.frusta import drawings, time_color
+from completesplat.studies.frusta import drawings, place_cross, time_color
 
 SIDE = 200
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.reports.data_sets.statistics import MEASURES, show_statistics, statistics
-from completesplat.reports.data_sets.statistics_plot import plot_statistics
+from completesplat.studies.statistics import MEASURES, plot_statistics, show_statistics, statistics
 
 BLUE, ORANGE = (31, 119, 180), (255, 127, 14)
 

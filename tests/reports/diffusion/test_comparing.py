@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import torch
 
-from completesplat.reports.diffusion import comparing
-from completesplat.reports.diffusion.comparing import WARM_UP, Comparison, measured
+from completesplat.benchmarks import diffusion
+from completesplat.benchmarks.diffusion import WARM_UP, Comparison, measured
 
 
 def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatch):
     now, calls = [0.0], []
-    monkeypatch.setattr(comparing, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(diffusion, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     # Seconds of each call; those of the warm-up are long.
     seconds = {"a": [9.0] * WARM_UP + [1.0, 2.0, 6.0], "b": [90.0] * WARM_UP + [40.0, 8.0, 1.0]}
 

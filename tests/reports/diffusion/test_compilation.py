@@ -7,8 +7,7 @@ import torch
 from support import tiny_generator
 from torch import nn
 
-from completesplat.reports.diffusion.comparing import NotMeasured
-from completesplat.reports.diffusion.compilation import compiled_vs_eager
+from completesplat.benchmarks.diffusion import NotMeasured, compiled_vs_eager
 
 
 class Wrapped(nn.Module):

@@ -7,9 +7,8 @@ import pytest
 from support import compose_config, tiny_generator
 from torch import nn
 
+from completesplat.benchmarks.diffusion import Comparison, comparisons
 from completesplat.generation import CompleteSplat
-from completesplat.reports.diffusion.comparing import Comparison
-from completesplat.reports.diffusion.drawing import comparisons
 
 FEW = compose_config("fit", "sampler=dpm10", "sampler.steps=3").sampler
 

@@ -7,7 +7,7 @@ import torch
 from hydra.utils import instantiate
 from support import compose_config
 
-from completesplat.reports.diffusion.training import Training, batches, cached_vs_on_the_fly
+from completesplat.benchmarks.diffusion import Training, batches, cached_vs_on_the_fly
 from completesplat.scene import EncodedScene, SceneBatch
 
 SMALL = [
@@ -67,7 +67,7 @@ def test_both_ways_load_a_batch_for_each_step_and_pictures_only_once(toy_root, t
     given = []
     monkeypatch.setattr(Training, "step", lambda self, batch: given.append(batch))
     comparison = cached_vs_on_the_fly(training, data, tmp_path / "latents")
-    monkeypatch.setattr("completesplat.data.transforms.decode", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("completesplat.data.pictures.crop.decode", lambda *_: pytest.fail("decoded again"))
     for _ in range(5):
         comparison.a[1]()
         comparison.b[1]()

@@ -3,11 +3,11 @@
 import pytest
 from packaging.requirements import Requirement
 
-from completesplat.reports.doctor.packages import applies, check, extra_packages, needed_packages
+from completesplat.commands.doctor import applies, check_packages, extra_packages, needed_packages
 
 
 def test_what_is_needed_here_is_installed_here():
-    assert [finding for finding in check() if finding.state == "broken"] == []
+    assert [finding for finding in check_packages() if finding.state == "broken"] == []
 
 
 def test_a_missing_package_is_broken_and_says_how_to_get_it():

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from completesplat.commands import doctor_checks
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, failure
-from completesplat.reports.doctor import rendering
 
 
 class Changed:
@@ -24,11 +24,11 @@ class Changed:
 
 @pytest.mark.parametrize("name", [name for name in FASTER if failure(name, None) is None])
 def test_backends_that_agree_with_the_reference_draw_the_closed_form(name):
-    assert rendering.wrong(FASTER[name](None)) is None
+    assert doctor_checks.wrong(FASTER[name](None)) is None
 
 
 def test_the_reference_draws_the_closed_form():
-    assert rendering.wrong(ReferenceRasterizer()) is None
+    assert doctor_checks.wrong(ReferenceRasterizer()) is None
 
 
 @pytest.mark.parametrize(
@@ -42,11 +42,11 @@ def test_the_reference_draws_the_closed_form():
     ids=["no blur", "brighter", "a pixel aside", "not a number"],
 )
 def test_a_wrong_picture_is_noticed(wrong):
-    assert "wrong by" in (rendering.wrong(wrong) or "")
+    assert "wrong by" in (doctor_checks.wrong(wrong) or "")
 
 
 def test_only_a_wrong_reference_is_broken(monkeypatch):
-    assert [finding.state for finding in rendering.check() if finding.name == "reference"] == ["yes"]
-    assert all(finding.state != "broken" for finding in rendering.check())
-    monkeypatch.setattr(rendering, "ReferenceRasterizer", lambda: Changed(torch.zeros_like))
-    assert [finding.name for finding in rendering.check() if finding.state == "broken"] == ["reference"]
+    assert [finding.state for finding in doctor_checks.check_rasterizers() if finding.name == "reference"] == ["yes"]
+    assert all(finding.state != "broken" for finding in doctor_checks.check_rasterizers())
+    monkeypatch.setattr(doctor_checks, "ReferenceRasterizer", lambda: Changed(torch.zeros_like))
+    assert [finding.name for finding in doctor_checks.check_rasterizers() if finding.state == "broken"] == ["reference"]

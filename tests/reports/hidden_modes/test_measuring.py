@@ -11,9 +11,8 @@ from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.losses import WeightedSum
 from completesplat.losses.mse import MeanSquaredError
 from completesplat.rasterizers import Rendering
-from completesplat.reports.hidden_modes.measuring import in_region, measure, usable
-from completesplat.reports.hidden_modes.predictors import predictors
 from completesplat.scene import SceneBatch, Views
+from completesplat.studies.hidden_modes import in_region, measure, predictors, usable
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 

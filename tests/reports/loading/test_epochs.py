@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import pytest
 from prepared_sequences import ListedSource
 
-from completesplat.data.loading import EpochSampler, SceneLoader
-from completesplat.data.scenes import SceneStore, TrainingScenes
-from completesplat.data.view_selection import training_views
-from completesplat.reports.loading import epochs
-from completesplat.reports.loading.epochs import Epoch, read_epoch, rows
+from completesplat.benchmarks import data
+from completesplat.benchmarks.data import Epoch, read_epoch, rows
+from completesplat.data.loading.loader import EpochSampler, SceneLoader
+from completesplat.data.loading.scenes import SceneStore, TrainingScenes
+from completesplat.data.loading.view_selection import training_views
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def loader() -> SceneLoader:
 
 
 def test_an_epoch_counts_batches_scenes_and_images(loader: SceneLoader, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(epochs, "time", SimpleNamespace(perf_counter=iter([3.0, 5.5]).__next__))
+    monkeypatch.setattr(data, "time", SimpleNamespace(perf_counter=iter([3.0, 5.5]).__next__))
     assert read_epoch(loader, 0) == Epoch(2.5, batches=3, scenes=5, images=15)
 
 
@@ -45,7 +45,7 @@ def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypa
     def form(name: str) -> Callable[..., SimpleNamespace]:
         return lambda workers: SimpleNamespace(train_dataloader=lambda: f"{name}{workers}")
 
-    monkeypatch.setattr(epochs, "read_epoch", read_from)
+    monkeypatch.setattr(data, "read_epoch", read_from)
     said: list[str] = []
     found = rows({"a": form("a"), "b": form("b")}, [0, 2], 3, said.append)
     turns = [(form, 0, number) for number in range(4) for form in "ab"]

@@ -8,10 +8,9 @@ import pytest
 import torch
 from prepared_sequences import ListedSource
 
+from completesplat.benchmarks import data
+from completesplat.benchmarks.data import RepeatedSource, resident_megabytes
 from completesplat.data.sequences import SequenceSource
-from completesplat.reports.loading import memory
-from completesplat.reports.loading.memory import resident_megabytes
-from completesplat.reports.loading.opening import RepeatedSource
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system has no /proc")
 
@@ -60,5 +59,5 @@ def test_pages_of_a_mapped_file_are_counted_apart(tmp_path: Path) -> None:
 
 
 def test_without_proc_memory_is_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(memory, "STATUS", tmp_path / "status")
+    monkeypatch.setattr(data, "STATUS", tmp_path / "status")
     assert resident_megabytes() is None

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from completesplat.data.co3d import CO3DDataModule
-from completesplat.reports.loading import watching
-from completesplat.reports.loading.watching import DECODERS, Counter, Stopwatch, decoding_share, replaced
+from completesplat.benchmarks import data
+from completesplat.benchmarks.data import DECODERS, Counter, Stopwatch, decoding_share, replaced
+from completesplat.data.co3d.module import CO3DDataModule
 
 
 def test_a_function_is_put_back_also_after_an_error() -> None:
@@ -24,7 +24,7 @@ def test_a_function_is_put_back_also_after_an_error() -> None:
 
 
 def test_a_stopwatch_adds_up_what_the_functions_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watching, "time", SimpleNamespace(perf_counter=iter([1.0, 3.0, 10.0, 10.5]).__next__))
+    monkeypatch.setattr(data, "time", SimpleNamespace(perf_counter=iter([1.0, 3.0, 10.0, 10.5]).__next__))
     watch = Stopwatch()
     assert watch.wrap(max)(2, 3) == 3
     with pytest.raises(ValueError, match="literal"):

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from completesplat.reports.published import check
-from completesplat.reports.published.checking import differences
-from completesplat.reports.published.figures import Column, PublishedTable, parse, published
-from completesplat.reports.published.grid import environment, figure, grid
+from completesplat.results.paper_check import check, differences, environment, figure, grid
+from completesplat.results.published import Column, PublishedTable, parse, published
 
 PAPER = os.environ.get("COMPLETESPLAT_PAPER")
 SMALL = r"""

@@ -9,20 +9,20 @@ import pytest
 import torch
 from rasterizer_scenes import draw_scene
 
+from completesplat.benchmarks.rasterizers import (
+    BAND,
+    PIXELS_PER_VIEW,
+    STOP_BAND,
+    TOLERANCE,
+    Backend,
+    is_decided,
+    rows,
+)
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
-from completesplat.reports.rasterizers.agreement import (
-    BAND,
-    PIXELS_PER_VIEW,
-    STOP_BAND,
-    TOLERANCE,
-    is_decided,
-    rows,
-)
-from completesplat.reports.rasterizers.backends import Backend
 
 CONSTANTS = RenderingConstants()
 FOCAL, DEPTH, SCALE = 50.0, 2.0, 0.1

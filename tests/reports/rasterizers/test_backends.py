@@ -3,11 +3,11 @@
 import pytest
 from support import compose_config
 
+from completesplat.benchmarks import rasterizers
+from completesplat.benchmarks.rasterizers import CLASSES, Backend, working_backends
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.rasterizers import backends
-from completesplat.reports.rasterizers.backends import CLASSES, Backend, working_backends
 
 TILED = "completesplat.rasterizers.tiled.TiledRasterizer"
 
@@ -69,7 +69,7 @@ def test_the_order_is_kept_and_the_constants_arrive(names: list[str]) -> None:
 
 
 def test_only_the_reference_is_spared_large_workloads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "MOST_REFERENCE_PAIRS", 1000)
+    monkeypatch.setattr(rasterizers, "MOST_REFERENCE_PAIRS", 1000)
     reference, tiled = (Backend(name, ReferenceRasterizer()) for name in ("reference", "tiled"))
     assert reference.takes(10, 100)
     assert not reference.takes(10, 101)

@@ -9,10 +9,10 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from completesplat.benchmarks import rasterizers
+from completesplat.benchmarks.rasterizers import Backend
 from completesplat.rasterizers import Rendering
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.rasterizers import growth
-from completesplat.reports.rasterizers.backends import Backend
 
 BLUE, ORANGE = (31, 119, 180), (255, 127, 14)  # matplotlib's first two colours
 
@@ -21,7 +21,7 @@ BLUE, ORANGE = (31, 119, 180), (255, 127, 14)  # matplotlib's first two colours
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     values = {"SOURCE_SIZES": (3, 4, 6), "IMAGE_SIZE": 8, "SOURCE_SIZE": 5, "VIEWS": (1, 2, 3), "IMAGE_SIZES": (4, 7)}
     for name, value in values.items():
-        monkeypatch.setattr(growth, name, value)
+        monkeypatch.setattr(rasterizers, name, value)
 
 
 def named(*names: str) -> list[Backend]:
@@ -40,7 +40,7 @@ def test_every_axis_is_measured_with_the_others_held() -> None:
         return ReferenceRasterizer()(gaussians, cameras)
 
     said: list[str] = []
-    rows = growth.rows([Backend("tiled", draw)], said.append, most_gaussians=1000)
+    rows = rasterizers.rows([Backend("tiled", draw)], said.append, most_gaussians=1000)
     found = [(row["axis"], row["gaussians"], row["views"], row["size"]) for row in rows]
     assert found == [
         *(("gaussians", 2 * size**2, 1, 8) for size in (3, 4, 6)),
@@ -49,11 +49,13 @@ def test_every_axis_is_measured_with_the_others_held() -> None:
     ]
     assert list(dict.fromkeys(seen)) == [workload for _, *rest in found if (workload := tuple(rest))]
     assert all(0 < row["forward_ms"] <= row["forward_backward_ms"] for row in rows)
-    assert said == [f"growth with {axis}: {dict(zip(growth.AXES, rest, strict=True))[axis]}" for axis, *rest in found]
+    assert said == [
+        f"growth with {axis}: {dict(zip(rasterizers.AXES, rest, strict=True))[axis]}" for axis, *rest in found
+    ]
 
 
 def test_no_more_gaussians_than_asked_for() -> None:
-    rows = growth.rows(named("tiled"), lambda _: None, most_gaussians=32)
+    rows = rasterizers.rows(named("tiled"), lambda _: None, most_gaussians=32)
     assert points(rows, "tiled", "gaussians") == [18, 32]
     assert points(rows, "tiled", "views") == [1, 2, 3]
 
@@ -61,11 +63,11 @@ def test_no_more_gaussians_than_asked_for() -> None:
 def test_one_that_took_too_long_is_spared_the_rest_of_that_axis_only(monkeypatch: pytest.MonkeyPatch) -> None:
     def side_by_side(backends: Sequence[Backend], gaussians, cameras, repeats: int) -> dict[str, dict[str, float]]:
         weary = gaussians.count == 32 or cameras.intrinsics.shape[1] == 2
-        times = {"slow": growth.PATIENCE_MS + weary, "quick": growth.PATIENCE_MS}
+        times = {"slow": rasterizers.PATIENCE_MS + weary, "quick": rasterizers.PATIENCE_MS}
         return {backend.name: {"forward_backward_ms": times[backend.name]} for backend in backends}
 
-    monkeypatch.setattr(growth, "side_by_side", side_by_side)
-    rows = growth.rows(named("slow", "quick"), lambda _: None, most_gaussians=1000)
+    monkeypatch.setattr(rasterizers, "side_by_side", side_by_side)
+    rows = rasterizers.rows(named("slow", "quick"), lambda _: None, most_gaussians=1000)
     assert points(rows, "slow", "gaussians") == [18, 32]  # that one still counts
     assert points(rows, "slow", "views") == [1, 2]
     assert points(rows, "slow", "size") == [4, 7]
@@ -84,7 +86,7 @@ def along(axis: str, backend: str, milliseconds: float, *values: int) -> list[di
 def drawn(rows: list[dict[str, Any]], path: Path) -> np.ndarray:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        growth.plot(rows, path)
+        rasterizers.plot(rows, path)
     return imageio.imread(path)[..., :3]
 
 
@@ -94,7 +96,7 @@ def marks(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
 
 
 def test_the_plot_of_one_backend_shows_a_curve_in_each_panel(tmp_path: Path) -> None:
-    image = drawn([row for axis in growth.AXES for row in along(axis, "tiled", 1.0, 1, 4)], tmp_path / "plot.png")
+    image = drawn([row for axis in rasterizers.AXES for row in along(axis, "tiled", 1.0, 1, 4)], tmp_path / "plot.png")
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
     for panel in np.array_split(image, 3, axis=1):
         assert np.ptp(marks(panel, BLUE)) > 0.3  # it rises

@@ -7,10 +7,10 @@ import pytest
 import torch
 from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
 
+from completesplat.benchmarks import gsplat_torch
+from completesplat.benchmarks.gsplat_torch import GsplatTorchRasterizer, intersect_tiles, weights_along_rays
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import RenderingConstants
-from completesplat.reports.rasterizers import gsplat_torch
-from completesplat.reports.rasterizers.gsplat_torch import GsplatTorchRasterizer, intersect_tiles, weights_along_rays
 
 
 @pytest.mark.parametrize(("seed", "size"), [(0, (13, 17)), (1, (40, 36)), (2, (9, 23))])

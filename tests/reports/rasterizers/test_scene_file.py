@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.errors import DataError
-from completesplat.reports.rasterizers.scene_file import (
+from completesplat.benchmarks.workloads import (
     DEFAULTS,
     NEEDED,
     read_scene,
 )
+from completesplat.errors import DataError
 
 COUNT, VIEWS, WIDTH, HEIGHT = 7, 2, 40, 30
 Arrays = dict[str, Any]  # of numpy

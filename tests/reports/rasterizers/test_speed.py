@@ -4,13 +4,12 @@ from types import SimpleNamespace
 
 import pytest
 
+from completesplat.benchmarks import rasterizers, workloads
+from completesplat.benchmarks.rasterizers import LONGEST_SECONDS, Backend, rows, side_by_side
+from completesplat.benchmarks.workloads import splatter_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering
-from completesplat.reports.rasterizers import backends, speed, timing
-from completesplat.reports.rasterizers.backends import Backend
-from completesplat.reports.rasterizers.speed import LONGEST_SECONDS, rows, side_by_side
-from completesplat.reports.rasterizers.workloads import splatter_scene
 
 KEYS = {"backend", "size", "gaussians", "views", "opacity", "forward_ms", "forward_backward_ms", "peak_mb"}
 
@@ -21,7 +20,7 @@ class Clock:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
         self.turns: list[str] = []
-        for module in (speed, timing):
+        for module in (rasterizers, workloads):
             monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
 
     def backend(self, name: str, *seconds: float) -> Backend:
@@ -75,14 +74,14 @@ def test_one_that_took_too_long_at_first_is_not_run_again(clock: Clock) -> None:
 
 
 def test_one_that_has_taken_too_long_by_now_is_not_run_again(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(speed, "LONGEST_SECONDS", 4.0)
+    monkeypatch.setattr(rasterizers, "LONGEST_SECONDS", 4.0)
     figures = side_by_side([clock.backend("a", 1.5)], *splatter_scene(4, 1, "trained"), repeats=9)
     assert len(clock.turns) == 3
     assert figures["a"]["forward_ms"] == 1500
 
 
 def test_the_reference_is_spared_large_workloads(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backends, "MOST_REFERENCE_PAIRS", 2 * 8**2 * 8**2)  # size 8 in one view, just
+    monkeypatch.setattr(rasterizers, "MOST_REFERENCE_PAIRS", 2 * 8**2 * 8**2)  # size 8 in one view, just
     chosen = [clock.backend("reference", 0.1), clock.backend("tiled", 0.1)]
     found = rows(chosen, [8, 9], [1, 2], 1, lambda _: None)
     of_reference = {(row["size"], row["views"]) for row in found if row["backend"] == "reference"}

@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from completesplat.reports.rasterizers.tables import AGREEMENT, GROWTH, SPEED, against_tiled, show
-from completesplat.reports.tables import table
+from completesplat.benchmarks.rasterizers import AGREEMENT, GROWTH, SPEED, against_tiled, show
+from completesplat.results.tables import table
 
 MACHINE = {"processor": "Some CPU", "threads": 2, "torch": "2.10", "date": "2026-01-31"}
 REASON = 'it needs gsplat: pip install "completesplat[cuda]"'

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 import torch
 
+from completesplat.benchmarks import workloads
+from completesplat.benchmarks.workloads import milliseconds, peak_megabytes, splatter_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering
-from completesplat.rasterizers.kernels import buffers
+from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.rasterizers import timing
-from completesplat.reports.rasterizers.timing import milliseconds, peak_megabytes
-from completesplat.reports.rasterizers.workloads import splatter_scene
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system has no /proc")
 FLOATS = 60 * 2**20 // 4  # 60 MB
@@ -44,7 +43,7 @@ def test_gradients_of_all_images_are_taken_for_all_parameters() -> None:
 
 def test_the_first_figure_is_the_forward_pass_and_the_second_both(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(workloads, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
     class Image(torch.autograd.Function):
         @staticmethod
@@ -84,7 +83,7 @@ def test_memory_that_is_given_back_before_the_end_counts() -> None:
 
 @needs_proc
 def test_memory_that_is_held_at_the_end_counts_however_short_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timing, "SAMPLING_SECONDS", 1e3)
+    monkeypatch.setattr(workloads, "SAMPLING_SECONDS", 1e3)
     kept = []
     assert 50 < peak(lambda: kept.append(np.ones(FLOATS, np.float32))) < 70
 
@@ -99,13 +98,13 @@ def test_no_work_needs_next_to_no_memory() -> None:
 @needs_proc
 def test_memory_that_the_kernels_would_use_again_counts_each_time() -> None:
     def work() -> None:
-        buffers.Buffers().empty((FLOATS,)).fill(1)
+        drawing.Buffers().empty((FLOATS,)).fill(1)
 
     assert all(peak(work) > 50 for _ in range(2))
 
 
 def test_without_proc_the_work_is_done_and_memory_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(timing, "Path", lambda _: tmp_path / "statm")
+    monkeypatch.setattr(workloads, "Path", lambda _: tmp_path / "statm")
     done = []
     assert peak_megabytes(lambda: done.append(1), "cpu") is None
     assert done == [1]

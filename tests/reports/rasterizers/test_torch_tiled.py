@@ -6,12 +6,12 @@ import pytest
 import torch
 from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
 
+from completesplat.benchmarks import torch_tiled
+from completesplat.benchmarks.torch_tiled import TorchTiledRasterizer
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.rasterizers import torch_tiled
-from completesplat.reports.rasterizers.torch_tiled import TorchTiledRasterizer
 
 SIZES = [(13, 17), (16, 16), (9, 23), (31, 6), (1, 40)]
 CENTER = (0.05, -0.03, 0.02)

@@ -12,15 +12,15 @@ from rasterizer_scenes import cotangents_for, render_with_gradients, scenes
 from support import compose_config
 from torch import Tensor
 
+from completesplat.benchmarks import training_step
+from completesplat.benchmarks.rasterizers import Backend
+from completesplat.benchmarks.training_step import StopWatch, share, synthetic_batch
+from completesplat.benchmarks.workloads import DISTANCE, splatter_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, project
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer
-from completesplat.reports.rasterizers import training_step
-from completesplat.reports.rasterizers.backends import Backend
-from completesplat.reports.rasterizers.training_step import StopWatch, share, synthetic_batch
-from completesplat.reports.rasterizers.workloads import DISTANCE, splatter_scene
 
 NETWORK, RASTERIZER = (100.0, 200.0), (2.0, 3.0)  # seconds that it takes forward and backward
 

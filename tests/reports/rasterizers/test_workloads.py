@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from completesplat.benchmarks.workloads import DISTANCE, FOV_DEGREES, OPACITIES, orbit, splatter_scene
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.rasterizers.workloads import DISTANCE, FOV_DEGREES, OPACITIES, orbit, splatter_scene
 
 
 @pytest.mark.parametrize("opacity", OPACITIES)

@@ -7,13 +7,13 @@ import pytest
 import torch
 from support import some_gaussians
 
-from completesplat.export.depth_colors import NOTHING, ramp
+from completesplat.export.pictures import NOTHING, ramp
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.reports.sampling.depth import color_deviation, deviation, deviations, rows, strips
-from completesplat.reports.sampling.drawing import Artist
 from completesplat.scene import SceneBatch, Views
+from completesplat.studies.depth import color_deviation, deviation, deviations, rows, strips
+from completesplat.studies.samples import Artist
 from completesplat.tensors import stack
 
 SIZE, AWAY = 16, 3.0

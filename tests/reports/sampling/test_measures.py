@@ -7,7 +7,7 @@ import torch
 
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
-from completesplat.reports.sampling.measures import near, object_psnr
+from completesplat.studies.samples import near, object_psnr
 
 
 def test_object_pixels_alone_count():

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from completesplat.reports.sampling.controls_plot import plot_controls
-from completesplat.reports.sampling.masked import box_visibility
-from completesplat.reports.sampling.samplers_plot import plot_samplers
-from completesplat.reports.sampling.strips import Strip, draw_strips
+from completesplat.studies.controls import plot_controls
+from completesplat.studies.masked import box_visibility
+from completesplat.studies.samplers import plot_samplers
+from completesplat.studies.samples import Strip, draw_strips
 
 CRIMSON = (220, 20, 60)
 

@@ -3,8 +3,8 @@
 import torch
 from support import tiny_generator
 
-from completesplat.reports.sampling.controls import PAPER, grid
-from completesplat.reports.sampling.samplers import Watch, fewest
+from completesplat.studies.controls import PAPER, grid
+from completesplat.studies.samplers import Watch, fewest
 
 
 def row(calls: int, psnr: float, agreement: float = 30.0) -> dict:
@@ -34,7 +34,7 @@ def test_calls_are_those_of_the_denoiser():
 
 
 def camera(model):
-    from completesplat.data.photograph import Photograph
+    from completesplat.data.pictures.photograph import Photograph
 
     return model.camera(Photograph(torch.zeros(3, 32, 32), 50.0, "given"))[None]
 

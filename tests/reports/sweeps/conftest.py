@@ -90,7 +90,7 @@ def written() -> Callable[[Sweep], str]:
     """Writes a sweep's summary and gives the Markdown."""
 
     def write(sweep: Sweep) -> str:
-        from completesplat.reports.sweeps.writing import write_summary
+        from completesplat.results.sweeps import write_summary
 
         write_summary(sweep.folder)
         return (sweep.folder / "summary.md").read_text()

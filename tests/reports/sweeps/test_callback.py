@@ -20,7 +20,7 @@ hydra:
   sweep: {dir: swept, subdir: "seed=${seed}"}
   run: {dir: swept}
   output_subdir: null
-  callbacks: {summary: {_target_: completesplat.reports.sweeps.callback.SweepSummary}}
+  callbacks: {summary: {_target_: completesplat.results.sweeps.SweepSummary}}
 """
 
 
@@ -92,7 +92,7 @@ def test_a_summary_that_cannot_be_written_is_logged_and_stops_nothing(launched, 
 
 def test_the_hook_is_loaded_without_the_heavy_libraries() -> None:
     code = (
-        "import sys, completesplat.reports.sweeps.callback; "
+        "import sys, completesplat.results.sweeps; "
         "print(*sorted({'torch', 'pandas', 'numpy', 'rich', 'matplotlib'} & {n.split('.')[0] for n in sys.modules}))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)

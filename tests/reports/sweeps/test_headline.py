@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from completesplat.reports.sweeps.headline import ALWAYS, BEST, SECOND, UNMARKED, columns, figure, marks, metric
+from completesplat.results.tables import ALWAYS, BEST, SECOND, UNMARKED, columns, figure, marks, metric
 
 PSNR = "full_novel_psnr"
 

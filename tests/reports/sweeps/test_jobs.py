@@ -1,7 +1,7 @@
 """What is read of a job's results."""
 
-from completesplat.reports.sweeps.jobs import collect
-from completesplat.reports.sweeps.summary import summarize
+from completesplat.results.runs import collect
+from completesplat.results.sweeps import summarize
 
 PREDICTOR = {"scenes": 4, "views": 8, "seconds": {"inference": 2.0}, "full": {"novel": {"psnr": 20.0}}}
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from completesplat.reports.sweeps.summary import summarize
+from completesplat.results.sweeps import summarize
 
 
 def named(sweep) -> list[str]:

@@ -2,8 +2,8 @@
 
 import time
 
-from completesplat.reports.machine import machine
-from completesplat.reports.sweeps.summary import summarize
+from completesplat.results.machine import machine
+from completesplat.results.sweeps import summarize
 
 
 def test_jobs_that_have_not_finished_are_named(ablations) -> None:

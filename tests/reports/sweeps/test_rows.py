@@ -7,8 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from completesplat.reports.sweeps.summary import summarize
-from completesplat.reports.sweeps.writing import write_summary
+from completesplat.results.sweeps import summarize, write_summary
 
 
 def read_back(folder) -> pd.DataFrame:

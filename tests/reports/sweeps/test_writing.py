@@ -8,11 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from completesplat.reports.sweeps.headline import SSIM_NOTE
-from completesplat.reports.sweeps.latex import escape
-from completesplat.reports.sweeps.rows import IDENTITY
-from completesplat.reports.sweeps.summary import summarize
-from completesplat.reports.sweeps.writing import show_summary, write_summary
+from completesplat.results.rows import IDENTITY
+from completesplat.results.sweeps import escape, show_summary, summarize, write_summary
+from completesplat.results.tables import SSIM_NOTE
 
 FILES = ["summary.csv", "summary.md", "summary.png", "summary.tex"]
 

@@ -1,0 +1,1 @@
+"""What takes how long, side by side in one process. Nothing else imports this package."""

@@ -1,0 +1,299 @@
+"""What stage 2 costs, in training and in drawing: one way against another, on the same work."""
+
+import signal
+import statistics
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch.optim import Optimizer
+
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.diffusion.sampling import Sampler
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.generation import CompleteSplat
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.results.tables import Column, table
+from completesplat.training.encoding import encode_training_set
+from completesplat.training.scene_module import SceneModule
+
+WARM_UP = 2
+
+Work = Callable[[], object]
+
+
+class NotMeasured(CompleteSplatError):
+    """Why there are no figures of a comparison on this machine."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two ways, each with a few words for tables; the first is the one that should be faster."""
+
+    name: str
+    a: tuple[str, Work]
+    b: tuple[str, Work]
+
+
+def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict[str, Any]:
+    """A row: medians in ms of both, which take turns, and how many times faster `a` is than `b`.
+
+    The first two of each are not counted.
+    """
+    ways = {"a": comparison.a, "b": comparison.b}
+    times: dict[str, list[float]] = {key: [] for key in ways}
+    for _ in range(WARM_UP + repeats):
+        for key, (_, work) in ways.items():
+            times[key].append(milliseconds(work, device))
+    medians = {f"{key}_ms": statistics.median(taken[WARM_UP:]) for key, taken in times.items()}
+    texts = {key: text for key, (text, _) in ways.items()}
+    return {"name": comparison.name, **texts, **medians, "ratio": medians["b_ms"] / medians["a_ms"]}
+
+
+def milliseconds(work: Work, device: torch.device) -> float:
+    """Of one call, until the device has finished it."""
+    wait = torch.cuda.synchronize if device.type == "cuda" else _nothing
+    wait()
+    start = time.perf_counter()
+    work()
+    wait()
+    return (time.perf_counter() - start) * 1e3
+
+
+def _nothing() -> None: ...
+
+
+MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
+
+
+class Training:
+    """Optimizer steps of either stage as in a run, without what a run logs.
+
+    Args:
+        module: on its device.
+        precision: Lightning's; "bf16-mixed" computes the networks in bfloat16.
+    """
+
+    def __init__(self, module: SceneModule, precision: str) -> None:
+        self.module: Any = module.train()
+        self.precision = precision
+        for logs in ("log_loss", "log_dict"):  # there is no trainer that would
+            setattr(module, logs, lambda *_, **__: None)
+        self.optimizer: Optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
+
+    def step(self, batch: Any) -> None:
+        """One optimizer step on a batch of scenes, encoded or not."""
+        module = self.module
+        with autocast(module.device, self.precision):
+            loss = module.training_step(batch.to(module.device), 0)
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), MAXIMAL_NORM)
+        self.optimizer.step()
+
+
+def autocast(device: torch.device, precision: str) -> torch.autocast:
+    """The context in which Lightning computes with this precision."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
+
+
+def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule], folder: Path) -> Comparison:
+    """Steps on batches that are loaded within the time.
+
+    Args:
+        data: settings (`encoded`) -> the data module, whose scenes are there.
+        folder: where the training set is encoded.
+    """
+    parts = training.module.completesplat
+    pictures = data()
+    store = encode_training_set(
+        parts.autoreconstructor,
+        pictures,
+        folder,
+        conditioning=parts.conditioning if parts.conditioning.frozen else None,
+        device=training.module.device,
+        progress=False,
+    )
+    parts.latent_scale.fill_(store.scale)
+    parts.train()
+    fill_cache(pictures)
+    cached, fly = batches(data(encoded=str(folder))), batches(pictures)
+    return Comparison(
+        "cached_vs_on_the_fly",
+        ("step from the latent cache", lambda: training.step(next(cached))),
+        ("encoding on the fly", lambda: training.step(next(fly))),
+    )
+
+
+def fill_cache(data: SceneDataModule) -> None:
+    """Read all training pictures, as a run has after its first epochs: what `data.cache` keeps is there then."""
+    store = data.store("train")
+    for name in store.names:
+        sequence = store.source.read(name)
+        for view in range(len(sequence.frames)):
+            store.image(sequence, view)
+
+
+def batches(data: SceneDataModule) -> Iterator[Any]:
+    """The training batches of one epoch after the other."""
+    loader = data.train_dataloader()
+    epoch = 0
+    while True:
+        loader.sampler.set_epoch(epoch)  # type: ignore[union-attr]
+        yield from loader
+        epoch += 1
+
+
+GUIDANCE_WEIGHT = 0.5  # of the paper's settings for diverse samples
+MANY_STEPS = 50  # the paper's
+
+
+def comparisons(model: CompleteSplat, few: Mapping[str, Any], samples: int, steps: int, batch: int) -> list[Comparison]:
+    """Of a generator on its device.
+
+    Args:
+        few: configuration of a sampler with few steps.
+        samples: of one picture, in a batch or one by one.
+        steps: of those samples.
+        batch: pictures, of which a sample each is drawn without and with guidance, and in few and in many steps.
+    """
+    model.eval()
+    usual, quick = model.sampler, _built(model, few)
+    several = partial(_draw, model, usual, 1, steps=steps, samples=samples)
+    draw = partial(_draw, model, usual, batch)
+    return [
+        Comparison(
+            f"batch_vs_one_by_one_k{samples}",
+            (f"{samples} samples at a time", several),
+            ("one by one", partial(several, batch=1)),
+        ),
+        Comparison(
+            "unguided_vs_guided",
+            ("w = 0", draw),
+            (f"w = {GUIDANCE_WEIGHT}", partial(draw, guidance_weight=GUIDANCE_WEIGHT)),
+        ),
+        Comparison(
+            f"few_steps_vs_{MANY_STEPS}",
+            (_named(quick, quick.steps), partial(_draw, model, quick, batch)),
+            (_named(usual, MANY_STEPS), partial(draw, steps=MANY_STEPS)),
+        ),
+    ]
+
+
+def _built(model: CompleteSplat, sampler: Mapping[str, Any]) -> Sampler:
+    """The sampler of a configuration, for what the model's denoiser was trained with."""
+    own, config = model.sampler, model.architecture["sampler"]
+    model.replace_sampler(sampler)
+    built = model.sampler
+    model.sampler, model.architecture["sampler"] = own, config
+    return built
+
+
+def _draw(model: CompleteSplat, sampler: Sampler, pictures: int, **settings: Any) -> Gaussians:
+    """Scenes of pictures of noise: what they show does not change the work."""
+    size, device = model.image_size, model.latent_scale.device
+    images = torch.rand(pictures, 3, size, size, generator=torch.Generator().manual_seed(0)).to(device)
+    camera = Cameras(torch.eye(4, device=device), pinhole(model.fov_degrees.item(), size).to(device), (size, size))
+    cameras = camera.map(lambda tensor: tensor.expand(pictures, *tensor.shape))
+    model.sampler = sampler
+    return model.generate(images, cameras, model.depth_range.expand(pictures, 2), **settings)
+
+
+def _named(sampler: Sampler, steps: int) -> str:
+    name = type(sampler.scheduler).__name__.removesuffix("Scheduler").removesuffix("Multistep")
+    return f"{name}, {steps} step{'' if steps == 1 else 's'}"
+
+
+def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: float) -> Comparison:
+    """Forward and backward pass of the denoiser on noise, as in a training step; compiles it now.
+
+    Args:
+        limit: seconds that compiling may take; 0: nothing is compiled.
+
+    Raises:
+        NotMeasured: it takes longer or fails, for want of a C++ compiler, say.
+    """
+    if not limit:
+        raise NotMeasured("compile_limit=0")
+    denoiser, device = model.denoiser, model.latent_scale.device
+    with torch.no_grad():
+        conditioning = model.conditioning(torch.rand(batch, 3, model.image_size, model.image_size, device=device))
+    latent = torch.randn(batch, denoiser.latent_channels, *conditioning.shape[-2:], device=device)
+    timestep = torch.arange(batch, device=device)
+
+    def work(network: Callable[..., Any]) -> None:
+        with autocast(device, precision):
+            loss = network(latent, timestep, conditioning).square().mean()
+        loss.backward()
+        denoiser.zero_grad()
+
+    denoiser.train()
+    try:
+        with at_most(limit), warnings.catch_warnings(action="ignore"):  # of code that torch will not see into
+            compiled = torch.compile(denoiser)
+            work(compiled)
+    except Exception as error:
+        first = (str(error).strip().splitlines() or [""])[0]
+        raise NotMeasured(f"torch.compile failed: {type(error).__name__}: {first}") from error
+    except _TimeIsUp:
+        raise NotMeasured(f"torch.compile took longer than compile_limit={limit:g} s") from None
+    return Comparison(
+        "compiled_vs_eager",
+        ("denoiser compiled, both passes", lambda: work(compiled)),
+        ("as it is", lambda: work(denoiser)),
+    )
+
+
+class _TimeIsUp(BaseException):
+    """No Exception, because what is interrupted may handle those."""
+
+
+@contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Interrupt what takes longer, where the system and the thread allow it."""
+    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(*_: object) -> None:
+        raise _TimeIsUp
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+COMPARED: list[Column] = [
+    ("a", "a", ""),
+    ("b", "b", ""),
+    ("a\nms", "a_ms", ",.1f"),
+    ("b\nms", "b_ms", ",.1f"),
+    ("times\nfaster", "ratio", ",.2f"),
+]
+
+
+def show(results: dict[str, Any]) -> None:
+    """Print all that there is in the results."""
+    machine, work = results["machine"], results["workload"]
+    console = Console(width=None if Console().is_terminal else 120, markup=False)
+    where = machine["gpu"] if work["device"] == "cuda" else f"{machine['processor']}, {machine['threads']} threads"
+    console.print(f"{where}, torch {machine['torch']}, {machine['date']}")
+    title = (
+        f"{work['image_size']} x {work['image_size']} pixels, batch {work['batch']}, training in {work['precision']}"
+    )
+    console.print(table(title, COMPARED, results["rows"]))
+    for name, reason in results["not_measured"].items():
+        console.print(f"{name}: not measured, because {reason}")

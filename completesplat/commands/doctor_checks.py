@@ -1,0 +1,109 @@
+"""What `completesplat doctor` needs the package's own parts for: do rasterizers draw, are weights whole."""
+
+import math
+from pathlib import Path
+from urllib.parse import urlparse
+
+import torch
+
+from completesplat.commands.doctor import Finding, size
+from completesplat.errors import WeightsError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.losses.lpips import URL as VGG_URL
+from completesplat.metrics.image_sets import URL as INCEPTION_URL
+from completesplat.rasterizers.protocol import Rasterizer, RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.rasterizers.selection import FASTER, TOLERANCE, failure
+from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, weights_folder
+
+RENDERING_PART = "rasterizers"
+GOOD = "a test rendering is as it should be"
+
+
+def check_rasterizers() -> list[Finding]:
+    """The backends, fastest first. The last one, which needs torch alone, must work; the others need not."""
+    found = []
+    for name, make in FASTER.items():
+        reason = failure(name, None) or wrong(make(None))
+        found.append(Finding(RENDERING_PART, name, "no" if reason else "yes", reason or GOOD))
+    reason = wrong(ReferenceRasterizer())
+    faster = any(finding.state == "yes" for finding in found)
+    said = reason or (GOOD if faster else f"{GOOD}; with nothing else, predictions are very slow")
+    return [*found, Finding(RENDERING_PART, "reference", "broken" if reason else "yes", said)]
+
+
+@torch.no_grad()
+def wrong(rasterizer: Rasterizer) -> str | None:
+    """What is wrong with the picture of two round Gaussians, one behind the other on the optical axis; None if nothing.
+
+    With focal length f, a Gaussian of size s at depth z is a disc of variance (f s / z)^2 and the blur's, in px^2: its
+    alpha is its opacity in the middle, and exp(-1 / (2 variance)) of that one pixel aside. The front one covers the
+    other (gsplat's conventions, see `completesplat.rasterizers`).
+    """
+    focal, depths, sizes, opacities = 40.0, (2.0, 4.0), (0.1, 0.4), (0.8, 0.5)
+    colors = torch.tensor([[0.9, 0.5, 0.1], [0.2, 0.4, 1.0]])
+    means = torch.tensor([[0.0, 0.0, depth] for depth in depths])
+    scales, upright = torch.tensor(sizes)[:, None].expand(2, 3), torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4)
+    intrinsics = torch.tensor([[focal, 0, 2.5], [0, focal, 2.5], [0, 0, 1]])
+    cameras = Cameras(torch.eye(4)[None, None], intrinsics[None, None], (5, 5))
+    drawn = rasterizer(Gaussians(means, upright, scales, torch.tensor(opacities), colors)[None], cameras).color[0, 0]
+    variances = [(focal * s / z) ** 2 + RenderingConstants().blur for s, z in zip(sizes, depths, strict=True)]
+    for aside in (0, 1):
+        front, back = (o * math.exp(-(aside**2) / (2 * v)) for o, v in zip(opacities, variances, strict=True))
+        true = front * colors[0] + (1 - front) * back * colors[1]
+        difference = (drawn[:, 2, 2 + aside] - true).abs().max().item()
+        if not difference <= TOLERANCE:  # not-a-number is wrong too
+            return f"its test rendering is wrong by {difference:.2g}"
+    return None
+
+
+WEIGHTS_PART = "weights"
+WEIGHTS_FILES = (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)
+PUBLISHED = [("LPIPS: VGG16", VGG_URL), ("FID, KID: Inception", INCEPTION_URL)]
+VAE = "stabilityai/sd-vae-ft-mse"
+
+
+def check_weights(box: Path = BOX) -> list[Finding]:
+    """Published weights that are not here are no error: they are fetched when they are needed.
+
+    Args:
+        box: holds the package's own, one folder for each model.
+    """
+    found = [
+        _own(folder) for folder in sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
+    ]
+    if not found:
+        said = "none come with this version: give predict weights=FOLDER, the `weights` that a run of stage 2 leaves"
+        found = [Finding(WEIGHTS_PART, "in the package", "no", said)]
+    return [*found, *(_published(name, url) for name, url in PUBLISHED), _vae()]
+
+
+def _own(folder: Path) -> Finding:
+    try:
+        weights_folder(folder)
+    except (OSError, WeightsError) as error:
+        return Finding(WEIGHTS_PART, folder.name, "broken", f"{error}; install completesplat again")
+    count = (folder / WEIGHTS_FILE).stat().st_size
+    checked = "as it was written" if (folder / SUMS_FILE).is_file() else f"not checked, for there is no {SUMS_FILE}"
+    return Finding(
+        WEIGHTS_PART, folder.name, "yes", f"with the package, {size(count)}, {checked}: predict weights={folder.name}"
+    )
+
+
+def _published(name: str, url: str) -> Finding:
+    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
+    if path.is_file():
+        return Finding(WEIGHTS_PART, name, "yes", f"{path}, {size(path.stat().st_size)}")
+    return Finding(WEIGHTS_PART, name, "no", f"not here; will be downloaded from {url} when it is asked for")
+
+
+def _vae() -> Finding:
+    from huggingface_hub import try_to_load_from_cache
+
+    name = "Stable Diffusion's VAE"
+    path = try_to_load_from_cache(VAE, "diffusion_pytorch_model.safetensors")
+    if isinstance(path, str):
+        return Finding(WEIGHTS_PART, name, "yes", path)
+    said = f"not here; will be downloaded from huggingface.co when autoreconstructor.pretrained={VAE} is given"
+    return Finding(WEIGHTS_PART, name, "no", said)

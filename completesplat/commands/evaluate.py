@@ -1,0 +1,106 @@
+"""`completesplat test`: images of a trained model against true ones; `fit` scores in the same way."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from completesplat.errors import CompleteSplatError
+
+
+def scored_data(run_config: Any, evaluation: Any) -> Any:
+    """The data of a run's settings, which are changed as the protocol says.
+
+    Where it scores at a larger size than the model's, the model sees what the data give at its own size.
+
+    Raises:
+        CompleteSplatError: the protocol is of no pictures or of other data, changes a setting that these data have not
+            got, or scores at a smaller size, or at another one than that of prepared pictures.
+        DataError: the protocol's files cannot be used.
+    """
+    from hydra.utils import instantiate
+
+    from completesplat.data.packed.manifest import is_prepared
+
+    if "scoring" not in evaluation:
+        raise CompleteSplatError(f"evaluation={evaluation.name}: fit scores pictures only; set test=false")
+    for key, value in evaluation.data.items():
+        if key not in run_config.data:
+            raise CompleteSplatError(f"evaluation={evaluation.name}: the data of this run have no setting {key}")
+        run_config.data[key] = value
+    data = instantiate(run_config.data, _convert_="all")
+    found = data.describe()["data_set"]
+    if evaluation.data_set is not None and found.partition("/")[0] != evaluation.data_set:
+        raise CompleteSplatError(
+            f"evaluation={evaluation.name} is of {evaluation.data_set}, this run's data are {found}: "
+            "use evaluation=images"
+        )
+    resolution, size = evaluation.resolution, data.image_size
+    if resolution is None or resolution == size:
+        return data
+    if resolution < size:
+        raise CompleteSplatError(f"evaluation.resolution={resolution}: below the model's {size}")
+    if is_prepared(data.root):
+        said = f"evaluation.resolution={resolution}: prepared pictures have one size"
+        raise CompleteSplatError(f"{said}; give the data as they were published (data.root)")
+    larger = instantiate(run_config.data, image_size=resolution, _convert_="all")
+    larger.at_model_size = data
+    return larger
+
+
+def set_scoring(module: Any, evaluation: Any) -> None:
+    """Give a model the protocol's metrics.
+
+    Raises:
+        CompleteSplatError: several samples are asked of a model that has one answer.
+    """
+    from hydra.utils import instantiate
+
+    module.evaluation = instantiate(evaluation.scoring, _convert_="all")
+    if module.evaluation.samples > 1 and not module.draws_samples:
+        raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
+
+
+def scoring_trainer(config: Any, **settings: Any) -> Any:
+    """A trainer that tests in the protocol's precision, whatever the networks were trained in.
+
+    Args:
+        settings: of the trainer, besides those of the configuration.
+    """
+    from hydra.utils import instantiate
+
+    return instantiate(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
+
+
+def run(config: Any, out: Path) -> None:
+    """Write `metrics.json` and print the table."""
+    from hydra.utils import instantiate
+    from lightning import seed_everything
+
+    from completesplat.commands import quieten
+    from completesplat.commands.protocol import protocol
+    from completesplat.commands.trained import configuration, facts, open_module
+    from completesplat.results.tables import evaluation_table, show
+    from completesplat.results.wandb import begin, log_test
+    from completesplat.training.loggers import finished
+
+    run_config = configuration(config)
+    quieten()
+    seed_everything(config.seed, verbose=False)
+    data = scored_data(run_config, config.evaluation)
+    module = open_module(config, run_config)
+    set_scoring(module, config.evaluation)
+    loggers = list(instantiate(config.get("logger", {}), _convert_="all").values())
+    trainer = scoring_trainer(config, logger=loggers)
+    with finished(loggers):
+        shown = begin(module, trainer, config, out)
+        trainer.test(module, datamodule=data, verbose=False)
+        results = module.test_results()
+        if not trainer.is_global_zero:
+            return
+        described = protocol(config.evaluation, module, data, results) | facts(config)
+        text = json.dumps({"protocol": described} | results, indent=2, allow_nan=False)
+        (out / "metrics.json").write_text(text + "\n")
+        log_test(results, shown, trainer, out)
+    show(evaluation_table(results))
+    for name, reason in described["missing"].items():
+        print(f"{name}: {reason}")

@@ -1,0 +1,224 @@
+"""Reading a whole data set once: what of it can be used, and what cannot and why."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+from completesplat.data.sequences import SequenceSource
+from completesplat.data.validation import TooFewFrames, at
+from completesplat.errors import DataError
+
+FEWEST_FRAMES = 2
+LARGEST_BATCH = 16
+EXAMPLES, LONGEST_EXAMPLE = 3, 400
+
+Sources = Mapping[str, SequenceSource]
+# Names, each with the splits that have it.
+_Batch = list[tuple[str, list[str]]]
+
+
+class LeftOut(DataError):
+    """A sequence in which nothing is broken, but which the settings leave out."""
+
+    kind = "left out"
+
+
+@runtime_checkable
+class Verifiable(Protocol):
+    """A source that has checksums of its files."""
+
+    def verify(self) -> list[DataError]:
+        """The files that are no longer what their checksums were taken of."""
+        ...
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What reading everything showed.
+
+    Attributes:
+        sequences: usable ones, those with at least two usable frames.
+        frames: usable ones of these sequences.
+        refused: each thing once, in the order of the data set.
+        splits: the same two numbers for each split alone.
+    """
+
+    sequences: int
+    frames: int
+    refused: list[DataError]
+    splits: dict[str, dict[str, int]]
+
+    def by_kind(self) -> dict[str, list[DataError]]:
+        """The refusals by what is wrong, and those left out by their reason; the most frequent first."""
+        kinds: dict[str, list[DataError]] = {}
+        for error in self.refused:
+            kind = f"{error.kind}: {error.reason}" if isinstance(error, LeftOut) else error.kind
+            kinds.setdefault(kind, []).append(error)
+        return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
+
+    def json(self) -> dict[str, Any]:
+        """The contents of `check.json`."""
+        return {
+            "usable": {"sequences": self.sequences, "frames": self.frames},
+            "refused": [
+                {"sequence": error.sequence, "frame": error.frame, "file": error.file, "reason": error.reason}
+                for error in self.refused
+            ],
+            "counts": {kind: len(errors) for kind, errors in self.by_kind().items()},
+            "splits": self.splits,
+        }
+
+    def write(self, path: Path) -> None:
+        """Write `json()` as a file."""
+        path.write_text(json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
+
+
+def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:
+    """Read every sequence and every picture once, also where several splits share them.
+
+    A sequence that is not usable although nothing of it was refused counts as refused: it has too few frames.
+
+    Args:
+        sources: by split; with more than one worker they must be picklable.
+        workers: processes, by default one a core.
+        progress: show a progress bar.
+    """
+    refused = [error for source in sources.values() for error in _before_reading(source)]
+    sequences: list[_Sequence] = []
+    batches = _batches(sources)
+    with Progress(disable=not progress) as bar:
+        task = bar.add_task("reading sequences", total=sum(map(len, batches)))
+        for batch in _read_batches(sources, batches, workers):
+            sequences += batch
+            bar.advance(task, len(batch))
+    refused += [error for sequence in sequences for error in sequence.refused]
+    explained = {error.sequence for error in refused}
+    for sequence in sequences:
+        if len(sequence.usable) < FEWEST_FRAMES and sequence.name not in explained:
+            refused.append(TooFewFrames(f"{len(sequence.usable)} usable, 2 are needed", sequence=sequence.name))
+    unique = {(error.kind, error.reason, error.file, error.sequence, error.frame): error for error in refused}
+    return Findings(
+        **_numbers([sequence.usable for sequence in sequences]),
+        refused=list(unique.values()),
+        splits={
+            split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
+            for split in sources
+        },
+    )
+
+
+def show(findings: Findings) -> None:
+    """Print refusals by kind, with the first few of each, and what is usable."""
+    console = Console(width=None if Console().is_terminal else 120)
+    if findings.refused:
+        table = Table(title="not usable", show_lines=True)
+        table.add_column("what", overflow="fold", max_width=30)
+        table.add_column("count", justify="right", no_wrap=True)
+        table.add_column(f"the first {EXAMPLES}", overflow="fold")
+        for kind, errors in findings.by_kind().items():
+            examples = "\n".join(_printable(str(error)) for error in errors[:EXAMPLES])
+            table.add_row(Text(_printable(kind)), str(len(errors)), Text(examples))
+        console.print(table)
+    splits = ", ".join(f"{split} {n['sequences']} and {n['frames']}" for split, n in findings.splits.items())
+    usable = f"usable sequences: {findings.sequences}, their usable frames: {findings.frames} ({splits})"
+    console.print(Text(usable), soft_wrap=True)
+
+
+@dataclass
+class _Sequence:
+    """One sequence, read: its frames in each split, and which of all of them are usable."""
+
+    name: str
+    frames: dict[str, set[int]] = field(default_factory=dict)
+    usable: set[int] = field(default_factory=set)
+    refused: list[DataError] = field(default_factory=list)
+
+
+def _before_reading(source: SequenceSource) -> Iterator[DataError]:
+    yield from source.refused
+    for reason, names in source.left_out.items():
+        yield from (LeftOut(reason, sequence=name) for name in names)
+    if isinstance(source, Verifiable):
+        yield from source.verify()
+
+
+def _batches(sources: Sources) -> list[_Batch]:
+    """All names, each once, in pieces of what is best read by one process."""
+    splits: dict[str, list[str]] = {}
+    for split, source in sources.items():
+        for name in dict.fromkeys(source.names):
+            splits.setdefault(name, []).append(split)
+    batches = []
+    for split, source in sources.items():
+        names = [name for name in dict.fromkeys(source.names) if splits[name][0] == split]
+        for group in source.groups(names):
+            ordered = [(names[index], splits[names[index]]) for index in group]
+            batches += [ordered[start : start + LARGEST_BATCH] for start in range(0, len(ordered), LARGEST_BATCH)]
+    return batches
+
+
+def _read_batches(sources: Sources, batches: list[_Batch], workers: int | None) -> Iterator[list[_Sequence]]:
+    workers = min(workers or os.cpu_count() or 1, len(batches))
+    if workers <= 1:
+        yield from ([_read(sources, *item) for item in batch] for batch in batches)
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (dict(sources),)) as pool:
+        yield from pool.map(_read_in_worker, batches)
+
+
+_sources_of_worker: dict[str, SequenceSource] = {}
+
+
+def _start_worker(sources: dict[str, SequenceSource]) -> None:
+    torch.set_num_threads(1)
+    _sources_of_worker.update(sources)
+
+
+def _read_in_worker(batch: _Batch) -> list[_Sequence]:
+    return [_read(_sources_of_worker, *item) for item in batch]
+
+
+def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
+    sequence, seen = _Sequence(name), set[int]()
+    for split in splits:
+        try:
+            with at(sequence=name):
+                posed = sources[split].read(name)
+        except DataError as error:
+            sequence.refused.append(error)
+            continue
+        sequence.frames[split] = set(posed.frames)
+        for index, frame in enumerate(posed.frames):
+            if frame in seen:
+                continue
+            seen.add(frame)
+            try:
+                with at(sequence=name, frame=frame):
+                    posed.read(index)
+            except DataError as error:
+                sequence.refused.append(error)
+            else:
+                sequence.usable.add(frame)
+    return sequence
+
+
+def _numbers(usable: list[set[int]]) -> dict[str, int]:
+    frames = [len(frames) for frames in usable if len(frames) >= FEWEST_FRAMES]
+    return {"sequences": len(frames), "frames": sum(frames)}
+
+
+def _printable(text: str) -> str:
+    """One line without control characters, which names of files may hold, and not too long (`check.json` has it)."""
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return plain if len(plain) <= LONGEST_EXAMPLE else f"{plain[: LONGEST_EXAMPLE - 3]}..."

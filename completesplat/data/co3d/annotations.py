@@ -1,0 +1,179 @@
+"""CO3D v2's annotations: frames and their cameras, without PyTorch3D.
+
+Layout: facebookresearch/co3d, `co3d/dataset/data_types.py`.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    Refuse,
+    at,
+    field,
+    finite_array,
+    inside,
+    read_json,
+    refused_to,
+    require_rotation,
+)
+from completesplat.geometry.cameras import Cameras
+
+VIEWPOINT_SHAPES = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
+
+
+class DepthMap(NamedTuple):
+    """A depth map's file and the factor that brings its values to the sequence's units."""
+
+    path: Path
+    scale_adjustment: float
+
+
+@dataclass(frozen=True)
+class CO3DFrame:
+    """One picture with its mask; `camera` is in float64, in the sequence's own units."""
+
+    number: int
+    image: Path
+    mask: Path
+    depth: DepthMap | None
+    camera: Cameras
+
+
+@dataclass(frozen=True)
+class CO3DVideo:
+    """What is annotated of a whole sequence; the qualities are None where they are not given, or NaN."""
+
+    point_cloud: Path | None
+    point_cloud_quality: float | None
+    viewpoint_quality: float | None
+
+
+def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
+    """The sequences in `sequence_annotations.jgz` by name. Entries that are none are handed to `refuse`.
+
+    Raises:
+        DataError: the file is missing, unreadable or no list.
+    """
+    videos: dict[str, CO3DVideo] = {}
+    for index, entry in enumerate(_read_list(path)):
+        with refused_to(refuse), at(path):
+            name = _name(entry, index)
+            with at(sequence=name):
+                if name in videos:
+                    raise BadAnnotation("the sequence is annotated twice")
+                videos[name] = _video(root, entry)
+    return videos
+
+
+def _video(root: Path, entry: dict[str, Any]) -> CO3DVideo:
+    quality = _optional_number(entry, "viewpoint_quality_score")
+    cloud = entry.get("point_cloud")
+    if cloud is None:
+        return CO3DVideo(None, None, quality)
+    return CO3DVideo(inside(root, field(cloud, "path", str)), _optional_number(cloud, "quality_score"), quality)
+
+
+def _optional_number(entry: dict[str, Any], key: str) -> float | None:
+    value = entry.get(key)
+    # CO3D's writer has NaN where there was nothing to compute a score from.
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return None
+    return float(finite_array(value, (), key))
+
+
+def read_frames(
+    root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
+) -> dict[str, dict[int, CO3DFrame]]:
+    """The frames in `frame_annotations.jgz` by sequence and number. Entries that are none are handed to `refuse`.
+
+    Args:
+        wanted: (sequence, number) -> whether the frame is looked at.
+
+    Raises:
+        DataError: the file is missing, unreadable or no list.
+    """
+    frames: dict[str, dict[int, CO3DFrame]] = {}
+    for index, entry in enumerate(_read_list(path)):
+        with refused_to(refuse), at(path):
+            name = _name(entry, index)
+            with at(sequence=name):
+                number = field(entry, "frame_number", int)
+            if wanted(name, number):
+                with at(sequence=name, frame=number):
+                    if number in frames.get(name, ()):
+                        raise BadAnnotation("the frame is annotated twice")
+                    frames.setdefault(name, {})[number] = _frame(root, number, entry)
+    return frames
+
+
+def _name(entry: object, index: int) -> str:
+    try:
+        return field(entry, "sequence_name", str)
+    except BadAnnotation as error:
+        raise BadAnnotation(f"entry {index}: {error.reason}") from None
+
+
+def _read_list(path: Path) -> list[Any]:
+    # CO3D is written by Python's `json`, which writes NaN; every number that is used is checked.
+    content = read_json(path, allow_nan=True)
+    if type(content) is not list:
+        raise BadAnnotation("must hold a list", str(path))
+    return content
+
+
+def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
+    image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), entry.get("depth")
+    size = field(image, "size", list)
+    if [type(side) for side in size] != [int, int] or min(size) <= 0:
+        raise BadAnnotation(f"the image's size must be two positive integers, not {size}")
+    camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
+    image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
+    return CO3DFrame(number, image_path, mask_path, None if depth is None else _depth(root, depth), camera)
+
+
+def _depth(root: Path, entry: object) -> DepthMap:
+    path = inside(root, field(entry, "path", str))
+    # Some writers leave out the fraction of a whole number.
+    scale = entry.get("scale_adjustment") if isinstance(entry, dict) else None
+    return DepthMap(path, float(finite_array(scale, (), "scale_adjustment")))
+
+
+def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) -> Cameras:
+    """OpenCV camera (float64, no batch axis) of a PyTorch3D viewpoint for an image of (height, width).
+
+    PyTorch3D: X_cam = X_world R + T with row vectors, +x left, +y up, and coordinates on the image in units of half
+    its width and height (`ndc_norm_image_bounds`) or of half its shorter side (`ndc_isotropic`), from its centre
+    (`pytorch3d/implicitron/dataset/frame_data.py:756`, `renderer/camera_conversions.py:64`).
+
+    Raises:
+        BadAnnotation: missing keys, anything but finite numbers in the right shapes, or another intrinsics format.
+        BadCamera: no rotation (to 1e-3), a focal length that is not positive, a principal point outside of the image.
+    """
+    height, width = image_size
+    half = np.array([width, height]) / 2
+    # Annotations older than the field carry the default of the format.
+    layout = viewpoint.get("intrinsics_format", "ndc_norm_image_bounds")
+    if layout not in ("ndc_norm_image_bounds", "ndc_isotropic"):
+        raise BadAnnotation(f"unknown intrinsics format {layout!r}")
+    unit = half if layout == "ndc_norm_image_bounds" else np.full(2, half.min())
+    numbers = {key: finite_array(viewpoint.get(key), shape, key) for key, shape in VIEWPOINT_SHAPES.items()}
+    require_rotation(numbers["R"], "R")
+    focal, center = numbers["focal_length"] * unit, half - numbers["principal_point"] * unit
+    if not ((focal > 0) & np.isfinite(focal)).all():
+        raise BadCamera(f"focal_length must be positive and finite, not {viewpoint['focal_length']}")
+    if not ((center > 0) & (center < 2 * half)).all():
+        raise BadCamera(f"principal point ({center[0]:g}, {center[1]:g}) lies outside of the {width} x {height} image")
+    flip = np.diag([-1.0, -1.0, 1.0])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3] = flip @ numbers["R"].T
+    world_to_camera[:3, 3] = flip @ numbers["T"]
+    intrinsics = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
+    return Cameras(torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics), (height, width))

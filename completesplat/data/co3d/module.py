@@ -1,0 +1,119 @@
+"""One category of CO3D v2 (Reizenstein et al., ICCV 2021), or of anything in its layout, as a data module."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
+from completesplat.data.co3d.source import CO3DSource, Framing
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.scenes import Choice
+from completesplat.data.loading.view_selection import evaluation_views, training_views
+from completesplat.data.sequences import PosedSequence
+from completesplat.errors import CompleteSplatError
+
+
+class CO3DDataModule(SceneDataModule):
+    """Scenes of one category.
+
+    Training draws a random reference and random targets of a sequence; validation and test take a sequence's first
+    frame as the reference and others as targets. Needs neither PyTorch3D nor the `co3d` package.
+
+    Args:
+        root: folder of the categories, or a prepared category.
+        category: a folder below `root`, such as "hydrant".
+        subset: the set list that splits the frames, which is named after what is tested (Splatter Image:
+            `fewview_dev`); None: split by seed.
+        allow_shared_sequences: take a set list also where it tests on training sequences, as CO3D's `fewview_train`
+            does, and as all do that divide the frames of one sequence (`manyview_...`, an imported capture).
+        val_fraction, test_fraction, split_seed: see `SeededSplit`.
+        min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
+        evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
+        validation_targets: the same of a validation scene; None: as many as of a test scene.
+        depth_before, depth_after: the depth range around the object's centre, where the object's half size is 0.57
+            (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full pictures).
+        **settings: of `SceneDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        category: str,
+        subset: str | None = "fewview_dev",
+        allow_shared_sequences: bool = False,
+        val_fraction: float = 0.05,
+        test_fraction: float = 0.1,
+        split_seed: int = 0,
+        min_frames: int = 2,
+        min_viewpoint_quality: float | None = None,
+        min_point_cloud_quality: float | None = None,
+        most_training_sequences: int | None = None,
+        evaluation_targets: int | None = None,
+        validation_targets: int | None = None,
+        depth_before: float = 1.5,
+        depth_after: float = 4.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        if min_frames < 2:
+            raise CompleteSplatError(f"data.min_frames={min_frames}: a scene needs at least 2")
+        self.category = category
+        self.subset = subset
+        self.allow_shared_sequences = allow_shared_sequences
+        self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
+        self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
+        self.framing = Framing(self.image_size, depth_before, depth_after)
+        self.evaluation_targets = evaluation_targets
+        self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
+
+    def describe(self) -> dict[str, str | None]:
+        """See `SceneDataModule`."""
+        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
+        return {
+            "data_set": f"co3d/{self.category}",
+            "subset": self.subset,
+            "split": self._split(),
+            "crop": "largest square around the principal point",
+            "protocol_views": f"reference: a sequence's first frame; targets: {targets}",
+        }
+
+    def _split(self) -> str:
+        """How sequences are divided, in words."""
+        val, test, seed = self.seeded
+        if self.subset is None:
+            return f"by seed {seed}: {val:g} of the sequences for validation, {test:g} for the test"
+        if self.allow_shared_sequences:
+            return "of the set list, shared sequences allowed"
+        return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
+
+    def prepared_settings(self) -> dict[str, Any]:
+        """See `SceneDataModule`."""
+        parts = vars(self.filters) | vars(self.framing)
+        seeded = {"val_fraction": self.seeded.val_fraction, "test_fraction": self.seeded.test_fraction}
+        return {
+            "category": self.category,
+            "subset": self.subset,
+            "allow_shared_sequences": self.allow_shared_sequences,
+            **seeded,
+            "split_seed": self.seeded.seed,
+            **parts,
+        }
+
+    def open(self, split: str) -> Mapping[str, CO3DSource]:
+        """All splits: the annotations are read once."""
+        which = self.root, self.category, self.subset
+        category = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
+        return {
+            name: CO3DSource(members, self.framing, category.files, category.refused)
+            for name, members in category.splits.items()
+        }
+
+    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
+        """A random reference and random targets."""
+        return training_views(frames, self.targets, rng)
+
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """The first frame as reference, others as targets."""
+        targets = self.validation_targets if split == "val" else self.evaluation_targets
+        return evaluation_views(len(sequence.frames), targets)

@@ -1,0 +1,266 @@
+"""Which sequences and frames of a CO3D category belong to which split, and which are left out."""
+
+import dataclasses
+import logging
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
+from completesplat.data.sequences import SPLITS, split_by_hash
+from completesplat.data.validation import (
+    BadAnnotation,
+    Refuse,
+    SharedSequences,
+    at,
+    field,
+    inside,
+    read_json,
+    refused_to,
+)
+from completesplat.errors import DataError
+
+FEWEST_SEQUENCES = 3
+NAMED = 5
+
+Listed = dict[str, set[tuple[str, int]]]
+"""(sequence name, frame number) of each split."""
+
+logger = logging.getLogger(__name__)
+
+
+class SeededSplit(NamedTuple):
+    """Shares of the sequences that are held out by seed, at least one sequence each.
+
+    Without a set list, of all sequences; with one that has no validation, `val_fraction` of its training sequences.
+    """
+
+    val_fraction: float
+    test_fraction: float
+    seed: int
+
+
+def set_list_path(category: Path, subset: str | None) -> Path | None:
+    """The set list of that name; None where the sequences are to be split by seed.
+
+    Raises:
+        DataError: there is no such set list.
+    """
+    folder = category / "set_lists"
+    if subset is None:
+        return None
+    there = sorted(path.stem.removeprefix("set_lists_") for path in folder.glob("set_lists_*.json"))
+    if not there:
+        raise DataError("no set lists there; data.subset=null splits the sequences by seed", str(folder))
+    if subset not in there:
+        raise DataError(
+            f"no set list {subset!r} there; choose data.subset among {', '.join(there)}, or null for a split by seed",
+            str(folder),
+        )
+    return folder / f"set_lists_{subset}.json"
+
+
+def read_set_list(path: Path, refuse: Refuse) -> Listed:
+    """The frames of each split. Entries that are none are handed to `refuse`.
+
+    Raises:
+        DataError: the file is missing, unreadable, or has no list for a split.
+    """
+    content = read_json(path)
+    splits: Listed = {}
+    for split in SPLITS:
+        with at(path):
+            members = field(content, split, list)
+        splits[split] = set()
+        for member in members:
+            with refused_to(refuse), at(path):
+                if type(member) is not list or [type(part) for part in member[:2]] != [str, int]:
+                    raise BadAnnotation(
+                        f"{split} has {str(member)[:80]} where [sequence name, frame number, path] is expected"
+                    )
+                splits[split].add((member[0], member[1]))
+    return splits
+
+
+def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
+    """A set list whose training sequences are neither validated nor tested on.
+
+    CO3D's `fewview_train` tests on all that it trains on (facebookresearch/co3d, issue 49); Splatter Image takes
+    `fewview_dev` (`data_preprocessing/preprocess_co3d.py`). Validation loses what is in training too. Where it then
+    has nothing, a seeded share of the training sequences is its.
+
+    Returns:
+        The lists, and the names that validation lost.
+
+    Raises:
+        SharedSequences: some sequences are trained on and tested.
+    """
+    names = {split: {name for name, _ in listed[split]} for split in SPLITS}
+    shared = sorted(names["train"] & names["test"])
+    if shared:
+        said = f"{len(shared)} sequences are trained on and tested: {', '.join(shared[:NAMED])}"
+        more = " and others" if len(shared) > NAMED else ""
+        advice = "choose another data.subset, or set data.allow_shared_sequences=true"
+        raise SharedSequences(f"{said}{more}; {advice}", str(path))
+    lost = names["train"] & names["val"]
+    train, val = listed["train"], {frame for frame in listed["val"] if frame[0] not in lost}
+    if not val and len(names["train"]) > 1:
+        held_out = set(split_by_hash(sorted(names["train"]), rule.val_fraction, rule.seed)[1])
+        logger.warning(
+            "%s lists nothing for validation alone: %d of %d training sequences validate, by seed %d",
+            *(path, len(held_out), len(names["train"]), rule.seed),
+        )
+        val, lost = {frame for frame in train if frame[0] in held_out}, lost - held_out
+        train = train - val
+    return {"train": train, "val": val, "test": listed["test"]}, sorted(lost)
+
+
+def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
+    """Whole sequences for each split.
+
+    Raises:
+        DataError: fewer than three sequences.
+    """
+    if len(frames) < FEWEST_SEQUENCES:
+        raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
+    rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
+    # The rest's hashes lie above the test fraction, so the next share of them is validation's.
+    train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.seed)
+    if not train:
+        raise DataError(
+            f"no training sequences with val_fraction={rule.val_fraction}, test_fraction={rule.test_fraction}"
+        )
+    names = {"train": train, "val": val, "test": test}
+    return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Which sequences are taken, of those that are not broken.
+
+    Attributes:
+        min_frames: with fewer in a split, a sequence is left out of it.
+        min_viewpoint_quality, min_point_cloud_quality: CO3D's scores; None: any. Where one is asked for, a sequence
+            without the score is left out.
+        most_training_sequences: those with the best viewpoint quality (DFM takes 500); None: all.
+    """
+
+    min_frames: int = 2
+    min_viewpoint_quality: float | None = None
+    min_point_cloud_quality: float | None = None
+    most_training_sequences: int | None = None
+
+
+@dataclass(frozen=True)
+class SplitMembers:
+    """What one split is made of, by sequence.
+
+    Attributes:
+        listed: how many sequences the split has by its list, usable or not.
+        frames: those of the split, in order.
+        captured: all frames of the same sequences, also those of other splits: they tell which way is up.
+        left_out: names of sequences, by reason.
+    """
+
+    listed: int = 0
+    frames: dict[str, list[CO3DFrame]] = dataclasses.field(default_factory=dict)
+    captured: dict[str, list[CO3DFrame]] = dataclasses.field(default_factory=dict)
+    point_clouds: dict[str, Path | None] = dataclasses.field(default_factory=dict)
+    left_out: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+
+
+class Category(NamedTuple):
+    """The splits, the files that say so, and what was found broken."""
+
+    splits: dict[str, SplitMembers]
+    files: list[Path]
+    refused: list[DataError]
+
+
+def read_category(
+    root: Path, category: str, subset: str | None, seeded: SeededSplit, filters: Filters, allow_shared: bool = False
+) -> Category:
+    """The sequences of a category, their frames divided as the set list `subset` says, or else by seed.
+
+    Frames that the set list does not name are not looked at.
+
+    Args:
+        allow_shared: take the set list as it is, also where a sequence is in several of its parts; else see
+            `kept_apart`.
+
+    Raises:
+        DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
+            `root`; or training sequences are tested.
+    """
+    folder = inside(root, category)
+    if not os.path.isdir(folder):
+        raise DataError("no such CO3D category", str(folder))
+    frames_file, videos_file = folder / "frame_annotations.jgz", folder / "sequence_annotations.jgz"
+    set_list, refused = set_list_path(folder, subset), list[DataError]()
+    refuse: Refuse = refused.append
+    listed, lost = read_set_list(set_list, refuse) if set_list else None, list[str]()
+    if set_list and listed is not None and not allow_shared:
+        listed, lost = kept_apart(set_list, listed, seeded)
+    wanted = set().union(*listed.values()) if listed is not None else None
+    videos = read_videos(root, videos_file, refuse)
+    frames = read_frames(root, frames_file, lambda *key: wanted is None or key in wanted, refuse)
+    places = {(error.sequence, error.frame) for error in refused}
+    for name in sorted(frames.keys() - videos.keys()):
+        if (name, None) not in places:
+            refuse(BadAnnotation("the sequence is not annotated", str(videos_file), name))
+            places.add((name, None))
+        del frames[name]
+    if listed is None:
+        listed = split_by_seed(frames, seeded)
+    else:
+        for name, number in sorted(wanted or ()):
+            if number not in frames.get(name, ()) and not {(name, None), (name, number)} & places:
+                refuse(BadAnnotation("the frame is listed, but not annotated", str(set_list), name, number))
+    splits = {split: _members(split, listed[split], frames, videos, filters) for split in SPLITS}
+    if lost:
+        splits["val"].left_out["in training too"] = lost
+    files = [frames_file, videos_file, *([set_list] if set_list else [])]
+    return Category(splits, files, refused)
+
+
+def _members(
+    split: str,
+    listed: Iterable[tuple[str, int]],
+    frames: dict[str, dict[int, CO3DFrame]],
+    videos: dict[str, CO3DVideo],
+    filters: Filters,
+) -> SplitMembers:
+    members = SplitMembers(listed=len({name for name, _ in listed}))
+    for name, number in sorted(listed):
+        if number in frames.get(name, ()):
+            members.frames.setdefault(name, []).append(frames[name][number])
+    for name in list(members.frames):
+        reason = _reason_to_leave_out(len(members.frames[name]), videos[name], filters)
+        if reason:
+            members.left_out.setdefault(reason, []).append(name)
+            del members.frames[name]
+    most = filters.most_training_sequences
+    if split == "train" and most is not None:
+        best = sorted(members.frames, key=lambda name: -(videos[name].viewpoint_quality or 0.0))
+        for name in best[most:]:
+            members.left_out.setdefault(f"not among the {most} with the best viewpoint quality", []).append(name)
+            del members.frames[name]
+    for name in members.frames:
+        members.captured[name] = list(frames[name].values())
+        members.point_clouds[name] = videos[name].point_cloud
+    return members
+
+
+def _reason_to_leave_out(frames: int, video: CO3DVideo, filters: Filters) -> str | None:
+    if frames < filters.min_frames:
+        return f"fewer than {filters.min_frames} frames"
+    scores = (
+        ("viewpoint", video.viewpoint_quality, filters.min_viewpoint_quality),
+        ("point cloud", video.point_cloud_quality, filters.min_point_cloud_quality),
+    )
+    for name, score, least in scores:
+        if least is not None and (score is None or score < least):
+            return f"{name} quality below {least:g}, or not given"
+    return None

@@ -1,0 +1,301 @@
+"""CO3D sequences as posed sequences: cropped, placed at the common scale, with a depth range around the object."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from plyfile import PlyData
+from torch import Tensor
+
+from completesplat.data.co3d.annotations import CO3DFrame
+from completesplat.data.co3d.selection import SplitMembers
+from completesplat.data.pictures.crop import Square, principal_square, read_square
+from completesplat.data.pictures.files import decode, read_depth
+from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.validation import BadCamera, BadPlacement, UnreadableFile, at, require_file
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import (
+    Cameras,
+    crop_resize,
+    invert_rigid,
+    pixel_centers,
+    transform_points,
+    unproject,
+)
+from completesplat.tensors import stack
+
+
+def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> Float[Tensor, "1 size size"]:
+    """Depth along the optical axis at the centre of each pixel of the square picture; 0 where it is unknown.
+
+    The nearest pixel of the map counts: a mean across an edge would be the depth of nothing. The map may have another
+    size than the picture that it belongs to.
+
+    Args:
+        factor: from the sequence's units to the common scale.
+
+    Raises:
+        DataError: the frame has no depth map, or it cannot be read.
+    """
+    if frame.depth is None:
+        return torch.zeros(1, size, size)
+    with at(frame=frame.number):
+        depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
+    places = []
+    ends = zip(depth.shape, frame.camera.image_size, (square.top, square.left), strict=True)
+    for count, side, start in ends:
+        centers = start + (torch.arange(size, dtype=torch.float64) + 0.5) * square.side / size
+        places.append((centers * count / side).long().clamp(0, count - 1))
+    rows, columns = places
+    return factor * depth[rows[:, None], columns][None]
+
+
+DEPTH_MAPS = 8
+DEPTH_QUANTILE = 0.99
+FOREGROUND = 128  # of 255
+# Smaller eigenvalues than this (of at most 1) mean that the optical axes are parallel.
+PARALLEL = 1e-4
+UP = 1
+
+Axes = Float[np.ndarray, "3 3"]
+
+
+class Placement(NamedTuple):
+    """Centre of the object and half its size: the largest distance from the centre along one of the upright axes."""
+
+    center: Float[Tensor, "3"]
+    half_size: float
+
+
+def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], captured: Sequence[CO3DFrame]) -> Placement:
+    """From the point cloud; without one from the depth maps; without those from the cameras alone.
+
+    Args:
+        frames: whose depth maps and cameras count.
+        captured: all frames of the sequence, which tell the axes.
+
+    Raises:
+        DataError: what would tell is unreadable, empty, without extent or not finite.
+    """
+    if point_cloud is not None:
+        return from_point_cloud(point_cloud, upright_axes(captured))
+    with_depth = [frame for frame in frames if frame.depth is not None]
+    return from_depth_maps(with_depth, upright_axes(captured)) if with_depth else from_cameras(frames)
+
+
+def upright_axes(frames: Sequence[CO3DFrame]) -> Axes:
+    """The axes of an upright frame in the sequence's world, as columns; the second points up, or down.
+
+    People hold a camera level: its x axis varies least upwards and most along the first of these axes (Splatter Image,
+    `co3d_normalisation.py`).
+    """
+    sideways = torch.stack([frame.camera.world_to_camera[0, :3] for frame in frames]).numpy()
+    sideways = sideways - sideways.mean(axis=0)
+    least, middle, most = np.linalg.eigh(sideways.T @ sideways)[1].T
+    return np.stack([most, least, middle], axis=-1)
+
+
+def from_point_cloud(path: Path, axes: Axes) -> Placement:
+    """As Splatter Image places it (`co3d_normalisation.py`).
+
+    The centre is the points' mean, but upwards the middle between the lowest and the highest; half the size is the
+    largest coordinate from there, along the upright axes.
+
+    Raises:
+        MissingFile: no such file.
+        UnreadableFile: no PLY.
+        BadPlacement: no points, points in one place, or points that are not finite.
+    """
+    require_file(path)
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        points = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
+    except Exception as error:  # The parser raises nearly anything on a damaged file.
+        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
+    with at(path):
+        return _placement(points, axes, 1.0, "the point cloud")
+
+
+def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
+    """From what up to 8 evenly spaced depth maps show of the foreground, as if that were the point cloud.
+
+    Depth maps have outliers: the 99 % quantile counts instead of the largest value, and the 1 % quantile instead of
+    the smallest.
+
+    Raises:
+        DataError: a depth map or a mask is missing or unreadable.
+        BadPlacement: no foreground with a known depth.
+    """
+    chosen = [frames[i * len(frames) // DEPTH_MAPS] for i in range(DEPTH_MAPS)] if len(frames) > DEPTH_MAPS else frames
+    points = []
+    for frame in chosen:
+        with at(frame=frame.number):
+            points.append(_foreground(frame))
+    return _placement(np.concatenate(points), axes, DEPTH_QUANTILE, "the depth maps' foreground")
+
+
+def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
+    """The point that is nearest to all optical axes; the object is taken to fill the largest square of the pictures.
+
+    Raises:
+        BadPlacement: optical axes that are parallel, or meet behind the cameras.
+    """
+    world_to_camera = torch.stack([frame.camera.world_to_camera for frame in frames])
+    axes, eyes = world_to_camera[:, 2, :3], invert_rigid(world_to_camera)[:, :3, 3]
+    # The squared distance of x to an axis is (x - eye)^T P (x - eye), where P takes out the part along the axis.
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    if torch.linalg.eigvalsh(across.mean(dim=0))[0] < PARALLEL:
+        raise BadPlacement("no point cloud, no depth maps, and optical axes that do not meet")
+    center = torch.linalg.solve(across.sum(dim=0), (across @ eyes[:, :, None]).sum(dim=0)).squeeze(-1)
+    depths = transform_points(world_to_camera, center[None])[:, 0, 2]
+    half_size = (depths * torch.tensor([_half_extent(frame) for frame in frames], dtype=depths.dtype)).median().item()
+    if not (half_size > 0 and np.isfinite(half_size)):
+        raise BadPlacement("no point cloud, no depth maps, and optical axes that meet behind the cameras")
+    return Placement(center, half_size)
+
+
+def _half_extent(frame: CO3DFrame) -> float:
+    """Half the side of the largest square around the principal point, at depth 1."""
+    (x, y), focal = frame.camera.intrinsics[:2, 2].tolist(), frame.camera.intrinsics.diagonal()[:2].max().item()
+    side = principal_square((x, y), frame.camera.image_size).side
+    return 0.5 * side / focal
+
+
+def _foreground(frame: CO3DFrame) -> np.ndarray:
+    """World points [n 3] of a depth map's foreground; the map may be smaller than the picture."""
+    if frame.depth is None:
+        return np.zeros((0, 3))
+    depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
+    mask = decode(frame.mask, str(frame.mask), "L", frame.camera.image_size)
+    height, width = depth.shape
+    known = (depth > 0) & torch.from_numpy(np.asarray(mask.resize((width, height))) >= FOREGROUND)
+    ratio = torch.tensor([frame.camera.image_size[1] / width, frame.camera.image_size[0] / height]).double()
+    pixels = pixel_centers(height, width, dtype=torch.float64)[known] * ratio
+    return unproject(frame.camera, pixels, depth[known].double()).numpy()
+
+
+def _placement(points: np.ndarray, axes: Axes, quantile: float, what: str) -> Placement:
+    if not len(points) or not np.isfinite(points).all():
+        raise BadPlacement(f"{what} is empty or not finite")
+    mean = points.mean(axis=0)
+    upright = (points - mean) @ axes
+    middle = np.quantile(upright[:, UP], [1 - quantile, quantile]).mean()
+    upright[:, UP] -= middle
+    half_size = float(np.quantile(np.abs(upright), quantile, axis=0).max())
+    if not half_size > 0:
+        raise BadPlacement(f"{what} is without extent")
+    return Placement(torch.from_numpy(mean + middle * axes[:, UP]), half_size)
+
+
+# The object's half size (see `Placement`) after scaling (Splatter Image: 1.2 * 0.95 / 2).
+OBJECT_HALF_SIZE = 0.57
+SMALLEST_NEAR = 0.1
+# Cameras that stay within this share of their distance to the object show nothing but one view of it.
+SMALLEST_BASELINE = 0.01
+
+
+@dataclass(frozen=True)
+class Framing:
+    """How pictures and cameras are made from files.
+
+    Attributes:
+        image_size: side of the square pictures.
+        depth_before, depth_after: the depth range reaches this far in front of and behind the object's centre.
+    """
+
+    image_size: int
+    depth_before: float
+    depth_after: float
+
+
+class CO3DSource:
+    """The sequences of one split; see `SequenceSource`."""
+
+    def __init__(
+        self, members: SplitMembers, framing: Framing, files: Sequence[Path], refused: list[DataError]
+    ) -> None:
+        self.names = sorted(members.frames)
+        self.left_out = members.left_out
+        self.listed = members.listed
+        self.refused = refused
+        self.framing = framing
+        self._frames = members.frames
+        self._captured = members.captured
+        self._point_clouds = members.point_clouds
+        self._files = files
+        self._sequences: dict[str, PosedSequence] = {}
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """All in one: every picture is a file of its own."""
+        return [list(range(len(names)))]
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the annotations; pictures are not looked at."""
+        digest = hashlib.sha256()
+        for file in self._files:
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()
+
+    def read(self, name: str) -> PosedSequence:
+        """One sequence; its cameras are made on first use.
+
+        Raises:
+            DataError: nothing tells where the object is, or the cameras do not move.
+        """
+        if name not in self._sequences:
+            with at(sequence=name):
+                self._sequences[name] = self._make(name)
+        return self._sequences[name]
+
+    def _make(self, name: str) -> PosedSequence:
+        frames, size = self._frames[name], self.framing.image_size
+        placement = object_placement(self._point_clouds[name], frames, self._captured[name])
+        factor = OBJECT_HALF_SIZE / placement.half_size
+        cameras = stack([_cropped(frame, size) for frame in frames])
+        cameras = cameras.scale_world(torch.tensor(factor, dtype=torch.float64))
+        depths = transform_points(cameras.world_to_camera, factor * placement.center[None])[..., 0, 2]
+        baseline = (cameras.centers - cameras.centers[0]).norm(dim=-1).max()
+        if not baseline > SMALLEST_BASELINE * depths.abs().mean():
+            raise BadCamera("the cameras do not move", str(self._files[0]))
+        return PosedSequence(
+            name,
+            tuple(frame.number for frame in frames),
+            cameras,
+            self._depth_ranges(depths).to(torch.float32),
+            partial(_read, name, frames, size),
+            partial(_read_depth, name, frames, size, factor) if any(frame.depth for frame in frames) else None,
+        )
+
+    def _depth_ranges(self, depths: Float[Tensor, " view"]) -> Float[Tensor, "view 2"]:
+        near = (depths - self.framing.depth_before).clamp(min=SMALLEST_NEAR)
+        # An object behind the camera (a broken pose) still gets a range of positive length.
+        return torch.stack([near, torch.maximum(depths, near) + self.framing.depth_after], dim=-1)
+
+
+def _cropped(frame: CO3DFrame, size: int) -> Cameras:
+    square = _square(frame)
+    return crop_resize(frame.camera, square.left, square.top, square.side, size)
+
+
+def _square(frame: CO3DFrame) -> Square:
+    x, y = frame.camera.intrinsics[:2, 2].tolist()
+    return principal_square((x, y), frame.camera.image_size)
+
+
+def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> Picture:
+    frame = frames[index]
+    square, image_size = _square(frame), frame.camera.image_size
+    with at(sequence=name, frame=frame.number):
+        image = read_square(frame.image, image_size, square, size, "RGB")
+        return Picture(image, read_square(frame.mask, image_size, square, size, "L"))
+
+
+def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:
+    with at(sequence=name):
+        return square_depth(frames[index], _square(frames[index]), size, factor)

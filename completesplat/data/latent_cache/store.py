@@ -1,0 +1,237 @@
+"""A latent cache on disk: rows written, read back memory-mapped, and drawn as training items."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Shaped
+from torch import Tensor
+
+from completesplat.data.latent_cache.manifest import Array, Sequence, is_encoded, read_manifest
+from completesplat.data.loading.augmentation import BoxMasks
+from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
+from completesplat.data.packed.manifest import Scalar, differences
+from completesplat.data.sequences import SequenceSource
+from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, require_file
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.scene import EncodedScene
+
+
+class ArrayWriter:
+    """Writes rows of one shape behind each other; leaving the context puts their number into the header.
+
+    After an exception the file is removed.
+
+    Args:
+        row: shape of a row.
+    """
+
+    def __init__(self, path: Path, row: tuple[int, ...], dtype: str) -> None:
+        self.path = path
+        self.row = row
+        self.dtype = np.dtype(dtype)
+        self.count = 0
+
+    def __enter__(self) -> "ArrayWriter":
+        self._file = self.path.open("wb")
+        self._begin = self._write_header()
+        return self
+
+    def append(self, rows: Shaped[np.ndarray, "_ _ _ _"]) -> None:
+        """Some more rows, of the writer's dtype."""
+        assert (rows.shape[1:], rows.dtype) == (self.row, self.dtype)
+        self._file.write(np.ascontiguousarray(rows).data)
+        self.count += len(rows)
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        with self._file:
+            self._file.seek(0)
+            # NumPy pads headers so that a first axis of any length fits.
+            assert self._write_header() == self._begin
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        if error is not None:
+            self.path.unlink()
+
+    def _write_header(self) -> int:
+        header = {"descr": self.dtype.str, "fortran_order": False, "shape": (self.count, *self.row)}
+        np.lib.format.write_array_header_1_0(self._file, header)
+        return self._file.tell()
+
+    def described(self) -> Array:
+        """For the manifest."""
+        return Array(self.path.name, self.dtype.name, (self.count, *self.row))
+
+
+def open_array(root: Path, array: Array) -> np.memmap:
+    """A stored array; nothing of it is read yet.
+
+    Raises:
+        DataError: missing, cut short, or with another shape or type than the manifest says.
+    """
+    path = require_file(root / array.file)
+    with at(file=path):
+        try:
+            found = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError, OSError) as error:
+            raise UnreadableFile(f"damaged or no NumPy array: encode the pictures again ({error})") from None
+        if not isinstance(found, np.memmap) or found.shape != array.shape or found.dtype.name != array.dtype:
+            raise ChangedFile("not the array that the manifest describes: encode the pictures again")
+        if path.stat().st_size != found.offset + found.nbytes:
+            raise ChangedFile("longer than it was written: encode the pictures again")
+        return found
+
+
+class EncodedStore:
+    """The encoded pictures of a training set.
+
+    Attributes:
+        scale: 1 / standard deviation of a latent drawn from the posteriors, over all elements of all stored frames.
+        arrays: memory-mapped "mean", "log_variance" and "condition", one row for each picture.
+
+    Raises:
+        DataError: no finished store, or one that is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        if not is_encoded(folder):
+            raise MissingFile(
+                "no finished store of encoded pictures: completesplat data latents makes one", str(folder)
+            )
+        self.folder = folder
+        self.manifest = read_manifest(folder)
+        self.origin = self.manifest.origin
+        self.scale = self.manifest.scale
+        self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
+        self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
+
+    @property
+    def latent_shape(self) -> tuple[int, ...]:
+        """Channels, height and width."""
+        return self.manifest.arrays["mean"].shape[1:]
+
+    @property
+    def holds_pictures(self) -> bool:
+        """Whether the conditions are pictures rather than features."""
+        return self.origin.conditioning is None
+
+    def scene(self, name: str, frame: int) -> EncodedScene:
+        """One encoded frame, without batch axis; features as they were stored, in float32.
+
+        Args:
+            frame: place in the sequence.
+
+        Raises:
+            DataError: it is not in the store.
+        """
+        row = self._row(self.sequences[name], frame)
+        mean, log_variance = self._floats("mean", row), self._floats("log_variance", row)
+        if self.holds_pictures:
+            # The same division as of pictures that are read, bit by bit.
+            share = np.divide(self.arrays["condition"][row], 255, dtype=np.float32)
+            condition = torch.from_numpy(np.asarray(share))
+        else:
+            condition = self._floats("condition", row)
+        return EncodedScene(mean, log_variance, condition, torch.tensor(frame), name)
+
+    def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
+        """Refuse a store that was made from other pictures than `source` gives with these settings.
+
+        Raises:
+            DataError: another fingerprint, other settings, or other sequences.
+        """
+        differing = differences(self.origin.settings, settings)
+        if differing:
+            raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
+        self.must_be_of(source)
+
+    def must_be_of(self, source: SequenceSource) -> None:
+        """Refuse a store that was made from another data set.
+
+        Raises:
+            DataError: another fingerprint, or other sequences.
+        """
+        if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
+            raise DataError("made from other data than the training set now: encode it again", str(self.folder))
+
+    def missing(self, name: str, frame: int | None = None) -> DataError:
+        """What to raise where a sequence, or a frame of it, is asked for and not there."""
+        what = "its pictures" if frame is None else f"its picture {frame + 1}"
+        return DataError(f"{what} could not be read when the training set was encoded", str(self.folder), name)
+
+    def _row(self, sequence: Sequence, frame: int) -> int:
+        place = int(np.searchsorted(sequence.stored, frame))
+        if place == len(sequence.stored) or sequence.stored[place] != frame:
+            raise self.missing(sequence.name, frame)
+        return sequence.first + place
+
+    def _floats(self, array: str, row: int) -> Float[Tensor, "_ _ _"]:
+        return torch.from_numpy(np.array(self.arrays[array][row], dtype=np.float32))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Worker processes map the files themselves; a pickled array would hold all of it.
+        return EncodedStore, (self.folder,)
+
+
+class EncodedTraining(TrainingScenes):
+    """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
+
+    Where all frames were to be encoded, an item with a frame (target views included) that could not be read is
+    replaced by the very item that `TrainingScenes` puts in its place. Where only some frames of a sequence were, the
+    nearest of those that are there takes the reference's place (the earlier one of two).
+
+    Args:
+        encoded: where the items come from.
+        store: the training set, whose names and groups tell the order; it is not read.
+        choose: (number of a sequence's frames, random generator) -> views.
+        box_masks: hide parts of the pictures, as `augment` does; None for none.
+        references: items of a sequence in one epoch.
+
+    Raises:
+        CompleteSplatError: box masks, but the store holds features instead of pictures.
+    """
+
+    def __init__(
+        self,
+        encoded: EncodedStore,
+        store: SceneStore,
+        choose: Callable[[int, np.random.Generator], Choice],
+        box_masks: BoxMasks | None,
+        references: int,
+        seed: int,
+    ) -> None:
+        super().__init__(store, choose, lambda scene, rng: scene, references, seed)
+        if box_masks is not None and not encoded.holds_pictures:
+            raise CompleteSplatError(
+                "data.box_masks cannot hide parts of encoded features: use data.encoded=null, or encode pictures"
+            )
+        self.encoded = encoded
+        self.box_masks = box_masks
+
+    def draw(self, name: str, rng: np.random.Generator) -> EncodedScene:
+        """An encoded reference frame of the sequence of this name.
+
+        Raises:
+            DataError: it is not in the store.
+        """
+        sequence = self.encoded.sequences[name]
+        if not sequence.frames:
+            raise self.encoded.missing(name)
+        reference, targets = self.choose(sequence.frames, rng)
+        if self.encoded.origin.frames is not None and sequence.stored:
+            stored = np.array(sequence.stored)
+            reference = int(stored[np.abs(stored - reference).argmin()])
+        elif missing := {reference, *targets}.difference(sequence.stored):
+            raise self.encoded.missing(name, min(missing))
+        scene = self.encoded.scene(name, reference)
+        if self.box_masks is None:
+            return scene
+        boxes_rng = rng.spawn(3)[2]  # the third, as in `augment`
+        height, width = scene.condition.shape[-2:]
+        visible = self.box_masks(height, width, boxes_rng)
+        return replace(scene, condition=scene.condition * visible)

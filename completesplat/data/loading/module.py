@@ -1,0 +1,270 @@
+"""What the data modules of all data sets share: loaders and settings."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from lightning import LightningDataModule
+from torch import Tensor
+
+from completesplat.data.latent_cache.store import EncodedStore, EncodedTraining
+from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
+from completesplat.data.loading.distributed import batch_per_process, processes
+from completesplat.data.loading.loader import EpochSampler, SceneLoader, check_policy
+from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
+from completesplat.data.loading.streaming import StreamedScenes
+from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
+from completesplat.data.packed.manifest import is_prepared, read_manifest, settings_must_match
+from completesplat.data.packed.source import PreparedSource
+from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.validation import at
+from completesplat.errors import CompleteSplatError, DataError
+
+
+def check_settings(targets: int, mask_threshold: float | None, encoded: str | None, changed: bool) -> None:
+    """Refuse them; see `SceneDataModule`.
+
+    Args:
+        encoded: folder of encoded pictures; an empty name is one that is still to be given.
+        changed: whether training pictures are augmented or streamed.
+
+    Raises:
+        CompleteSplatError: one of them is out of its range, or encoded pictures are to be changed.
+    """
+    if targets < 0:
+        raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
+    if mask_threshold is not None and not 0 < mask_threshold <= 1:
+        raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
+    if encoded == "":
+        raise CompleteSplatError("data.encoded is needed: give data.encoded=DIR, which `data latents` wrote")
+    if encoded is not None and changed:
+        asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
+        raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
+
+
+SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
+
+logger = logging.getLogger(__name__)
+
+
+class SceneDataModule(LightningDataModule):
+    """Scenes from the sequences of a data set, as it was published or prepared with `completesplat data prepare`.
+
+    What training draws depends on the seed, the epoch and the item only.
+
+    Args:
+        root: folder of the data set, or of its prepared form.
+        image_size: side of the square pictures.
+        batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
+        targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which has no use
+            for them.
+        evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
+        references_per_sequence: training items of a sequence in one epoch.
+        mask_threshold: masks are cut at this probability; None: they stay soft.
+        color_jitter: settings of `ColorJitter`; None: no augmentation of colours.
+        box_masks: settings of `BoxMasks`; None: the reference pictures are seen completely.
+        mirroring: mirror half of the training scenes horizontally.
+        workers: processes that load data; 0: none.
+        cache: keep decoded pictures in memory.
+        streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
+        encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
+            validation and test read pictures. An empty name is one that is still to be given.
+        on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
+        most_bad: skipping more than this share of an epoch's items is an error.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        image_size: int = 128,
+        batch_size: int = 8,
+        targets: int = 3,
+        evaluation_batch_size: int = 4,
+        references_per_sequence: int = 1,
+        mask_threshold: float | None = None,
+        color_jitter: Mapping[str, float] | None = None,
+        box_masks: Mapping[str, Any] | None = None,
+        mirroring: bool = False,
+        workers: int = 0,
+        cache: bool = False,
+        streaming: bool = False,
+        encoded: str | None = None,
+        on_bad: str = "skip",
+        most_bad: float = 0.1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        check_policy(on_bad)
+        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring or streaming)
+        self.root = Path(root)
+        self.image_size = image_size
+        self.batch_size = batch_size
+        self.targets = targets
+        self.evaluation_batch_size = evaluation_batch_size
+        self.references_per_sequence = references_per_sequence
+        self.mask_threshold = mask_threshold
+        jitter = None if color_jitter is None else ColorJitter(**color_jitter)
+        self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
+        self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
+        self.workers, self.cache, self.streaming = workers, cache, streaming
+        self.encoded = None if encoded is None else Path(encoded)
+        self.policy = on_bad, most_bad
+        self.seed = seed
+        # The same data in the smaller pictures that a tested model sees.
+        self.at_model_size: SceneDataModule | None = None
+        self._sources: dict[str, SequenceSource] = {}
+        self._stores: dict[str, SceneStore] = {}
+
+    @abstractmethod
+    def prepared_settings(self) -> dict[str, Any]:
+        """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
+
+    @abstractmethod
+    def describe(self) -> Mapping[str, str | None]:
+        """For results: "data_set", "crop" of pictures, "protocol_views"; "subset" and "split" where there are lists."""
+
+    @abstractmethod
+    def open(self, split: str) -> Mapping[str, SequenceSource]:
+        """The data set's own files: the sequences of this split, and of others that come with it.
+
+        Raises:
+            DataError: they are missing or unreadable as a whole.
+        """
+
+    @abstractmethod
+    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
+        """Reference and targets of a training scene."""
+
+    @abstractmethod
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """Reference and targets of a scene of "val" or "test".
+
+        Raises:
+            DataError: the sequence has not got the frames that are asked for.
+        """
+
+    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
+        """Of the sequences of a split those that are used."""
+        return source
+
+    def stackable(self, scenes: EvaluationScenes) -> bool:
+        """Whether all evaluation scenes have the same number of targets."""
+        return scenes.stackable()
+
+    def setup(self, stage: str | None = None) -> None:
+        """List the sequences (pictures are read later).
+
+        Raises:
+            DataError: missing or malformed files, no sequences for this stage, or encodings of other data.
+        """
+        for split in SPLITS_OF_STAGE.get(stage or "", ()):
+            self.store(split)
+        if stage == "fit" and self.encoded is not None:
+            self._training_scenes()  # what is wrong with the encodings is told before training starts
+
+    def source(self, split: str) -> SequenceSource:
+        """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
+
+        Raises:
+            DataError: missing or malformed files, prepared with other settings, or broken where that is to be raised.
+        """
+        if split not in self._sources:
+            if is_prepared(self.root):
+                settings_must_match(read_manifest(self.root), self.prepared_settings())
+                self._sources[split] = PreparedSource(self.root, split)
+            else:
+                self._sources |= self.open(split)
+        source = self._sources[split]
+        if source.refused and self.policy[0] == "raise":
+            raise source.refused[0]
+        return source
+
+    def store(self, split: str) -> SceneStore:
+        """The scenes of a split.
+
+        Raises:
+            DataError: as `source`, or it has no sequences.
+        """
+        if split not in self._stores:
+            source = self.source(split)
+            used = self.evaluated(split, source)
+            if not used.names:
+                raise DataError(f"no {split} sequences that can be used", str(self.root))
+            left_out = "".join(f"; {len(them)} left out: {reason}" for reason, them in source.left_out.items())
+            logger.info("%s: %d sequences%s", split, len(source.names), left_out)
+            if source.refused:
+                logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
+            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache)
+        return self._stores[split]
+
+    @cached_property
+    def encoded_store(self) -> EncodedStore:
+        """The encoded pictures of `encoded`, which must be those of this training set.
+
+        Raises:
+            DataError: there are none, or they are damaged, or of other data or made with other settings.
+        """
+        assert self.encoded is not None
+        store = EncodedStore(self.encoded)
+        store.must_belong_to(self.source("train"), self.prepared_settings())
+        return store
+
+    def train_dataloader(self) -> SceneLoader:
+        """Random views of all training sequences, in random order."""
+        scenes = self._training_scenes()
+        accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
+        batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
+        order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
+        if self.streaming:
+            order = StreamedScenes(scenes, self.source("train"), batch_size)
+        items = order if isinstance(order, StreamedScenes) else scenes
+        return SceneLoader(items, batch_size, order, self.workers, *self.policy)
+
+    def _training_scenes(self) -> TrainingScenes:
+        drawing = self.store("train"), self.training_views
+        counting = self.references_per_sequence, self.seed
+        if self.encoded is not None:
+            return EncodedTraining(self.encoded_store, *drawing, self.box_masks, *counting)
+        return TrainingScenes(*drawing, self.augment, *counting)
+
+    def val_dataloader(self) -> SceneLoader:
+        """The validation sequences."""
+        return self._evaluation_loader("val")
+
+    def test_dataloader(self) -> SceneLoader:
+        """The test sequences."""
+        return self._evaluation_loader("test")
+
+    def _evaluation_loader(self, split: str) -> SceneLoader:
+        seen = None if self.at_model_size is None else self.at_model_size.store(split)
+        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split), seen=seen)
+        batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
+        own = scenes.share(batch_size) if split == "test" else scenes
+        return SceneLoader(own, batch_size, None, self.workers, *self.policy)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The data's fingerprint, for checkpoints."""
+        return {"fingerprint": self.source("train").fingerprint()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Warn if the run that is resumed was trained on other data."""
+        if state_dict["fingerprint"] != self.source("train").fingerprint():
+            logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
+
+    def typical_camera(self) -> TypicalCamera:
+        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences.
+
+        Raises:
+            DataError: none of them can be read.
+        """
+        with at(file=self.root):
+            return mean_camera(self.store("train"))
+
+    def mean_image(self) -> Float[Tensor, "3 height width"]:
+        """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
+        return mean_image(self.store("train"), self.image_size)

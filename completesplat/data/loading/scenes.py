@@ -1,0 +1,213 @@
+"""Scenes made of sequences: views in the reference's frame; what cannot be read is passed on, not raised."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from completesplat.data.loading.distributed import processes
+from completesplat.data.loading.view_selection import draws
+from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.errors import DataError
+from completesplat.scene import EncodedScene, SceneBatch, Views
+from completesplat.tensors import stack
+
+# So many other items are tried in the place of one that cannot be read.
+ATTEMPTS = 10
+
+Choice = tuple[int, list[int]]  # reference, targets
+
+
+class Loaded(NamedTuple):
+    """A scene, or a batch of them, and what could not be read on the way."""
+
+    scenes: SceneBatch | EncodedScene | None
+    refused: tuple[DataError, ...]
+
+
+class SceneStore:
+    """Makes scenes of some of a source's sequences.
+
+    Args:
+        names: the sequences, in order.
+        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay
+            probabilities.
+        cache: keep decoded pictures (uint8) in memory, each from its first use on.
+    """
+
+    def __init__(
+        self, source: SequenceSource, names: Sequence[str], mask_threshold: float | None = None, cache: bool = False
+    ) -> None:
+        self.source = source
+        self.names = list(names)
+        self.mask_threshold = mask_threshold
+        self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
+
+    def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
+        """One scene in the reference camera's frame, from the frames of these indices.
+
+        Raises:
+            DataError: a picture that cannot be read.
+        """
+        views = [reference, *targets]
+        pictures = [self._picture(sequence, view) for view in views]
+        images = _shares([picture.image for picture in pictures])
+        everywhere = torch.full_like(pictures[0].image[:1], 255)
+        masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
+        if self.mask_threshold is not None:
+            masks = (masks >= self.mask_threshold).float()
+        cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
+        seen = Views(images, cameras, masks)
+        visible = torch.ones_like(masks[0])
+        frame = torch.tensor(reference)
+        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, frame, sequence.name)
+
+    def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
+        """One picture.
+
+        Raises:
+            DataError: it cannot be read.
+        """
+        return self._picture(sequence, view).image
+
+    def _picture(self, sequence: PosedSequence, view: int) -> Picture:
+        key = sequence.name, view
+        if self._pictures is None:
+            return sequence.read(view)
+        if key not in self._pictures:
+            self._pictures[key] = sequence.read(view)
+        return self._pictures[key]
+
+
+def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
+    # By NumPy: torch would wake its threads for so little, and they would wait on cores that others need.
+    return torch.from_numpy(np.divide([picture.numpy() for picture in pictures], 255, dtype=np.float32))
+
+
+class TrainingScenes(Dataset[Loaded]):
+    """Scenes of random views; a key is (epoch, index), see `EpochSampler`.
+
+    An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
+    only.
+
+    Args:
+        choose: (number of a sequence's frames, random generator) -> views.
+        augment: (scene, random generator) -> scene.
+        references: items of a sequence in one epoch.
+    """
+
+    def __init__(
+        self,
+        store: SceneStore,
+        choose: Callable[[int, np.random.Generator], Choice],
+        augment: Callable[[SceneBatch, np.random.Generator], SceneBatch],
+        references: int,
+        seed: int,
+    ) -> None:
+        self.store = store
+        self.choose = choose
+        self.augment = augment
+        self.references = references
+        self.seed = seed
+
+    def __len__(self) -> int:
+        return len(self.store.names) * self.references
+
+    def __getitem__(self, key: tuple[int, int]) -> Loaded:
+        epoch, index = key
+        rng = draws(self.seed, epoch, index)
+        refused: list[DataError] = []
+        for _ in range(ATTEMPTS):
+            try:
+                return Loaded(self.draw(self.store.names[index // self.references], rng), tuple(refused))
+            except DataError as error:
+                refused.append(error)
+                index = int(rng.integers(len(self)))
+        return Loaded(None, tuple(refused))
+
+    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | EncodedScene:
+        """A scene of random views of the sequence of this name.
+
+        Raises:
+            DataError: the sequence or a picture cannot be read.
+        """
+        return self.make(self.store.source.read(name), rng)
+
+    def make(self, sequence: PosedSequence, rng: np.random.Generator) -> SceneBatch:
+        """A scene of random views of a sequence.
+
+        Raises:
+            DataError: a picture that cannot be read.
+        """
+        scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
+        return self.augment(scene, rng)
+
+    def groups(self) -> list[list[int]]:
+        """Items that are best loaded one after the other."""
+        several = range(self.references)
+        groups = self.store.source.groups(self.store.names)
+        return [[name * self.references + i for name in group for i in several] for group in groups]
+
+
+class EvaluationScenes(Dataset[Loaded]):
+    """Every sequence once.
+
+    Args:
+        choose: sequence -> views. Raises `DataError` where it has not got them.
+        names: the sequences; None: all.
+        seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
+    """
+
+    def __init__(
+        self,
+        store: SceneStore,
+        choose: Callable[[PosedSequence], Choice],
+        names: Sequence[str] | None = None,
+        seen: SceneStore | None = None,
+    ) -> None:
+        self.store = store
+        self.choose = choose
+        self.names = store.names if names is None else names
+        self.seen = seen
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def share(self, batch_size: int) -> "EvaluationScenes":
+        """What this process of several evaluates: whole batches, so that each is made up as in one process alone."""
+        rank, count = processes()
+        starts = range(rank * batch_size, len(self.names), count * batch_size)
+        own = [name for start in starts for name in self.names[start : start + batch_size]]
+        return EvaluationScenes(self.store, self.choose, own, self.seen)
+
+    def __getitem__(self, index: int) -> Loaded:
+        name = self.names[index]
+        try:
+            sequence = self.store.source.read(name)
+            views = self.choose(sequence)
+            scene = self.store.scene(sequence, *views)
+            if self.seen is not None:
+                scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
+            return Loaded(scene, ())
+        except DataError as error:
+            return Loaded(None, (error,))
+
+    def stackable(self) -> bool:
+        """Whether all scenes have the same number of targets, as far as they can be read."""
+        counts = set()
+        for name in self.names:
+            with suppress(DataError):
+                counts.add(len(self.choose(self.store.source.read(name))[1]))
+        return len(counts) <= 1
+
+
+def collate(items: Sequence[Loaded]) -> Loaded:
+    """A batch of the scenes that are there."""
+    scenes = [item.scenes for item in items if item.scenes is not None]
+    return Loaded(stack(scenes) if scenes else None, tuple(error for item in items for error in item.refused))

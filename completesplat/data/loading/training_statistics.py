@@ -1,0 +1,87 @@
+"""Means over the training pictures and cameras, or over an excerpt of them where there are many."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.data.loading.scenes import SceneStore
+from completesplat.data.sequences import PosedSequence
+from completesplat.errors import DataError
+from completesplat.geometry.cameras import Cameras
+
+
+class TypicalCamera(NamedTuple):
+    """Means over the training pictures.
+
+    Attributes:
+        fov_degrees: horizontal field of view.
+        depth_range: near and far, in scene units.
+        up: the direction away from the ground in the camera's frame, a unit vector.
+    """
+
+    fov_degrees: float
+    depth_range: tuple[float, float]
+    up: tuple[float, float, float]
+
+
+def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Tensor, "_ 2"]]) -> TypicalCamera:
+    """Average over all cameras of all sequences, each [view]."""
+    focal = torch.cat([cameras.intrinsics[:, 0, 0] for cameras in sequences])
+    width = sequences[0].image_size[1]
+    near, far = torch.cat(list(depth_ranges)).mean(dim=0).tolist()
+    ups = torch.cat([cameras.world_to_camera[:, :3, :3] @ world_up(cameras) for cameras in sequences])
+    x, y, z = torch.nn.functional.normalize(ups.mean(dim=0), dim=0).tolist()
+    return TypicalCamera(2 * torch.atan(0.5 * width / focal).mean().rad2deg().item(), (near, far), (x, y, z))
+
+
+def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
+    """The up direction of a sequence of hand-held cameras [view], in world coordinates.
+
+    People hold cameras level: the direction to which all horizontal image axes are most nearly perpendicular, on the
+    side of the cameras' own up (after `co3d_normalisation.py` of Splatter Image).
+    """
+    horizontal, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
+    up = torch.linalg.svd(horizontal).Vh[-1]
+    return torch.where(down.mean(dim=0) @ up > 0, -up, up)
+
+
+# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
+SEQUENCES, PICTURES = 400, 8192
+
+
+def mean_camera(store: SceneStore) -> TypicalCamera:
+    """The typical camera of at most 8,192 frames, in the first 400 sequences.
+
+    Raises:
+        DataError: none of them can be read.
+    """
+    chosen = list(excerpts(store))
+    if not chosen:
+        raise DataError("no training sequence can be read")
+    return typical_camera([s.cameras[f] for s, f in chosen], [s.depth_ranges[f] for s, f in chosen])
+
+
+def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
+    """Mean of the pictures of the same frames; black if none can be read."""
+    total, count = torch.zeros(3, size, size, dtype=torch.float64), 0
+    for sequence, frames in excerpts(store):
+        for frame in frames:
+            with suppress(DataError):
+                total += store.image(sequence, frame)
+                count += 1
+    return (total / (255 * max(count, 1))).float()
+
+
+def excerpts(store: SceneStore) -> Iterator[tuple[PosedSequence, list[int]]]:
+    """The first sequences that can be read, each with evenly spaced frames."""
+    names = store.names[:SEQUENCES]
+    most = PICTURES // len(names)
+    for name in names:
+        with suppress(DataError):
+            sequence = store.source.read(name)
+            count = len(sequence.frames)
+            yield sequence, sorted({i * count // most for i in range(most)})

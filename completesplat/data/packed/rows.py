@@ -1,0 +1,227 @@
+"""One sequence as one row of an Arrow table, its pictures as bytes, and back."""
+
+import io
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import torch
+from jaxtyping import UInt8
+from PIL import Image
+from torch import Tensor
+
+from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
+from completesplat.geometry.cameras import Cameras
+
+# What Pillow is told for each codec. BMP is not compressed: more than twice the bytes of PNG, decoded in a ninth of the
+# time.
+CODECS: dict[str, dict[str, Any]] = {
+    "png": {"format": "PNG"},
+    "jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
+    "bmp": {"format": "BMP"},
+}
+
+
+def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
+    """A file of three channels (colour) or one (grey); PNG and BMP are without loss."""
+    # Here and below NumPy reorders the channels: PyTorch would wake its threads, which costs more than the picture.
+    channels_last = np.ascontiguousarray(picture.numpy().transpose(1, 2, 0))
+    image = Image.fromarray(channels_last.squeeze(-1) if len(picture) == 1 else channels_last)
+    content = io.BytesIO()
+    image.save(content, **CODECS[codec])
+    return content.getvalue()
+
+
+def decode(content: bytes, channels: int, size: int) -> UInt8[Tensor, "channel size size"]:
+    """The inverse of `encode`.
+
+    Raises:
+        BadPicture: damaged, or with other channels or another size than expected.
+    """
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
+            # The header is looked at before the pixels are, so that no bytes make a huge picture.
+            wrong = image.size != (size, size) or len(image.getbands()) != channels
+            pixels = None if wrong else np.array(image)
+    # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+    except Exception as error:
+        raise BadPicture(f"cannot be decoded: {error}") from error
+    if pixels is None or pixels.dtype != np.uint8:
+        raise BadPicture(f"is no picture of {size} x {size} pixels with {channels} channels of 8 bits")
+    return torch.from_numpy(np.ascontiguousarray(pixels.reshape(size, size, channels).transpose(2, 0, 1)))
+
+
+MATRIX, INTRINSICS, RANGE = 16, 9, 2
+
+
+@cache
+def features() -> Any:
+    """The columns (`datasets.Features`). Numbers of all frames lie flat, one frame after the other, rows first.
+
+    `picture_checksums` are CRC-32 of a frame's image and mask, `checksum` of all the other columns; Pillow does not
+    look at those within PNG, and JPEG has none. A mask may be null. Large types, as 2 GB are soon reached.
+    """
+    # Takes a second and 70 MB, which nobody should pay who reads raw data.
+    from datasets import Features, LargeList, Value
+
+    return Features(
+        {
+            "name": Value("string"),
+            "size": Value("int64"),
+            "frames": LargeList(Value("int64")),
+            "world_to_camera": LargeList(Value("float64")),
+            "intrinsics": LargeList(Value("float64")),
+            "depth_ranges": LargeList(Value("float32")),
+            "images": LargeList(Value("large_binary")),
+            "masks": LargeList(Value("large_binary")),
+            "picture_checksums": LargeList(Value("int64")),
+            "checksum": Value("int64"),
+        }
+    )
+
+
+@dataclass(frozen=True)
+class EncodedPicture:
+    """The files of an image and of its mask, if it has one."""
+
+    image: bytes
+    mask: bytes | None
+
+    def checksum(self) -> int:
+        """CRC-32 of both."""
+        return zlib.crc32(self.mask or b"", zlib.crc32(self.image))
+
+
+def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPicture:
+    """A frame's picture as files; the mask is without loss whatever the codec.
+
+    Raises:
+        DataError: it cannot be read, or has another size than its camera.
+    """
+    image, mask = sequence.read(index)
+    for part in (image, mask):
+        if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
+            raise BadPicture(f"has {part.shape[1]} x {part.shape[2]} pixels, its camera {sequence.cameras.image_size}")
+    without_loss = "png" if codec == "jpeg" else codec
+    return EncodedPicture(encode(image, codec), None if mask is None else encode(mask, without_loss))
+
+
+def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[EncodedPicture]) -> pa.Table:
+    """A table of one row with some frames of a sequence.
+
+    Args:
+        kept: indices of the frames.
+        pictures: theirs.
+    """
+    indices, cameras = list(kept), sequence.cameras
+    numbers = {
+        "frames": np.array([sequence.frames[index] for index in indices], dtype=np.int64),
+        "world_to_camera": cameras.world_to_camera[indices].double().numpy().ravel(),
+        "intrinsics": cameras.intrinsics[indices].double().numpy().ravel(),
+        "depth_ranges": sequence.depth_ranges[indices].numpy().ravel(),
+    }
+    size = cameras.image_size[0]
+    row = {
+        "name": sequence.name,
+        "size": size,
+        **numbers,
+        "images": [picture.image for picture in pictures],
+        "masks": [picture.mask for picture in pictures],
+        "picture_checksums": [picture.checksum() for picture in pictures],
+        "checksum": _checksum(sequence.name, size, numbers),
+    }
+    return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=features().arrow_schema)
+
+
+def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
+    """The sequence of a table with one row; pictures are decoded when they are asked for.
+
+    Args:
+        file: where the row lies, for messages.
+        name: of the sequence that it should be.
+
+    Raises:
+        DataError: damaged, another sequence, columns of different lengths, or numbers that are not finite.
+    """
+    with at(file=file, sequence=name):
+        try:
+            row.validate(full=True)  # Offsets within bounds: without it damage could crash the process.
+        except pa.ArrowInvalid as error:
+            raise UnreadableFile(f"damaged ({error})") from None
+        found, size, checksum = (row.column(column)[0].as_py() for column in ("name", "size", "checksum"))
+        if found != name:
+            raise BadAnnotation(f"holds sequence {found!r} in its place")
+        count = len(_values(row, "frames"))
+        numbers = {
+            "frames": _numbers(row, "frames", count, 1),
+            "world_to_camera": _numbers(row, "world_to_camera", count, MATRIX),
+            "intrinsics": _numbers(row, "intrinsics", count, INTRINSICS),
+            "depth_ranges": _numbers(row, "depth_ranges", count, RANGE),
+        }
+        if not isinstance(size, int) or size < 1 or checksum != _checksum(name, size, numbers):
+            raise ChangedFile("its cameras are no longer what was written")
+        frames = tuple(numbers["frames"].tolist())
+        world_to_camera = torch.from_numpy(numbers["world_to_camera"]).view(count, 4, 4)
+        cameras = Cameras(world_to_camera, torch.from_numpy(numbers["intrinsics"]).view(count, 3, 3), (size, size))
+        depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
+        checksums = _numbers(row, "picture_checksums", count, 1)
+        images, masks = _files(row, "images", count), _files(row, "masks", count)
+        return PosedSequence(
+            name, frames, cameras, depth_ranges, _Pictures(images, masks, checksums, size, (file, name), frames)
+        )
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Decodes one frame's picture; the others' bytes are not touched."""
+
+    images: pa.LargeBinaryArray
+    masks: pa.LargeBinaryArray
+    checksums: np.ndarray
+    size: int
+    place: tuple[str, str]
+    frames: tuple[int, ...]
+
+    def __call__(self, index: int) -> Picture:
+        with at(*self.place, frame=self.frames[index]):
+            encoded = EncodedPicture(self.images[index].as_py(), self.masks[index].as_py())
+            if encoded.image is None or encoded.checksum() != self.checksums[index]:
+                raise BadPicture("is no longer what was written")
+            mask = None if encoded.mask is None else decode(encoded.mask, 1, self.size)
+            return Picture(decode(encoded.image, 3, self.size), mask)
+
+
+def _values(row: pa.Table, column: str) -> pa.Array:
+    values = row.column(column)[0].values
+    if values is None:
+        raise BadAnnotation(f"no {column}")
+    return values
+
+
+def _numbers(row: pa.Table, column: str, count: int, width: int) -> np.ndarray:
+    values = _values(row, column)
+    if len(values) != count * width or values.null_count:
+        raise BadAnnotation(f"{column} must be {count} x {width} numbers, not {len(values)}")
+    numbers = values.to_numpy().copy()  # The map cannot be written to.
+    if not np.isfinite(numbers).all():
+        raise BadAnnotation(f"{column} is not finite")
+    return numbers
+
+
+def _files(row: pa.Table, column: str, count: int) -> pa.LargeBinaryArray:
+    values = _values(row, column)
+    if len(values) != count:
+        raise BadAnnotation(f"{column} must be {count} pictures, not {len(values)}")
+    return values
+
+
+def _checksum(name: str, size: int, numbers: dict[str, np.ndarray]) -> int:
+    value = zlib.crc32(f"{name} {size}".encode())
+    for array in numbers.values():
+        value = zlib.crc32(array.tobytes(), value)
+    return value

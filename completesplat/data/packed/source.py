@@ -1,0 +1,114 @@
+"""Reading a prepared store: opened by its manifest, memory-mapped shard by shard when a sequence is asked for."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from completesplat.data.packed.manifest import Shard, read_manifest
+from completesplat.data.packed.rows import features, from_row
+from completesplat.data.sequences import PosedSequence
+from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
+from completesplat.errors import DataError
+
+
+class PreparedSource:
+    """One split of a prepared store, as a `SequenceSource`. What was refused while it was made is in its manifest.
+
+    Raises:
+        DataError: no such split, a malformed manifest, or a shard that is missing or of another size.
+    """
+
+    def __init__(self, root: Path, split: str) -> None:
+        manifest = read_manifest(root)
+        if split not in manifest.splits:
+            there = ", ".join(manifest.splits) or "none"
+            raise DataError(f"no split {split} in this prepared store; there are: {there}", str(root))
+        entry = manifest.splits[split]
+        self.manifest = manifest
+        self.shards = entry.shards
+        self.names = list(entry.names)
+        self.refused: list[DataError] = []
+        self.left_out: dict[str, list[str]] = {}
+        self.listed = entry.listed
+        self._fingerprint = entry.fingerprint
+        self._places = {
+            name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
+        }
+        self._opened: dict[int, Any] = {}
+        for shard in self.shards:
+            check_size(root, shard)
+
+    def read(self, name: str) -> PosedSequence:
+        """One sequence: its cameras as they were prepared, its pictures decoded when asked for.
+
+        Raises:
+            DataError: its shard is damaged or does not hold it.
+        """
+        number, row = self._places[name]
+        shard = self.shards[number]
+        path = self.manifest.root / shard.file
+        if number not in self._opened:
+            with at(sequence=name):
+                self._opened[number] = open_shard(path, shard)
+        return from_row(self._opened[number][row], str(path), name)
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """One group: any order is as fast as any other."""
+        return [list(range(len(names)))]
+
+    def fingerprint(self) -> str:
+        """That of the source which the store was made from."""
+        return self._fingerprint
+
+    def verify(self) -> list[ChangedFile]:
+        """The shards of this split that are no longer those whose checksums are in the manifest; reads all of them."""
+        changed = []
+        for shard in self.shards:
+            with require_file(self.manifest.root / shard.file).open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+            if found != shard.sha256:
+                advice = "remove it and prepare again into the same folder"
+                changed.append(ChangedFile(f"its checksum is no longer that of the manifest: {advice}", file.name))
+        return changed
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Worker processes open the files themselves and share their pages.
+        return {**self.__dict__, "_opened": {}}
+
+
+def check_size(root: Path, shard: Shard) -> None:
+    """Refuse a shard that is not there as it was written, as far as a glance shows.
+
+    Raises:
+        DataError: missing, elsewhere, or of another size.
+    """
+    path = require_file(inside(root, shard.file))
+    size = path.stat().st_size
+    if size != shard.bytes:
+        raise ChangedFile(
+            f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder", str(path)
+        )
+
+
+def open_shard(path: Path, shard: Shard) -> Any:
+    """A memory-mapped `datasets.Dataset` that gives Arrow tables, one row for each sequence.
+
+    Raises:
+        DataError: missing, damaged, or with other columns or rows than expected.
+    """
+    from datasets import Dataset  # See `features`.
+
+    with at(file=path):
+        try:
+            dataset = Dataset.from_file(str(require_file(path)))
+        # A damaged header may fail in the library's own reading of it too: KeyError, TypeError, JSON errors, ...
+        except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UnreadableFile(f"not a readable Arrow file ({error})") from None
+        if dataset.features != features() or dataset.data.schema.types != features().arrow_schema.types:
+            raise UnreadableFile("its columns are not those of a prepared store")
+        if len(dataset) != len(shard.sequences):
+            raise BadAnnotation(f"{len(dataset)} sequences, the manifest says {len(shard.sequences)}")
+        return dataset.with_format("arrow")

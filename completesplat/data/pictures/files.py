@@ -1,0 +1,227 @@
+"""Image files that nobody has looked at: complete, upright and 8 bits deep, or refused."""
+
+import io
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageFile
+from torch import Tensor
+
+from completesplat.data.pictures.exif import ORIENTATION, TRANSPOSITIONS, read_exif
+from completesplat.data.validation import BadPicture, require_file
+from completesplat.errors import ImageError
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+MOST_PIXELS = 50_000_000
+MOST_BYTES = 2**28
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
+SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
+TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
+QUARTER_TURNS = (5, 6, 7, 8)
+TRANSPARENT = "has transparent pixels; lay it over a background first"
+SMALLEST_NORMAL = 2.0**-14  # of float16
+LARGEST_SCALE = 2.0**112  # times the largest float16 it is still a float32
+
+
+def decode(
+    source: Path | bytes,
+    file: str,
+    mode: Literal["RGB", "L"],
+    image_size: tuple[int, int] | None = None,
+    most_pixels: int = MOST_PIXELS,
+    most_bytes: int = MOST_BYTES,
+) -> Image.Image:
+    """One picture of a data set, of 8 bits, turned upright as its EXIF orientation says.
+
+    Grey of 16 bits is scaled to 8. Pixels that are not opaque are refused: what lies behind them is for the maker of
+    the data set to decide, and metrics depend on it. So is colour where `mode` is "L" (a mask): its brightness would
+    be no probability. Colour profiles are ignored, as the loaders behind all published numbers on these data sets do.
+    Of an MPO (a JPEG with previews behind it) the first picture is taken; other files of several frames are refused.
+    PNG has checksums, which are checked; flipped bits in a JPEG go unnoticed.
+
+    Args:
+        source: the file, or its content.
+        file: what refusals name.
+        image_size: (height, width) that the upright picture must have, if that is known.
+        most_pixels: checked before anything is decoded.
+        most_bytes: checked before a file is read.
+
+    Raises:
+        MissingFile: no such file.
+        BadPicture: too large, damaged, in another format than JPEG, PNG, WebP, TIFF and BMP, of another size than
+            annotated, or with pixels that have no plain meaning in this mode.
+    """
+    if isinstance(source, Path):
+        require_file(source)
+    try:
+        with damage_refused(FORMATS, most_pixels):
+            picture, exif = _load(_content(source, most_bytes), FORMATS, most_pixels)
+            orientation = exif.get(ORIENTATION)
+            image = upright(picture, orientation)
+            if image_size is not None:
+                _check_annotated_size(image, image_size, orientation)
+            return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
+    except ImageError as error:
+        raise BadPicture(str(error), file) from error.__cause__
+
+
+def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
+    """A depth map of CO3D: 16-bit grey PNG whose bits are float16, times the frame's `scale_adjustment`.
+
+    0 stands for "unknown", also where the file is not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
+
+    Raises:
+        MissingFile: no such file.
+        BadPicture: no readable 16-bit PNG, a factor that is not positive and finite, negative depths, no finite depth
+            at all, or nothing but subnormal numbers, which is what integer depths below 1024 look like.
+    """
+    if not 0 < scale_adjustment < LARGEST_SCALE:
+        raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
+    require_file(path)
+    try:
+        with damage_refused(("PNG",), MOST_PIXELS):
+            picture, _ = _load(_content(path, MOST_BYTES), ("PNG",), MOST_PIXELS)
+            if picture.mode not in SIXTEEN_BIT_MODES:
+                raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
+            bits = np.asarray(picture).astype(np.uint16)
+    except ImageError as error:
+        raise BadPicture(str(error), str(path)) from error.__cause__
+    depth = bits.view(np.float16).astype(np.float32)
+    finite = np.isfinite(depth)
+    if not finite.any():
+        raise BadPicture("no finite depth in it", str(path))
+    depth[~finite] = 0
+    if depth.min() < 0:
+        raise BadPicture("negative depths; its bits are no float16", str(path))
+    if 0 < depth.max() < SMALLEST_NORMAL:
+        raise BadPicture("its values are integers, where the bits of float16 are expected", str(path))
+    return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
+
+
+@contextmanager
+def damage_refused(formats: tuple[str, ...], most_pixels: int) -> Iterator[None]:
+    """Whatever Pillow raises on a bad file becomes an `ImageError`; its warnings are silenced."""
+    # Pillow only warns of images between 89 and 179 million pixels; the limit here is lower and an error.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        except ImageError:
+            raise
+        except Image.UnidentifiedImageError:
+            raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
+        except Image.DecompressionBombError:
+            raise ImageError(f"more than {most_pixels:,} pixels") from None
+        # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ImageError(f"cannot be decoded: {reason}") from error
+
+
+def check_pixels(picture: Image.Image, most_pixels: int) -> None:
+    """Refuse a picture of too many pixels, by its header.
+
+    Raises:
+        ImageError: it has more than `most_pixels`.
+    """
+    width, height = picture.size
+    if width * height > most_pixels:
+        raise ImageError(f"{width} x {height} are more than {most_pixels:,} pixels")
+
+
+def upright(picture: Image.Image, orientation: object) -> Image.Image:
+    """The picture turned and mirrored as EXIF's orientation says; values without a meaning change nothing."""
+    transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
+    return picture if transposition is None else picture.transpose(transposition)
+
+
+def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
+    """Grey values of more than 8 bits as float32 in [0, 1]. Pillow's own conversion would clip them at 255.
+
+    Args:
+        tiff_tags: of the opened file, as pictures derived from it have none; empty for other formats.
+
+    Raises:
+        ImageError: values outside the range from black to white.
+    """
+    bits = tiff_tags.get(TIFF_BITS, (16,))
+    values = np.asarray(picture).astype(np.float64)
+    if picture.mode != "F":
+        # Pillow gives 12-bit TIFF values as they are; everything else of these modes uses 16 bits.
+        values = values / (4095 if bits == (12,) else 65535)
+    # False for NaN too.
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ImageError(f"grey values of mode {picture.mode} outside the range from black to white, or not finite")
+    if tiff_tags.get(TIFF_PHOTOMETRIC) == 0:
+        values = 1 - values  # "white is zero", which Pillow undoes for 8 bits only
+    if isinstance(picture.info.get("transparency"), int):
+        values[np.asarray(picture) == picture.info["transparency"]] = 1
+    return values.astype(np.float32)
+
+
+def _content(source: Path | bytes, most_bytes: int) -> bytes:
+    if isinstance(source, Path):
+        if not source.is_file():
+            raise ImageError("no such file")
+        with source.open("rb") as file:
+            size, content = source.stat().st_size, b""
+            if size <= most_bytes:
+                content = file.read(most_bytes + 1)
+    else:
+        size, content = len(source), source
+    if max(size, len(content)) > most_bytes:
+        raise ImageError(f"more than {most_bytes:,} bytes")
+    if not content:
+        raise ImageError("the file is empty")
+    return content
+
+
+def _load(content: bytes, formats: tuple[str, ...], most_pixels: int) -> tuple[Image.Image, dict[int, Any]]:
+    """The picture, decoded completely, and its EXIF record."""
+    if ImageFile.LOAD_TRUNCATED_IMAGES:
+        raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
+    with Image.open(io.BytesIO(content), formats=formats) as picture:
+        check_pixels(picture, most_pixels)
+        frames = getattr(picture, "n_frames", 1)
+        if frames > 1 and picture.format != "MPO":
+            raise ImageError(f"has {frames} frames; one picture is expected")
+        picture.load()
+        exif = read_exif(picture)
+    if picture.format == "PNG":
+        with Image.open(io.BytesIO(content), formats=formats) as again:
+            again.verify()  # All checksums; decoding leaves out those of the pixels.
+    return picture, exif
+
+
+def _check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object) -> None:
+    if image.size == annotated[::-1]:
+        return
+    actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
+    if orientation in QUARTER_TURNS and image.size == annotated:
+        actual += f": its size before it is turned as its EXIF orientation {orientation} says; save it upright"
+    raise ImageError(actual)
+
+
+def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, Any], mode: Literal["RGB", "L"]) -> Image.Image:
+    if image.mode in SIXTEEN_BIT_MODES:
+        if (np.asarray(image) == image.info.get("transparency")).any():
+            raise ImageError(TRANSPARENT)
+        image = Image.fromarray(np.rint(255 * deep_grey(image, tiff_tags)).astype(np.uint8))
+    if image.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {image.mode} is not supported")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        if image.getchannel("A").getextrema() != (255, 255):
+            raise ImageError(TRANSPARENT)
+    if mode == "L" and image.mode not in ("1", "L"):
+        red, green, blue = image.convert("RGB").split()
+        if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():
+            raise ImageError("has colours; a mask is grey")
+        return red
+    return image.convert(mode)

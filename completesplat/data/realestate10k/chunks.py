@@ -1,0 +1,153 @@
+"""RealEstate10K in pixelSplat's chunks: `<split>/NNNNNN.torch` and `<split>/index.json` with each clip's file.
+
+A chunk is a list of clips as dictionaries: key, url, timestamps int64 [view], cameras float32 [view 18], images (a list
+of JPEG files as uint8 tensors) (`real_estate_10k_tools`, `src/convert.py`). Chunks are read without running code.
+"""
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from completesplat.data.pictures.crop import Square, cut_square
+from completesplat.data.pictures.files import decode
+from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
+from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
+from completesplat.errors import DataError
+
+CHUNKS_IN_MEMORY = 2
+
+Chunk = dict[str, dict[str, Any]]
+
+
+class ChunkedClips:
+    """The clips of one folder whose chunk is there; at most two chunks (of about 100 MB) are in memory.
+
+    Attributes:
+        keys: names of the clips, in the order of their files.
+        missing: the clips of chunks that are not there.
+        refused: entries of the index that lead elsewhere.
+
+    Raises:
+        DataError: the index is missing or no table.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        path = folder / "index.json"
+        index = read_json(path)
+        if not isinstance(index, dict) or not all(isinstance(name, str) for name in index.values()):
+            raise BadAnnotation("not a table of keys and files", str(path))
+        self.refused: list[DataError] = []
+        paths: dict[str, Path] = {}
+        for key, name in index.items():
+            with refused_to(self.refused.append), at(path, key):
+                paths[key] = inside(folder, name)
+        there = {path for path in set(paths.values()) if path.is_file()}
+        self.folder = folder
+        self._files = {key: path for key, path in paths.items() if path in there}
+        self.keys = sorted(self._files, key=lambda key: (self._files[key], key))
+        self.missing = sorted(paths.keys() - self._files.keys())
+        self._loaded: dict[Path, Chunk] = {}
+
+    def chunks(self, keys: Sequence[str]) -> list[list[int]]:
+        """Numbers of the clips that lie in one file, for all files."""
+        members: dict[Path, list[int]] = {}
+        for number, key in enumerate(keys):
+            members.setdefault(self._files[key], []).append(number)
+        return list(members.values())
+
+    def clip(self, key: str) -> Clip:
+        """A clip, from the chunk in memory or on disk.
+
+        Raises:
+            DataError: the chunk cannot be read, does not hold the clip, or holds a malformed one.
+        """
+        path = self._files[key]
+        with at(path, key):
+            chunk = self._chunk(path)
+            if key not in chunk:
+                raise BadAnnotation("the chunk does not hold this clip, which index.json says it does")
+            return _clip_from_entry(path, key, chunk[key])
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the index and of the chunks' sizes."""
+        sizes = sorted((path.name, path.stat().st_size) for path in set(self._files.values()))
+        index = {key: path.name for key, path in sorted(self._files.items())}
+        return hashlib.sha256(json.dumps([index, sizes]).encode()).hexdigest()
+
+    def _chunk(self, path: Path) -> Chunk:
+        chunk = self._loaded.pop(path, None)
+        if chunk is None:
+            # The least recently used one goes before the next one comes, so that there are never three.
+            while len(self._loaded) >= CHUNKS_IN_MEMORY:
+                del self._loaded[next(iter(self._loaded))]
+            chunk = read_chunk(path)
+        self._loaded[path] = chunk
+        return chunk
+
+
+def read_chunk(path: Path) -> Chunk:
+    """The clips of a file by key, as they are stored.
+
+    Raises:
+        MissingFile: no such file.
+        UnreadableFile: no chunk, one that is damaged or would run code, or one that is much larger than its file.
+        BadAnnotation: not a list of clips, or clips with the same key.
+    """
+    require_file(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(record.file_size for record in archive.infolist())
+            # torch.save compresses nothing, so a chunk that says it is larger than its file is made to fill the memory.
+            # PyTorch does not look at the checksums.
+            whole = size <= path.stat().st_size and archive.testzip() is None
+        content = torch.load(path, map_location="cpu", weights_only=True) if whole else None
+    except Exception as error:  # the unpickler's refusals have no common class
+        raise UnreadableFile(f"not a chunk that can be read safely ({type(error).__name__})", str(path)) from None
+    if not whole:
+        raise UnreadableFile("damaged, or larger than its file", str(path))
+    if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
+        raise BadAnnotation("not a list of clips with keys", str(path))
+    chunk = {entry["key"]: entry for entry in content}
+    if len(chunk) < len(content):
+        raise BadAnnotation("several clips with the same key", str(path))
+    return chunk
+
+
+def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
+    images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
+    if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
+        raise BadAnnotation("images are not a list of JPEG files (uint8)")
+    if not _is_plain(rows) or not rows.is_floating_point() or rows.shape[1:] != (CAMERA_NUMBERS,):
+        raise BadAnnotation(f"cameras are not {CAMERA_NUMBERS} columns of floats")
+    if not _is_plain(times) or times.dtype != torch.int64 or times.ndim != 1:
+        raise BadAnnotation("timestamps are not int64")
+    if not len(images) == len(rows) == len(times):
+        raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
+    with at(frame=0):
+        size = picture_size(images[0].numpy().tobytes(), str(path)) if images else (1, 1)
+    timestamps = tuple(times.tolist())
+    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), partial(_read, images, size, str(path)))
+
+
+def _is_bytes(image: Any) -> bool:
+    return _is_plain(image) and image.dtype == torch.uint8 and image.ndim == 1 and image.is_contiguous()
+
+
+def _is_plain(value: Any) -> TypeGuard[Tensor]:
+    """A tensor with numbers in memory, which is not part of a graph."""
+    strided = isinstance(value, Tensor) and value.layout == torch.strided
+    return strided and value.device.type == "cpu" and not value.requires_grad
+
+
+def _read(
+    images: list[Tensor], image_size: tuple[int, int], file: str, frame: int, square: Square, size: int
+) -> UInt8[Tensor, "3 size size"]:
+    return cut_square(decode(images[frame].numpy().tobytes(), file, "RGB", image_size), square, size)

@@ -1,0 +1,209 @@
+"""One clip of RealEstate10K, whichever form it is stored in; clips as texts beside frames."""
+
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from completesplat.data.pictures.crop import Square, read_square
+from completesplat.data.pictures.files import MOST_PIXELS, check_pixels, damage_refused
+from completesplat.data.validation import (
+    ROTATION_TOLERANCE,
+    BadAnnotation,
+    BadCamera,
+    BadPicture,
+    MissingFile,
+    TooFewFrames,
+    UnreadableFile,
+    at,
+    require_file,
+)
+from completesplat.errors import DataError, ImageError
+from completesplat.geometry.cameras import Cameras
+
+CAMERA_NUMBERS = 18
+FORMATS = ("JPEG", "PNG")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """The frames of a clip, in order.
+
+    Attributes:
+        source: the file that holds the cameras.
+        timestamps: microseconds of the video.
+        cameras: [view], float64, in pixels of the stored pictures and in the clip's own units of length.
+        read: (frame, square, size) -> the square part of that frame's picture, resized to `size`.
+    """
+
+    key: str
+    source: Path
+    timestamps: tuple[int, ...]
+    cameras: Cameras
+    read: Callable[[int, Square, int], UInt8[Tensor, "3 size size"]]
+
+
+def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int]) -> Cameras:
+    """Cameras [view] (float64) for pictures of (height, width), from rows as they are stored.
+
+    Raises:
+        TooFewFrames: fewer than two.
+        BadAnnotation: timestamps that repeat, or numbers that are not finite.
+        BadCamera: no positive focal length, lens distortion, or a pose that is no rotation and translation.
+    """
+    if len(rows) < 2:
+        raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
+    count = Counter(timestamps)
+    repeated = [f for f, time in enumerate(timestamps) if count[time] > 1]
+    _refuse(repeated, BadAnnotation, "another frame has its timestamp")
+    rows = rows.double()
+    rotation = rows[:, 6:].unflatten(1, (3, 4))[:, :, :3]
+    deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
+    rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
+    _refuse(_frames(~rows.isfinite().all(dim=1)), BadAnnotation, "camera with numbers that are not finite")
+    _refuse(_frames((rows[:, :2] <= 0).any(dim=1)), BadCamera, "focal length is not positive")
+    _refuse(_frames((rows[:, 4:6] != 0).any(dim=1)), BadCamera, "lens distortion is not supported")
+    _refuse(_frames(~rigid), BadCamera, "pose is not a rotation and translation")
+    height, width = image_size
+    intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1] = rows[:, 0] * width, rows[:, 1] * height
+    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = rows[:, 2] * width, rows[:, 3] * height
+    pose[:, :3] = rows[:, 6:].unflatten(1, (3, 4))
+    return Cameras(pose, intrinsics, image_size)
+
+
+def _frames(bad: Tensor) -> list[int]:
+    return bad.nonzero().flatten().tolist()
+
+
+def _refuse(frames: list[int], kind: type[BadAnnotation | BadCamera], reason: str) -> None:
+    if frames:
+        raise kind(reason, frame=frames[0])
+
+
+def picture_size(source: Path | bytes, file: str) -> tuple[int, int]:
+    """(height, width) of an image file, from its header.
+
+    Args:
+        source: the file, or its content.
+        file: what refusals name.
+
+    Raises:
+        MissingFile: no such file.
+        BadPicture: no JPEG or PNG image, or one of more than 50 million pixels.
+    """
+    opened = BytesIO(source) if isinstance(source, bytes) else require_file(source)
+    try:
+        with damage_refused(FORMATS, MOST_PIXELS), Image.open(opened, formats=FORMATS) as image:
+            check_pixels(image, MOST_PIXELS)
+            return image.height, image.width
+    except ImageError as error:
+        raise BadPicture(str(error), file) from None
+
+
+PICTURES = (".png", ".jpg")
+MOST_BYTES = 2**26  # a frame needs some 300
+
+
+class TextClips:
+    """The clips of one folder whose frames are there.
+
+    Attributes:
+        keys: names of the clips, sorted.
+        missing: the clips without a folder of frames.
+        refused: nothing, as clips are looked at when they are read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        with os.scandir(folder) as entries:
+            folders = {entry.name: _is_folder(entry) for entry in entries}
+        texts = sorted(name.removesuffix(".txt") for name in folders if name.endswith(".txt"))
+        self.keys = [key for key in texts if folders.get(key)]
+        self.missing = [key for key in texts if not folders.get(key)]
+        self.refused: list[DataError] = []
+
+    def chunks(self, keys: Sequence[str]) -> list[list[int]]:
+        """Numbers of the clips that are best read together: clips are files of their own, so any will do."""
+        return [list(range(len(keys)))]
+
+    def clip(self, key: str) -> Clip:
+        """Read a clip's text and list its frames.
+
+        Raises:
+            DataError: it is malformed, or a frame is missing.
+        """
+        path = self.folder / f"{key}.txt"
+        with at(path, key):
+            timestamps, rows = _read_text(path)
+            pictures = _pictures(self.folder / key)
+            for frame, time in enumerate(timestamps):
+                if time not in pictures:
+                    raise MissingFile(
+                        "no picture with this timestamp", str(self.folder / key / f"{time}.jpg"), key, frame
+                    )
+            paths = [pictures[time] for time in timestamps]
+            with at(frame=0):
+                size = picture_size(paths[0], str(paths[0])) if paths else (1, 1)
+            numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
+            return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
+
+    def fingerprint(self) -> str:
+        """SHA-256 of the texts' names and sizes (there are tens of thousands)."""
+        texts = {key: self.folder / f"{key}.txt" for key in self.keys}
+        sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts.items()]
+        return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a ring of links
+        return False
+
+
+def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
+    """Timestamps and camera rows."""
+    timestamps, rows = [], []
+    try:
+        with require_file(path).open("rb") as file:
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise UnreadableFile(f"more than {MOST_BYTES:,} bytes")
+        lines = content.decode("utf-8").splitlines()[1:]
+    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadableFile(f"not a text file ({type(error).__name__})") from None
+    for frame, columns in enumerate(line.split() for line in lines if line.strip()):
+        with at(frame=frame):
+            if len(columns) != 1 + CAMERA_NUMBERS:
+                raise BadAnnotation(f"{len(columns)} columns instead of {1 + CAMERA_NUMBERS}")
+            try:
+                timestamps.append(int(columns[0]))
+                rows.append([float(column) for column in columns[1:]])
+            except ValueError as error:
+                raise BadAnnotation(str(error)) from None
+    return tuple(timestamps), rows
+
+
+def _pictures(folder: Path) -> dict[int, Path]:
+    """Files by timestamp, JPEG before PNG."""
+    with os.scandir(folder) as entries:
+        paths = [Path(entry.path) for entry in entries]
+    ordered = sorted((path for path in paths if path.suffix in PICTURES), key=lambda path: PICTURES.index(path.suffix))
+    return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
+
+
+def _read(
+    paths: list[Path], image_size: tuple[int, int], frame: int, square: Square, size: int
+) -> UInt8[Tensor, "3 size size"]:
+    return read_square(paths[frame], image_size, square, size, "RGB")

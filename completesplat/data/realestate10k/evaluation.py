@@ -1,0 +1,210 @@
+"""Which clips of RealEstate10K are tested, and on which views: the lists that published works come with."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from completesplat.data.loading.scenes import Choice
+from completesplat.data.sequences import PosedSequence, SequenceSource
+from completesplat.data.validation import BadAnnotation, UnreadableFile, at, read_json, require_file
+
+CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
+FORMS = {frozenset((CONTEXT, TARGET)): "pixelSplat", frozenset((CONTEXT, TARGET, SCORED)): "MVSplat360"}
+LINE = "KEY source target target target"
+NAMED = 5
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class EvaluationIndex:
+    """A list of test views.
+
+    Attributes:
+        form: the work whose format it has.
+        views: reference and targets, as places in the clip's list of frames, of every test of a clip; a clip that the
+            file leaves out by name has no tests.
+    """
+
+    form: str
+    views: dict[str, list[Choice]]
+
+
+class ChosenClips(NamedTuple):
+    """What is tested.
+
+    Attributes:
+        clips: the clip of each test by the test's name, which is the clip's, or `KEY#1`, `KEY#2` ... where a clip has
+            several; in the order of the data.
+        views: reference and targets by name, where an index gives them.
+        left_out: clips that are not tested, by reason.
+    """
+
+    clips: dict[str, str]
+    views: dict[str, Choice] | None
+    left_out: dict[str, list[str]]
+
+    @property
+    def listed(self) -> int:
+        """How many tests there would be if all clips of the lists were in the data."""
+        absent = (keys for reason, keys in self.left_out.items() if reason.endswith("not in the data"))
+        return len(self.clips) + len({key for keys in absent for key in keys})
+
+
+class ChosenSource:
+    """Clips under the names of their tests; see `SequenceSource`."""
+
+    def __init__(self, source: SequenceSource, chosen: ChosenClips) -> None:
+        clips = chosen.clips
+        self.names = list(clips)
+        self.listed = chosen.listed
+        self.refused = source.refused
+        self.left_out = source.left_out
+        self._source = source
+        self._clips = clips
+
+    def read(self, name: str) -> PosedSequence:
+        """The clip of a test.
+
+        Raises:
+            DataError: it cannot be used as a whole.
+        """
+        return replace(self._source.read(self._clips[name]), name=name)
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """As the clips are grouped."""
+        return self._source.groups([self._clips[name] for name in names])
+
+    def fingerprint(self) -> str:
+        """That of all clips."""
+        return self._source.fingerprint()
+
+
+def read_index(path: Path) -> EvaluationIndex:
+    """A list of test views in one of four formats; the first context frame is the reference.
+
+    JSON by clip, all clips in the same format (null: no test):
+    `{"context": [i, j], "target": [...]}` (dcharatan/pixelsplat, `assets/evaluation_index_re10k.json`);
+    the same with "target_quantify", the targets that are scored, where "target" are the frames of a video
+    (donydchen/mvsplat360, `assets/re10k_evaluation/re10k_inter_14_target_views_match.json`);
+    a list of such pairs, which may be empty (Chrixtar/latentsplat, `assets/evaluation_index/re10k_extra.json`).
+    Lines of a key and four frames, the reference first (eldar/flash3d, `splits/re10k_mine_filtered/test_files.txt` and
+    `datasets/re10k.py`). A target that is listed twice is scored twice.
+
+    Raises:
+        DataError: missing, unreadable, or with anything else in it.
+    """
+    text = _text(path)
+    with at(file=path):
+        return _from_table(read_json(path)) if text.lstrip().startswith(("{", "[")) else _from_lines(text)
+
+
+def read_keys(path: Path) -> list[str]:
+    """A list of clips, one key a line.
+
+    Raises:
+        DataError: missing, unreadable, or with several columns.
+    """
+    keys = []
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        columns = line.split()
+        if len(columns) > 1:
+            reason = f"line {number}: {len(columns)} columns instead of a key (lists of views: data.evaluation_index)"
+            raise BadAnnotation(reason, str(path))
+        keys += columns
+    return keys
+
+
+def choose_clips(keys: list[str], index: EvaluationIndex | None, listed: list[str] | None) -> ChosenClips:
+    """Of the clips that are there, those which both lists name (all, without lists)."""
+    there, left_out = set(keys), dict[str, list[str]]()
+    if index is not None:
+        left_out["null in the index"] = [key for key, tests in index.views.items() if not tests]
+        left_out["in the index, not in the data"] = [
+            key for key, tests in index.views.items() if tests and key not in there
+        ]
+        left_out["not in the index"] = [key for key in keys if key not in index.views]
+        keys = [key for key in keys if index.views.get(key)]
+    if listed is not None:
+        left_out["in the list, not in the data"] = [key for key in dict.fromkeys(listed) if key not in there]
+        left_out["not in the list"] = [key for key in keys if key not in set(listed)]
+        keys = [key for key in keys if key in set(listed)]
+    if index is None:
+        return ChosenClips({key: key for key in keys}, None, left_out)
+    tests = [(key, number, views) for key in keys for number, views in enumerate(index.views[key], 1)]
+    names = [f"{key}#{number}" if len(index.views[key]) > 1 else key for key, number, _ in tests]
+    clips = {name: key for name, (key, _, _) in zip(names, tests, strict=True)}
+    return ChosenClips(clips, {name: views for name, (_, _, views) in zip(names, tests, strict=True)}, left_out)
+
+
+def log_choice(chosen: ChosenClips) -> None:
+    """Say how many tests there are and which clips were left out: as a warning if some are not in the data."""
+    parts = []
+    for reason, keys in chosen.left_out.items():
+        named = ", ".join([*keys[:NAMED], *(["..."] if len(keys) > NAMED else [])])
+        parts.append(f"{len(keys)} {reason}" + (f" ({named})" if keys else ""))
+    lacking = any(keys for reason, keys in chosen.left_out.items() if reason.endswith("not in the data"))
+    left_out = f"; left out: {', '.join(parts)}" if parts else ""
+    clips = len(set(chosen.clips.values()))
+    tests = f"{len(chosen.clips)} scenes of {clips} clips" if clips < len(chosen.clips) else f"{clips} clips"
+    logger.log(logging.WARNING if lacking else logging.INFO, "%s to test%s", tests, left_out)
+
+
+def _from_table(content: Any) -> EvaluationIndex:
+    if not isinstance(content, dict):
+        raise BadAnnotation("not a table of clips")
+    form, views = None, dict[str, list[Choice]]()
+    for key, value in content.items():
+        with at(sequence=key):
+            entries = [] if value is None else value if isinstance(value, list) else [value]
+            found = form if value is None else _form(value)
+            if form is not None and found != form:
+                raise BadAnnotation(f"in the format of {found}, clips before it in that of {form}")
+            form, views[key] = found, [_choice(entry) for entry in entries]
+    if form is None or not any(views.values()):
+        raise BadAnnotation("no clip with views")
+    return EvaluationIndex(form, views)
+
+
+def _form(value: Any) -> str:
+    if isinstance(value, list):
+        if all(isinstance(entry, dict) and entry.keys() == {CONTEXT, TARGET} for entry in value):
+            return "latentSplat"
+    elif isinstance(value, dict) and frozenset(value) in FORMS:
+        return FORMS[frozenset(value)]
+    raise BadAnnotation(
+        "neither null, {context, target} (pixelSplat), {context, target, target_quantify} (MVSplat360) "
+        "nor a list of {context, target} (latentSplat)"
+    )
+
+
+def _choice(entry: dict[str, Any]) -> Choice:
+    for frames in entry.values():
+        if not isinstance(frames, list) or not frames or not all(type(f) is int and f >= 0 for f in frames):
+            raise BadAnnotation("context and target must be lists of frame numbers")
+    return entry[CONTEXT][0], entry.get(SCORED, entry[TARGET])
+
+
+def _from_lines(text: str) -> EvaluationIndex:
+    views: dict[str, list[Choice]] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        columns = line.split()
+        if not columns:
+            continue
+        if len(columns) != len(LINE.split()) or not all(c.isascii() and c.isdecimal() for c in columns[1:]):
+            reason = f"line {number}: not `{LINE}` with numbers of frames (Flash3D; lists of keys: data.scene_list)"
+            raise BadAnnotation(reason)
+        reference, *targets = map(int, columns[1:])
+        views.setdefault(columns[0], []).append((reference, targets))
+    if not views:
+        raise BadAnnotation("no clip with views")
+    return EvaluationIndex("Flash3D", views)
+
+
+def _text(path: Path) -> str:
+    try:
+        return require_file(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise UnreadableFile("not a text file", str(path)) from None

@@ -1,0 +1,246 @@
+"""RealEstate10K clips as posed sequences, and their data module."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.scenes import Choice, EvaluationScenes
+from completesplat.data.loading.view_selection import evaluation_views_within, nearby_views
+from completesplat.data.pictures.crop import Square, principal_square
+from completesplat.data.realestate10k.chunks import ChunkedClips
+from completesplat.data.realestate10k.clips import Clip, TextClips
+from completesplat.data.realestate10k.evaluation import (
+    ChosenSource,
+    EvaluationIndex,
+    choose_clips,
+    log_choice,
+    read_index,
+    read_keys,
+)
+from completesplat.data.sequences import Picture, PosedSequence, SequenceSource, split_by_hash
+from completesplat.data.validation import BadAnnotation, at, require_file
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.tensors import stack
+from completesplat.weights import sha256_of
+
+CROPS = ("center", "principal")
+
+Clips = TextClips | ChunkedClips
+
+
+@dataclass(frozen=True)
+class Framing:
+    """How pictures and cameras are made from files.
+
+    Attributes:
+        image_size: side of the square pictures.
+        crop: "center": the largest central square; "principal": the largest square around the principal point.
+        scale: all lengths are multiplied by this, near and far included.
+        near, far: the depth range of every scene, in the clips' own units.
+    """
+
+    image_size: int
+    crop: str
+    scale: float
+    near: float
+    far: float
+
+
+def open_clips(folder: Path) -> Clips:
+    """The clips of a split's folder, in whichever form they are: with an `index.json`, in chunks, else in texts.
+
+    Raises:
+        DataError: neither is there.
+    """
+    if (folder / "index.json").is_file():
+        return ChunkedClips(folder)
+    if folder.is_dir() and any(folder.glob("*.txt")):
+        return TextClips(folder)
+    raise DataError("no RealEstate10K clips there: neither index.json (with *.torch) nor *.txt", str(folder))
+
+
+class RE10KSource:
+    """Some clips of one folder; see `SequenceSource`. The clips may be shared by several sources."""
+
+    def __init__(self, clips: Clips, names: list[str], framing: Framing) -> None:
+        self.names = names
+        self.refused: list[DataError] = clips.refused
+        self.left_out = {"frames are missing": clips.missing} if clips.missing else {}
+        self.listed = len(names) + len(clips.missing)
+        self.framing = framing
+        self._clips = clips
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """The clips of one chunk each."""
+        return self._clips.chunks(names)
+
+    def fingerprint(self) -> str:
+        """SHA-256 of what lists the clips; pictures are not looked at."""
+        return self._clips.fingerprint()
+
+    def read(self, name: str) -> PosedSequence:
+        """One clip: its cameras now, its pictures when asked for.
+
+        Raises:
+            DataError: it is missing, unreadable or malformed.
+        """
+        clip, framing = self._clips.clip(name), self.framing
+        count = len(clip.timestamps)
+        squares = [_square(clip, framing.crop, frame) for frame in range(count)]
+        cameras = _cropped(clip.cameras, squares, framing.image_size)
+        cameras = cameras.scale_world(torch.tensor(framing.scale, dtype=torch.float64))
+        depth_range = torch.tensor([framing.near * framing.scale, framing.far * framing.scale])
+        read = partial(_read, clip, squares, framing.image_size)
+        return PosedSequence(name, tuple(range(count)), cameras, depth_range.repeat(count, 1), read)
+
+
+def _square(clip: Clip, crop: str, frame: int) -> Square:
+    height, width = clip.cameras.image_size
+    with at(clip.source, clip.key, frame):
+        x, y = clip.cameras.intrinsics[frame, :2, 2].tolist() if crop == "principal" else (width / 2, height / 2)
+        return principal_square((x, y), (height, width))
+
+
+def _cropped(cameras: Cameras, squares: list[Square], size: int) -> Cameras:
+    if len(set(squares)) == 1:
+        return crop_resize(cameras, *squares[0], size)
+    return stack([crop_resize(cameras[i], *square, size) for i, square in enumerate(squares)])
+
+
+def _read(clip: Clip, squares: list[Square], size: int, index: int) -> Picture:
+    with at(clip.source, clip.key, index):
+        return Picture(clip.read(index, squares[index], size), None)
+
+
+class RE10KDataModule(SceneDataModule):
+    """Scenes of room tours.
+
+    `root` has the folders `train` and `test`, either with texts and frames as published (`realestate10k_text`) or with
+    pixelSplat's chunks (`realestate10k_chunks`), or is prepared. Training draws a random reference and random targets
+    near it. Clips are checked when they are read. Each loading process has at most two chunks in memory.
+
+    Args:
+        min_gap, max_gap: frames between the reference and a training target, either way (Flash3D: at most 30).
+        evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and so many
+            evenly spaced targets among the next `evaluation_gap` frames.
+        evaluation_index: a file of test views, instead of that rule: in the format of pixelSplat, MVSplat360,
+            latentSplat or Flash3D (`read_index`).
+        scene_list: a file with the keys of the clips to test, one a line.
+        crop: "center": the largest central square (DFM); "principal": the largest one around the principal point.
+        near, far: depth range in the clips' units (DFM, `data_io/realestate10k.py:55-56`; not stated by the paper).
+        scale: all lengths, near and far included, are multiplied by this.
+        val_fraction: share of `train` that is held out for validation, at least one clip, chosen by key and `val_seed`.
+        **settings: of `SceneDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        min_gap: int = 1,
+        max_gap: int = 30,
+        evaluation_targets: int = 3,
+        evaluation_gap: int = 30,
+        evaluation_index: str | None = None,
+        scene_list: str | None = None,
+        crop: str = "center",
+        near: float = 0.7,
+        far: float = 10.0,
+        scale: float = 1.0,
+        val_fraction: float = 0.02,
+        val_seed: int = 0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        if not 1 <= min_gap <= max_gap or evaluation_gap < 1:
+            raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap and 1 <= evaluation_gap")
+        if not 0 < near < far or not scale > 0:
+            raise CompleteSplatError("data: needs 0 < near < far and 0 < scale")
+        if crop not in CROPS:
+            raise CompleteSplatError(f"data.crop={crop}: choose one of {', '.join(CROPS)}")
+        self.gaps = min_gap, max_gap
+        self.evaluation = evaluation_targets, evaluation_gap
+        self.evaluation_index = Path(evaluation_index) if evaluation_index else None
+        self.scene_list = Path(scene_list) if scene_list else None
+        self.framing = Framing(self.image_size, crop, scale, near, far)
+        self.val_fraction = val_fraction
+        self.val_seed = val_seed
+        self._test_views: dict[str, Choice] | None = None
+
+    @cached_property
+    def index(self) -> EvaluationIndex | None:
+        """The content of `evaluation_index`.
+
+        Raises:
+            DataError: it is missing or malformed.
+        """
+        return None if self.evaluation_index is None else read_index(self.evaluation_index)
+
+    def describe(self) -> dict[str, str]:
+        """See `SceneDataModule`; a list that decides is named, with the work whose format it has and its checksum."""
+        count, gap = self.evaluation
+        views = f"reference: first frame; {count} targets within {gap} frames"
+        if self.index is not None:
+            views = f"those of {_identity(self.evaluation_index, self.index.form)}"
+        listed = "" if self.scene_list is None else f"; scenes of {_identity(self.scene_list)}"
+        return {
+            "data_set": "realestate10k",
+            "crop": f"largest square, {self.framing.crop}",
+            "protocol_views": views + listed,
+        }
+
+    def prepared_settings(self) -> dict[str, Any]:
+        """See `SceneDataModule`."""
+        return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
+
+    def open(self, split: str) -> Mapping[str, RE10KSource]:
+        """The test clips; or the clips of the folder `train`, which training and validation share."""
+        if split == "test":
+            clips = open_clips(self.root / "test")
+            return {"test": RE10KSource(clips, clips.keys, self.framing)}
+        clips = open_clips(self.root / "train")
+        train, val = split_by_hash(clips.keys, self.val_fraction, self.val_seed)
+        # Both read through the same two chunks.
+        return {"train": RE10KSource(clips, train, self.framing), "val": RE10KSource(clips, val, self.framing)}
+
+    def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
+        """Of the test clips those that the evaluation index and the list of scenes name."""
+        if split != "test":
+            return source
+        listed = None if self.scene_list is None else read_keys(self.scene_list)
+        chosen = choose_clips(source.names, self.index, listed)
+        log_choice(chosen)
+        self._test_views = chosen.views
+        return ChosenSource(source, chosen)
+
+    def stackable(self, scenes: EvaluationScenes) -> bool:
+        """Known from the evaluation index; reading all clips for it would take hours."""
+        views = self._test_views or {}
+        return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
+
+    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
+        """A random reference and random targets near it."""
+        return nearby_views(frames, self.targets, *self.gaps, rng)
+
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """The views of the evaluation index; without one, the first frame and some that follow it."""
+        if self._test_views is None or sequence.name not in self._test_views:
+            return evaluation_views_within(len(sequence.frames), *self.evaluation)
+        reference, targets = self._test_views[sequence.name]
+        position = {frame: view for view, frame in enumerate(sequence.frames)}
+        for frame in (reference, *targets):
+            if frame not in position:
+                raise BadAnnotation("the frame is in the evaluation index, not in the data", None, sequence.name, frame)
+        return position[reference], [position[frame] for frame in targets]
+
+
+def _identity(path: Path | None, *said: str) -> str:
+    """A file's name and content, wherever it lies."""
+    assert path is not None
+    return f"{path.name} ({', '.join([*said, f'SHA-256 {sha256_of(require_file(path))[:12]}'])})"

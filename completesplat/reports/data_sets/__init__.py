@@ -1,1 +1,0 @@
-"""What a data set holds, as numbers and as pictures."""

@@ -1,1 +1,0 @@
-"""What stage 2 costs, in training and in drawing: one way against another, on the same work."""

@@ -1,1 +1,0 @@
-"""One page of HTML that needs nothing else: tables, figures, and samples that turn under the mouse."""

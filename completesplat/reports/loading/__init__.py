@@ -1,1 +1,0 @@
-"""How fast training batches are read, and what that takes."""

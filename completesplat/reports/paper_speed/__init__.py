@@ -1,1 +1,0 @@
-"""The paper's figures of speed (one A100), beside what they are here."""

@@ -1,0 +1,192 @@
+"""The results of a test on Weights & Biases: figures, tables, and the scenes that were tested."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from lightning import Trainer
+from lightning.pytorch.loggers import Logger
+from omegaconf import OmegaConf
+from PIL import Image
+from torch import Tensor
+
+from completesplat.export.pictures import color_depth, enlarge, surface_depth, to_bytes
+from completesplat.export.prediction import seen_center
+from completesplat.export.video import orbit_views, write_video
+from completesplat.metrics.evaluation import BEST, MODEL, REGIONS, Evaluation, Scores
+from completesplat.results.published import tables
+from completesplat.results.tables import Table
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.loggers import wandb_runs
+from completesplat.training.samples import evenly_spaced
+from completesplat.training.scene_module import SceneModule, ScoredScene
+
+VIEWS, FRAMES = 4, 48
+READABLE_SIDE = 128
+
+
+class SceneTable:
+    """Rows of the first scenes that a test scores in this process, of which the module must tell it (`add`).
+
+    Pictures are rows of views: the reference's, then targets, evenly spread. Depth and turntable are of the first
+    sample; the turntables are also `folder/00.mp4` and so on.
+
+    Args:
+        folder: of the videos.
+        most: scenes.
+    """
+
+    def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
+        self.module, self.folder, self.most = module, folder, most
+        self.columns: list[str | int] = []
+        self.rows: list[list[Any]] = []
+        self.videos: list[Path] = []
+        self.names: list[str] = []
+
+    @torch.no_grad()
+    def add(self, scene: ScoredScene) -> None:
+        """Keep what is shown of a scene."""
+        if len(self.rows) >= self.most:
+            return
+        row: dict[str, Any] = {"scene": scene.name, "input": strip(scene.input[None])}
+        views = [0, *(1 + place for place in evenly_spaced(len(scene.truth.images) - 1, VIEWS - 1))]
+        row["truth"] = strip(scene.truth.images[views])
+        row |= {f"sample {n}": strip(images[views]) for n, images in enumerate(scene.images, 1)}
+        with torch.autocast(self.module.device.type, enabled=False):
+            seen = self.module.rasterizer(scene.gaussians[:1], scene.cameras[views][None])
+            row["depth"] = strip(color_depth(surface_depth(seen)[0])[0])
+            self.videos.append(self._turntable(scene))
+        row |= {"turntable": self.videos[-1], **scores_of(self.module.evaluation, scene.name)}
+        self.names.append(scene.name)
+        self.columns = list(row)
+        self.rows.append(list(row.values()))
+
+    def _turntable(self, scene: ScoredScene) -> Path:
+        module, gaussians, reference = self.module, scene.gaussians[0], scene.cameras[0]
+        up = module.completesplat.up if isinstance(module, LatentDiffusion) else None
+        pivot = seen_center(module.rasterizer, gaussians, reference)
+        frames, _ = orbit_views(module.rasterizer, gaussians, reference, pivot, FRAMES, module.background, up)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{len(self.rows):02}.mp4"
+        write_video(path, frames.float())
+        return path
+
+    def media(self) -> dict[str, Any]:
+        """What is logged: `test/scenes` and `test/turntables`; nothing if no scene was tested here."""
+        import wandb
+
+        if not self.rows:
+            return {}
+        table = wandb.Table(self.columns, [[as_media(value) for value in row] for row in self.rows])
+        videos = [wandb.Video(str(p), caption=name) for p, name in zip(self.videos, self.names, strict=True)]
+        return {"test/scenes": table, "test/turntables": videos}
+
+
+def as_media(value: Any) -> Any:
+    """Pictures and videos as W&B's; all else as it is."""
+    import wandb
+
+    if isinstance(value, Image.Image):
+        return wandb.Image(value)
+    return wandb.Video(str(value)) if isinstance(value, Path) else value
+
+
+def strip(images: Float[Tensor, "view 3 height width"]) -> Image.Image:
+    """Views side by side, each enlarged by a whole factor to about 128 px."""
+    factor = max(1, round(READABLE_SIDE / max(images.shape[-2:])))
+    row = torch.cat(list(images.float().nan_to_num()), dim=-1)
+    return Image.fromarray(to_bytes(enlarge(row, factor)))
+
+
+def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
+    """The model's scores for a scene, and those of the best of several samples, by `region_view_metric`."""
+    found: dict[str, float] = {}
+    for predictor, prefix in ((MODEL, ""), (BEST, f"{BEST}/")):
+        scores: Scores = evaluation.scores[predictor].get(name, {}) if predictor in evaluation.scores else {}
+        found |= {prefix + "_".join(key): value for key, value in scores.items()}
+    return found
+
+
+def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
+    """If W&B is among the loggers, begin its run, and collect what it is to show of the scenes of a test."""
+    runs = wandb_runs(trainer.loggers)
+    if not runs or not trainer.is_global_zero:
+        return None
+    for run in runs:
+        run.log_hyperparams(OmegaConf.to_container(config, resolve=True))
+    table = SceneTable(module, out / "turntables", max(run.scenes for run in runs))
+    module.on_scene_scored = table.add
+    return table
+
+
+def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
+    """Log `test/PREDICTOR/REGION_VIEW_METRIC`; for W&B also tables, pictures and videos.
+
+    Args:
+        results: of `SceneModule.test_results`.
+        scenes: of `begin`.
+        out: the run directory, with the results in its `metrics.json`.
+    """
+    flat = {predictor: by_name(scores) for predictor, scores in results.items()}
+    numbers = {f"test/{predictor}/{name}": x for predictor, scores in flat.items() for name, x in scores.items()}
+    for logger in trainer.loggers:
+        logger.log_metrics(numbers, step=trainer.global_step)
+        logger.save()
+    runs = wandb_runs(trainer.loggers)
+    if not runs:
+        return
+    media = {} if scenes is None else scenes.media()
+    media |= {"test/predictors": predictor_table(flat)}
+    media |= {f"report/{table.name}": as_wandb(table) for table in tables(out)[0] if holds_ours(table)}
+    for run in runs:
+        run.log_metrics(media, step=trainer.global_step)
+
+
+def log_modes(results: Mapping[str, Mapping[str, float]], figure: Path, config: Any, loggers: Sequence[Logger]) -> None:
+    """Log `hidden_modes/METHOD/FIGURE`; for W&B also the picture."""
+    numbers = {f"hidden_modes/{method}/{name}": x for method, found in results.items() for name, x in found.items()}
+    for logger in loggers:
+        logger.log_metrics(numbers, step=0)
+        logger.save()
+    for run in wandb_runs(loggers):
+        import wandb
+
+        run.log_hyperparams(OmegaConf.to_container(config, resolve=True))
+        run.log_metrics({"hidden_modes": wandb.Image(str(figure))}, step=0)
+
+
+def by_name(scores: dict[str, Any]) -> dict[str, float]:
+    """A predictor's results by `region_view_metric`."""
+    return {
+        f"{region}_{view}_{metric}": value
+        for region in REGIONS
+        for view, metrics in scores[region].items()
+        for metric, value in metrics.items()
+    }
+
+
+def predictor_table(flat: dict[str, dict[str, float]]) -> Any:
+    """A row for each predictor; what was not measured for one stays empty."""
+    import wandb
+
+    columns = list(dict.fromkeys(name for scores in flat.values() for name in scores))
+    rows = [[predictor, *(scores.get(name) for name in columns)] for predictor, scores in flat.items()]
+    return wandb.Table(columns=["predictor", *columns], data=rows)
+
+
+def holds_ours(table: Table) -> bool:
+    """Whether there is more in it than what is published."""
+    return any(row.source == "ours" for row in table.rows)
+
+
+def as_wandb(table: Table) -> Any:
+    """A table of a report with its texts, and in its last rows what stands below it."""
+    import wandb
+
+    columns: list[str | int] = [
+        ": ".join(part for part in (heading.group, heading.text) if part) for heading in table.headings
+    ]
+    rows = [[cell.text for cell in row.cells] for row in table.rows]
+    return wandb.Table(columns, [*rows, *([line] + [""] * (len(columns) - 1) for line in table.below())])

@@ -1,0 +1,152 @@
+"""One picture of several sequences and their cameras, on which a wrong convention is seen at once."""
+
+import math
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
+from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.errors import DataError
+from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
+
+MOST_SEQUENCES = 8
+CELL, GAP, LINE, MARGIN = 216, 6, 20, 12
+INK, PAPER, GREY, MASK = "black", "white", (190, 190, 190), (255, 220, 0)
+TEXT, NAME, TITLE = 13, 15, 18
+DRAWINGS = ("from above", "from the side")
+LEGEND = (
+    "Pictures: one cross stands at one place of each scene and must stick to it, its square level as a floor; "
+    "red: to the first camera's right, green: up, blue: ahead; yellow: mask.",
+    "Cameras: black: the first, then dark blue to orange with time; the tick is the picture's upper edge; "
+    "grey bar: near to far of the first (an arrow: farther); right, up and ahead are the first camera's.",
+)
+
+
+def show(sequences: Sequence[PosedSequence], path: Path, pictures: int = 6, title: str = "") -> None:
+    """Write a PNG with a row for each sequence: evenly spaced pictures, and its cameras from above and from the side.
+
+    A picture that cannot be read is a grey cell with the kind of its `DataError`.
+
+    Args:
+        pictures: for each sequence, the first and the last frame among them; fewer where it has fewer.
+
+    Raises:
+        ValueError: no sequences, more than `MOST_SEQUENCES`, or no pictures.
+    """
+    if not 0 < len(sequences) <= MOST_SEQUENCES or pictures < 1:
+        raise ValueError(f"a sheet has 1 to {MOST_SEQUENCES} sequences and 1 picture of each or more")
+    width = _left(pictures + len(DRAWINGS)) - GAP + MARGIN
+    legend = [line for text in LEGEND for line in _wrapped(text, width - 2 * MARGIN)]
+    header = MARGIN + int(1.5 * LINE) + len(legend) * LINE
+    row_height = 2 * LINE + CELL + GAP
+    sheet = Image.new("RGB", (width, header + len(sequences) * row_height + MARGIN), PAPER)
+    _text(sheet, (MARGIN, MARGIN), title, width - 2 * MARGIN, TITLE)
+    for index, line in enumerate(legend):
+        _text(sheet, (MARGIN, MARGIN + int(1.5 * LINE) + index * LINE), line, width - 2 * MARGIN)
+    for index, sequence in enumerate(sequences):
+        _draw_row(sheet, header + index * row_height, sequence, pictures)
+    with atomic_path(path) as temporary:
+        sheet.save(temporary, format="PNG")
+
+
+def _draw_row(sheet: Image.Image, top: int, sequence: PosedSequence, pictures: int) -> None:
+    """Heading, cells and captions below them."""
+    cross = place_cross(sequence.cameras, sequence.depth_ranges[0])
+    _text(sheet, (MARGIN, top), _heading(sequence), sheet.width - 2 * MARGIN, NAME)
+    chosen = np.unique(np.linspace(0, len(sequence.frames) - 1, pictures).round().astype(int)).tolist()
+    below = top + LINE + CELL
+    for column, index in enumerate(chosen):
+        cell, where = _picture_cell(sequence, index, cross)
+        sheet.paste(cell, (_left(column), top + LINE))
+        _text(sheet, (_left(column), below), f"frame {sequence.frames[index]}{where}", CELL)
+    drawn = drawings(sequence, cross)
+    for column, (label, drawing) in enumerate(
+        zip(DRAWINGS, (drawn.from_above(CELL), drawn.from_the_side(CELL)), strict=True), start=pictures
+    ):
+        sheet.paste(drawing, (_left(column), top + LINE))
+        _text(sheet, (_left(column), below), f"{label}, bar: {drawn.scale_bar():g}", CELL)
+
+
+def _heading(sequence: PosedSequence) -> str:
+    near, far = sequence.depth_ranges[0].tolist()
+    width, focal = sequence.cameras.image_size[1], sequence.cameras.intrinsics[0, 0, 0].item()
+    fov = math.degrees(2 * math.atan(width / 2 / focal))
+    numbers = f"{len(sequence.frames)} cameras, field of view {fov:.1f}°, near {near:.3g}, far {far:.3g}"
+    return f"{sequence.name}: {numbers}"
+
+
+def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Image.Image, str]:
+    """A picture with the cross, and what to say if the cross is not in it."""
+    try:
+        picture = sequence.read(index)
+    except DataError as error:
+        cell = Image.new("RGB", (CELL, CELL), GREY)
+        for number, line in enumerate(_wrapped(error.kind, CELL - 2 * GAP)):
+            _text(cell, (GAP, CELL // 2 - LINE + number * LINE), line, CELL - 2 * GAP)
+        return cell, ""
+    cell = _with_outline(picture)
+    camera = sequence.cameras[index]
+    scale = CELL / camera.image_size[1]
+    nearest = NEAREST * cross.arms.norm(dim=-1)[0].item()
+    draw = ImageDraw.Draw(cell)
+    for _, ends in visible_segments(camera, cross.square(), nearest):
+        _line(draw, scale * ends, "white", 2)
+    arms = visible_segments(camera, cross.ends(), nearest)
+    for arm, ends in arms:
+        _line(draw, scale * ends, CROSS_COLORS[arm], 3)
+    if not arms:
+        return cell, ": cross behind"
+    inside = any(((ends > 0) & (ends < camera.image_size[1])).all(dim=-1).any() for _, ends in arms)
+    return cell, "" if inside else ": cross outside"
+
+
+def _line(draw: ImageDraw.ImageDraw, ends: Float[Tensor, "2 2"], color: str | tuple[int, int, int], width: int) -> None:
+    """A line with a dark edge, which keeps it visible on anything."""
+    points = [(x, y) for x, y in ends.tolist()]
+    draw.line(points, INK, width + 2)
+    draw.line(points, color, width)
+
+
+def _with_outline(picture: Picture) -> Image.Image:
+    """The picture at the size of a cell, with a line where the mask crosses one half."""
+    image = Image.fromarray(np.ascontiguousarray(picture.image.permute(1, 2, 0).numpy()))
+    # Enlarged, this filter repeats pixels; reduced, it averages them.
+    pixels = np.array(image.resize((CELL, CELL), Image.Resampling.BOX))
+    if picture.mask is not None:
+        mask = Image.fromarray(np.ascontiguousarray(picture.mask[0].numpy()))
+        inside = np.array(mask.resize((CELL, CELL), Image.Resampling.BOX)) >= 128
+        padded = np.pad(inside, 1, mode="edge")
+        neighbors = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+        pixels[inside & ~neighbors] = MASK
+    return Image.fromarray(pixels)
+
+
+def _left(column: int) -> int:
+    return MARGIN + column * (CELL + GAP)
+
+
+def _text(picture: Image.Image, place: tuple[int, int], text: str, width: int, size: int = TEXT) -> None:
+    """One line, shortened to `width` pixels."""
+    font = ImageFont.load_default(size=size)
+    shown, text = text, text.rstrip()
+    while shown and font.getlength(shown) > width:
+        text = text[:-1]
+        shown = f"{text}..."
+    ImageDraw.Draw(picture).text(place, shown, INK, font)
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    """Lines that fit into `width` pixels."""
+    font = ImageFont.load_default(size=TEXT)
+    columns = next(
+        columns
+        for columns in range(len(text), 0, -1)
+        if all(font.getlength(line) <= width for line in textwrap.wrap(text, columns))
+    )
+    return textwrap.wrap(text, columns)

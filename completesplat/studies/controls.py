@@ -1,0 +1,138 @@
+"""Skip and guidance weight: faithfulness to the input against diversity."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from completesplat.atomic import atomic_path
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.diffusion.guidance import check_guidance_weight
+from completesplat.metrics.images import psnr
+from completesplat.metrics.samples import diversity
+from completesplat.scene import SceneBatch
+from completesplat.studies.samples import Artist, Strip, farthest, mean_over_scenes, near, object_psnr
+
+# From faithful to diverse (supplement, "Diverse Sampling").
+PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
+
+
+def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
+    """All pairs of (skip weight, guidance weight), the paper's three included.
+
+    Raises:
+        CompleteSplatError: a weight outside of [0, 1].
+    """
+    pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
+    for skip_weight, guidance_weight in pairs:
+        allowed_skip_weight(skip_weight)
+        check_guidance_weight(guidance_weight)
+    return sorted(pairs)
+
+
+def rows(
+    artist: Artist,
+    settings: Sequence[tuple[float, float]],
+    scenes: Sequence[SceneBatch],
+    near_degrees: float,
+    tick: Callable[[str], None],
+) -> list[dict[str, float | bool | None]]:
+    """A row for each setting, mean over the scenes.
+
+    `reference_psnr` is of the reference view; `near_object_psnr` of the true object's pixels in the targets that look
+    at most `near_degrees` away from the reference: mostly surface that the input shows (which surface it shows exactly
+    would take depth maps, which scenes have not got). `diversity` is of the targets.
+    """
+
+    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
+        images = artist(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        true = scene.all_views()
+        seen = near(scene.reference.cameras[0], scene.targets.cameras[0], near_degrees)
+        return {
+            "reference_psnr": psnr(images[:, 0], true.images[:, 0].expand_as(images[:, 0])).mean().item(),
+            "near_object_psnr": object_psnr(
+                images[:, 1:][:, seen], scene.targets.images[0, seen], scene.targets.masks[0, seen]
+            ),
+            "diversity": diversity(images[:, 1:]),
+        }
+
+    return over_settings(settings, scenes, measure, tick)
+
+
+def over_settings(
+    settings: Sequence[tuple[float, float]],
+    scenes: Sequence[SceneBatch],
+    measure: Callable[[SceneBatch, float, float], Mapping[str, float | None]],
+    tick: Callable[[str], None],
+) -> list[dict[str, float | bool | None]]:
+    """A row for each setting: the mean over the scenes of what is measured with its skip and guidance weight."""
+    found: list[dict[str, float | bool | None]] = []
+    for skip_weight, guidance_weight in settings:
+        tick(f"skip weight {skip_weight:g}, guidance weight {guidance_weight:g}")
+        means = mean_over_scenes([measure(scene, skip_weight, guidance_weight) for scene in scenes])
+        paper = (skip_weight, guidance_weight) in PAPER
+        found.append({"skip_weight": skip_weight, "guidance_weight": guidance_weight, "paper": paper, **means})
+    return found
+
+
+def strips(
+    artist: Artist, settings: Sequence[tuple[float, float]], scene: SceneBatch, samples: int
+) -> tuple[list[list[Strip | None]], list[str]]:
+    """Rows by skip weight, columns by guidance weight: one sample's reference view, and several from far away.
+
+    The far view is the target that looks in the direction most different from the reference's. The first row is the
+    truth.
+    """
+    far = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0])
+    skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
+    true = scene.all_views().images[0]
+    rows: list[list[Strip | None]] = [[Strip(true[[0, far]], "truth: reference, far"), *[None] * (len(weights) - 1)]]
+    for skip in skips[::-1]:
+        row: list[Strip | None] = []
+        for weight in weights:
+            if (skip, weight) not in settings:
+                row.append(None)
+                continue
+            images = artist(scene, skip_weight=skip, guidance_weight=weight)
+            shown = torch.cat([images[:1, 0], images[:samples, far]])
+            row.append(Strip(shown, f"guidance {weight:g}", (skip, weight) in PAPER))
+        rows.append(row)
+    return rows, ["", *(f"skip {skip:g}" for skip in skips[::-1])]
+
+
+PANELS = [
+    ("reference_psnr", "Reference view: PSNR, dB"),
+    ("near_object_psnr", "Object in near views: PSNR, dB"),
+]
+
+
+def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
+    """Write a PNG with a panel for each measure of faithfulness; the paper's three settings are circled and named."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 5.5), layout="constrained")
+    figure.suptitle(title)
+    skips = sorted({row["skip_weight"] for row in rows})
+    for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+        drawn = [row for row in rows if row[key] is not None]
+        for skip in skips:
+            own = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
+            color = colormaps["viridis"](0.9 * skip)
+            panel.plot([p[1] for p in own], [p[2] for p in own], "o-", color=color, label=f"skip weight {skip:g}")
+            for weight, x, y in own:
+                panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
+        for row in drawn:
+            if row["paper"]:
+                x, y = row["diversity"], row[key]
+                panel.plot(x, y, "o", markersize=13, fillstyle="none", color="crimson")
+                name = f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
+                panel.annotate(name, (x, y), (9, 9), textcoords="offset points", color="crimson")
+        panel.set(xlabel="diversity: difference of two samples in novel views (RMS)", ylabel=label)
+        panel.grid(alpha=0.3)
+        panel.margins(0.12)
+    figure.axes[0].legend(title="along a curve: guidance weight")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)

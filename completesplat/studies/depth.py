@@ -1,0 +1,102 @@
+"""Where the samples of one input disagree in depth: the paper's figure of diversity in depth, with numbers."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.export.pictures import NOTHING, color_depth, color_normals, ramp, surface_depth
+from completesplat.geometry.normals import normals_from_depth
+from completesplat.scene import SceneBatch
+from completesplat.studies.controls import over_settings
+from completesplat.studies.samples import Artist, Strip, farthest, near
+
+
+def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
+    """Standard deviation of the depth over those samples that have one (more than 0) at a pixel.
+
+    Its square is the unbiased estimate of the variance, so that pixels with more and with fewer samples compare. NaN
+    where less than two samples have a depth.
+    """
+    known = depth > 0
+    count = known.sum(0)
+    from_mean = torch.where(known, depth - depth.sum(0) / count, 0)
+    return torch.where(count > 1, (from_mean.square().sum(0) / (count - 1)).sqrt(), torch.nan)
+
+
+def rows(
+    artist: Artist,
+    settings: Sequence[tuple[float, float]],
+    scenes: Sequence[SceneBatch],
+    far_degrees: float,
+    tick: Callable[[str], None],
+) -> list[dict[str, float | bool | None]]:
+    """A row for each (skip weight, guidance weight), mean over the scenes.
+
+    `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units,
+    `far_deviation` that over the targets that look more than `far_degrees` away from the reference;
+    `reference_object_deviation` and `far_object_deviation` are of the true object's pixels alone. `reference_measured`
+    and `far_measured` are the shares of pixels where two samples or more are more than half opaque: the others have no
+    part in the deviations. What no scene has is None.
+    """
+
+    def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
+        rendering = artist.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        return deviations(surface_depth(rendering), scene, far_degrees)
+
+    return over_settings(settings, scenes, measure, tick)
+
+
+def deviations(
+    depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float
+) -> dict[str, float | None]:
+    """The figures of `rows` for one scene (a batch of one); depth of the reference view and of all targets."""
+    maps, masks = deviation(depth), scene.all_views().masks[0]
+    far = 1 + torch.nonzero(~near(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
+    found: dict[str, float | None] = {}
+    for name, views in (("reference", far.new_zeros(1)), ("far", far)):
+        found[f"{name}_deviation"] = _mean(maps[views])
+        found[f"{name}_object_deviation"] = _mean(maps[views][masks[views] > 0.5])
+        found[f"{name}_measured"] = maps[views].isfinite().float().mean().item() if len(views) else None
+    return found
+
+
+def _mean(values: Float[Tensor, "..."]) -> float | None:
+    known = values[values.isfinite()]
+    return known.mean().item() if len(known) else None
+
+
+def strips(
+    artist: Artist, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
+) -> list[list[Strip]]:
+    """A row for each scene: the truth, some samples from far away, and where all samples disagree.
+
+    The far view is the target that looks in the direction most different from the reference's. The truth is the input
+    and the far view; a sample's pictures are its render, depth and normals in the far view; the deviation is that of
+    the depth in the reference and in the far view, dark where the samples agree. The depths of a row have one scale,
+    and so have its deviations. Grey: nothing to see, or to compare.
+    """
+    rows = []
+    for scene in scenes:
+        rendering = artist.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        far, true = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0]), scene.all_views()
+        depth, images = surface_depth(rendering), artist.over_background(rendering)[:, far]
+        depths, (nearest, deepest) = color_depth(depth[:shown, far])
+        normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))
+        row = [Strip(true.images[0, [0, far]], "input, far view")]
+        for sample, pictures in enumerate(zip(images[:shown], depths, normals, strict=True)):
+            row.append(Strip(torch.stack(pictures), f"sample {sample}: depth {nearest:.2f} to {deepest:.2f}"))
+        maps, end = color_deviation(deviation(depth[:, [0, far]]))
+        rows.append([*row, Strip(maps, f"deviation 0 to {end:.2g}")])
+    return rows
+
+
+def color_deviation(
+    deviation: Float[Tensor, "view 1 height width"],
+) -> tuple[Float[Tensor, "view 3 height width"], float]:
+    """Dark for 0, on one scale for all views, grey for NaN; and the scale's end, which 2 % of the pixels exceed."""
+    known = deviation.isfinite()
+    end = deviation[known].quantile(0.98).item() if known.any() else 0.0
+    colors = ramp(torch.where(known, deviation, 0) / max(end, 1e-12))
+    return torch.where(known, colors, NOTHING), end

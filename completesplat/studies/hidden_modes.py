@@ -1,0 +1,303 @@
+"""The benchmark of what the reference view hides: samples against all that could be there."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
+from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.export.pictures import to_bytes
+from completesplat.gaussians import Gaussians
+from completesplat.metrics.hidden_modes import (
+    EDGES,
+    REJECTED,
+    HiddenModeScores,
+    bin_sums,
+    classify,
+    curve,
+    draw_modes,
+    mean_of,
+    mean_scores,
+    scores,
+    spread_and_error,
+)
+from completesplat.scene import SceneBatch
+
+Renders = Float[Tensor, "sample view 3 height width"]
+Predictor = Callable[[SceneBatch, int], Renders]
+"""Scene (a batch of one) and seed -> renders of all targets, in [0, 1]."""
+
+
+def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
+    """`model`: as it is tested. `posterior_samples`, for a variational autoreconstructor: latents that are drawn.
+
+    A model that draws nothing gives `samples` equal ones. Samples are computed and rendered `batch` at a time.
+    """
+    predict = _samples if module.draws_samples else _repeated
+    found: dict[str, Predictor] = {"model": partial(predict, module, samples, batch)}
+    if isinstance(getattr(module, "model", None), VariationalAutoReconstructor):
+        found["posterior_samples"] = partial(_posterior_samples, module, samples, batch)
+    return found
+
+
+def _samples(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
+    gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
+    return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
+
+
+def _repeated(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
+    image = _render(module, module.reconstruct(scene, seed=seed), scene)
+    return image.expand(samples, *image.shape[1:])
+
+
+def _posterior_samples(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
+    model: VariationalAutoReconstructor = module.model
+    images = scene.reference.images * scene.visible if module.masked else scene.reference.images
+    posterior, features = model.encoder(images)
+    # On the CPU, so that a seed means the same on every device.
+    noise = torch.randn(samples, *posterior.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
+    latents = posterior.mean + noise.to(posterior.mean) * posterior.std
+    parts = [_decoded(model, part, features, scene) for part in latents.split(batch)]
+    return torch.cat([_render(module, gaussians, scene) for gaussians in parts])
+
+
+def _decoded(
+    model: VariationalAutoReconstructor,
+    latents: Float[Tensor, "sample channel _ _"],
+    features: Sequence[Float[Tensor, "1 _ _ _"]],
+    scene: SceneBatch,
+) -> Gaussians:
+    count = len(latents)
+    splatter_image = model.reconstructor(latents, [feature.expand(count, -1, -1, -1) for feature in features])
+    cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
+    return splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1))
+
+
+def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
+    return module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)
+
+
+REGIONS = ("hidden", "visible")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A scene's pictures for the figure, from the view that shows the modes best, and the samples' classes."""
+
+    name: str
+    reference: Float[Tensor, "3 height width"]
+    truths: Float[Tensor, "mode 3 height width"]
+    modes: tuple[str, ...]
+    true_mode: int
+    samples: Float[Tensor, "sample 3 height width"]
+    classes: tuple[int, ...]
+
+
+@dataclass
+class Measured:
+    """What was found so far: scores by method and scene, sums of the calibration by method and region."""
+
+    scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
+    sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    shown: dict[str, list[Shown]] = field(default_factory=dict)
+    names: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+    def results(self, samples: int) -> dict[str, dict[str, float]]:
+        """Means over the scenes by method."""
+        counts = {"scenes": len(self.names), "samples": samples}
+        return {method: asdict(mean_scores(found)) | counts for method, found in self.scores.items()}
+
+    def calibration(self) -> dict[str, dict[str, Any]]:
+        """Curves by method and region."""
+        return {method: {region: curve(sums) for region, sums in found.items()} for method, found in self.sums.items()}
+
+
+def in_region(
+    images: Float[Tensor, "_ view 3 height width"], region: Bool[Tensor, "view height width"]
+) -> Float[Tensor, "_ pixel 3"]:
+    """The region's pixels, those of all views in one row."""
+    return images.movedim(2, -1)[:, region]
+
+
+@torch.no_grad()
+def measure(
+    predictors: Mapping[str, Predictor],
+    scenes: Iterator[HiddenModes | DataError],
+    samples: int,
+    seed: int,
+    shown_scenes: int,
+    shown_samples: int,
+) -> Measured:
+    """Every scene has the seed after that of the last one.
+
+    Raises:
+        CompleteSplatError: no scene can be used.
+    """
+    measured = Measured()
+    for index, scene in enumerate(scenes):
+        if isinstance(scene, DataError):
+            measured.skipped.append(str(scene))
+            continue
+        _measure_naive(measured, scene, samples, seed + index)
+        for method, predict in predictors.items():
+            renders = predict(scene.scene, seed + index)
+            own = renders[:, list(scene.views)]
+            _add(measured, method, own, scene)
+            _add_calibration(measured, method, renders, scene)
+            if len(measured.names) < shown_scenes:
+                measured.shown.setdefault(method, []).append(_shown(scene, own, shown_samples))
+        measured.names.append(scene.scene.names[0])
+    if not measured.names:
+        reason = measured.skipped[0] if measured.skipped else "there are none"
+        raise CompleteSplatError(f"no test scene can be used for hidden modes; the first: {reason}")
+    return measured
+
+
+def _measure_naive(measured: Measured, scene: HiddenModes, samples: int, seed: int) -> None:
+    """What knows all modes: their mean, as often as there are samples, and draws by their probabilities."""
+    mean = mean_of(scene.truths, scene.probabilities)
+    _add(measured, "true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed), scene)
+    _add(measured, "mean_predictor", mean.expand(samples, *mean.shape), scene)
+
+
+def _add(measured: Measured, method: str, images: Float[Tensor, "_ view 3 height width"], scene: HiddenModes) -> None:
+    found = scores(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
+    measured.scores.setdefault(method, []).append(found)
+
+
+def _add_calibration(
+    measured: Measured, method: str, renders: Float[Tensor, "_ view 3 height width"], scene: HiddenModes
+) -> None:
+    variance, error = spread_and_error(renders, scene.scene.targets.images[0])
+    found = measured.sums.setdefault(method, {})
+    for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
+        sums = bin_sums(variance, error, region)
+        found[name] = found[name] + sums if name in found else sums
+
+
+def _shown(scene: HiddenModes, images: Float[Tensor, "_ view 3 height width"], count: int) -> Shown:
+    classes = classify(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
+    return Shown(
+        name=scene.scene.names[0],
+        reference=scene.scene.reference.images[0].cpu(),
+        truths=scene.truths[:, 0].cpu(),
+        modes=scene.modes,
+        true_mode=scene.true_mode,
+        samples=images[:count, 0].cpu(),
+        classes=tuple(classes[:count].tolist()),
+    )
+
+
+def usable(scenes: HiddenModeScenes, count: int | None) -> Iterator[HiddenModes | DataError]:
+    """The first scenes (all by default), or in the place of one that cannot be used the reason."""
+    for index in range(len(scenes) if count is None else min(count, len(scenes))):
+        try:
+            yield scenes[index]
+        except DataError as error:
+            yield error
+
+
+SIDE = 1.0
+"""Inches of a picture."""
+GAP = 0.06
+CHARTS = 10.0
+"""Inches between pictures, and of the charts' width."""
+MEASURES = [
+    ("coverage", "coverage\n(best: 1)"),
+    ("total_variation", "total variation\n(best: 0)"),
+    ("sharpness", "sharpness\n(best: 0)"),
+    ("rejected", "rejected\n(best: 0)"),
+]
+COLORS = {"hidden": "C3", "visible": "C0"}
+STYLES = ("o-", "s--")
+LOWEST = EDGES[0].item() / 2
+"""Where variances (and errors) below the first edge are drawn."""
+
+
+def draw(
+    shown: Sequence[Shown],
+    results: Mapping[str, Mapping[str, float]],
+    calibration: Mapping[str, Mapping[str, Any]],
+    samples: int,
+    path: Path,
+) -> None:
+    """Write a PNG: a row of pictures for each scene, and beside them the scores and the calibration by method."""
+    from matplotlib.figure import Figure
+
+    count = 1 + len(shown[0].modes) + len(shown[0].samples)
+    height = max(5.4, (SIDE + 0.3) * len(shown) + 0.8)
+    width = (SIDE + GAP) * count + 0.3 + CHARTS
+    # Laid out by hand: matplotlib's constrained layout takes seconds for so many panels.
+    figure = Figure(figsize=(width, height))
+    split, top = 1 - CHARTS / width, 1 - 0.7 / height
+    bottom = max(0.1, height - 0.7 - (SIDE + 0.3) * len(shown)) / height
+    places = {"left": 0.3 / width, "right": split, "top": top, "bottom": bottom}
+    grid = figure.add_gridspec(len(shown), count, **places, wspace=GAP / SIDE, hspace=0.3 / SIDE)
+    _draw_pictures(grid.subplots(squeeze=False), shown)
+    charts = {"left": split + 0.6 / width, "right": 1 - 0.2 / width, "top": top, "bottom": 1.4 / height}
+    panels: Any = figure.add_gridspec(1, 2, **charts, wspace=0.22).subplots()
+    bars, curves = panels
+    _draw_bars(bars, results)
+    _draw_calibration(curves, calibration, samples)
+    found = next(iter(results.values()))
+    title = f"Hidden modes: {found['scenes']} scenes, {found['samples']} samples each"
+    figure.suptitle(f"{title}. Input; then from behind: every mode, the true one in green; samples with the mode found")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:
+    for panels, scene in zip(rows, shown, strict=True):
+        panels[0].set_ylabel(scene.name, fontsize=7)
+        _draw_picture(panels[0], scene.reference, "input", "k")
+        for mode, panel in enumerate(panels[1 : 1 + len(scene.modes)]):
+            _draw_picture(panel, scene.truths[mode], scene.modes[mode], "g" if mode == scene.true_mode else "k")
+        for image, found, panel in zip(scene.samples, scene.classes, panels[1 + len(scene.modes) :], strict=True):
+            _draw_picture(panel, image, *(("rejected", "0.5") if found == REJECTED else (scene.modes[found], "C1")))
+
+
+def _draw_picture(panel: Any, image: Float[Tensor, "3 height width"], label: str, color: str) -> None:
+    panel.imshow(to_bytes(image), interpolation="nearest")
+    panel.set(xticks=[], yticks=[])
+    panel.set_title(label, fontsize=8, color=color, pad=2)
+    for spine in panel.spines.values():
+        spine.set(color=color, linewidth=0.6 if color == "k" else 2)
+
+
+def _draw_bars(panel: Any, results: Mapping[str, Mapping[str, float]]) -> None:
+    width = 0.8 / len(results)
+    for index, (method, found) in enumerate(results.items()):
+        places = [place + (index + 0.5) * width - 0.4 for place in range(len(MEASURES))]
+        values = [found[key] for key, _ in MEASURES]
+        bars = panel.bar(places, values, width, label=method.replace("_", " "), color=f"C{index}")
+        panel.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    panel.set_xticks(range(len(MEASURES)), [label for _, label in MEASURES], fontsize=8)
+    panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
+    panel.margins(y=0.12)
+    panel.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+
+
+def _draw_calibration(panel: Any, calibration: Mapping[str, Mapping[str, Any]], samples: int) -> None:
+    for style, (method, found) in zip(STYLES, calibration.items(), strict=False):
+        for region in REGIONS:
+            bins = found[region]["bins"]
+            if bins:
+                points = [(max(row["variance"], LOWEST), max(row["squared_error"], LOWEST)) for row in bins]
+                label = f"{method.replace('_', ' ')}, {region}"
+                panel.plot(*zip(*points, strict=True), style, color=COLORS[region], markersize=4, label=label)
+    ends = [LOWEST, 0.3]
+    ideal = [(1 + 1 / samples) * end for end in ends]
+    panel.plot(ends, ideal, color="0.6", zorder=0, label="calibrated: error = (1 + 1/S) variance")
+    panel.set(xscale="log", yscale="log", xlabel="variance of the samples", ylabel="squared error of their mean")
+    panel.set_title(f"Pixels by variance; below {EDGES[0].item():.0e}: at the left edge", fontsize=9)
+    panel.grid(alpha=0.3)
+    panel.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)

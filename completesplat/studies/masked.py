@@ -1,0 +1,47 @@
+"""Completions of partly hidden inputs, side by side."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.scene import SceneBatch
+from completesplat.studies.samples import Artist, Strip
+
+
+def box_visibility(box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
+    """1 outside of a box [x0 y0 x1 y1] in shares of the square, 0 in the pixels that it touches."""
+    left, upper, right, lower = box
+    visible = torch.ones(1, size, size)
+    rows, columns = (slice(math.floor(a * size), math.ceil(b * size)) for a, b in ((upper, lower), (left, right)))
+    visible[:, rows, columns] = 0
+    return visible
+
+
+def strips(
+    artist: Artist, scenes: Sequence[SceneBatch], boxes: Sequence[Sequence[float]], views: int, guidance_weight: float
+) -> tuple[list[list[Strip | None]], list[str]]:
+    """Rows of three columns for each scene and their names: the truth, then its completions, without skips.
+
+    The columns are the input (complete in the truth's row), the reference view, and other views evenly spread over the
+    targets. The boxes take turns.
+    """
+    rows: list[list[Strip | None]] = []
+    names = []
+    for index, scene in enumerate(scenes):
+        size = scene.reference.images.shape[-1]
+        visible = box_visibility(boxes[index % len(boxes)], size).to(scene.reference.images)
+        images = artist(scene, visible=visible[None], guidance_weight=guidance_weight)
+        count = images.shape[1] - 1
+        shown = [1 + i * count // views for i in range(min(views, count))]
+        true = scene.all_views().images[0]
+        rows.append([Strip(true[:1], "input"), Strip(true[:1], "reference view"), Strip(true[shown], "other views")])
+        names.append(f"{scene.names[0]}\ntruth")
+        for sample, drawn in enumerate(images):
+            # Grey, as black may be the picture's own.
+            seen = Strip(true[:1] * visible + 0.5 * (1 - visible), "what is seen") if sample == 0 else None
+            rows.append([seen, Strip(drawn[:1]), Strip(drawn[shown])])
+            names.append(f"sample {sample}")
+    return rows, names

@@ -1,0 +1,152 @@
+"""Samplers and their numbers of steps: quality, diversity, time."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
+from completesplat.metrics.images import psnr, ssim
+from completesplat.metrics.samples import diversity
+from completesplat.scene import SceneBatch
+from completesplat.studies.samples import Artist
+
+REFERENCE = ("ddim", 50)
+CLOSE = 0.1
+"""dB."""
+
+
+def rows(
+    artist: Artist,
+    samplers: Mapping[str, Mapping[str, Any]],
+    steps: Mapping[str, Sequence[int]],
+    scenes: Sequence[SceneBatch],
+    settings: Mapping[str, float],
+    tick: Callable[[str], None],
+) -> list[dict[str, Any]]:
+    """A row for each sampler and number of steps, the reference (50 steps of DDIM) first.
+
+    PSNR and SSIM are of novel views, mean over samples, views and scenes; `agreement` is the PSNR against the
+    reference's renders from the same noise. `ms` is the time of a sample with its reconstruction, without rendering,
+    of the fastest scene.
+    """
+    settled: list[Float[Tensor, "sample view 3 height width"]] = []
+    others = [(name, count) for name, counts in steps.items() for count in counts if (name, count) != REFERENCE]
+    found = []
+    for name, count in [REFERENCE, *others]:
+        tick(f"{name}, {count} steps")
+        artist.model.replace_sampler(samplers[name])
+        found.append({"sampler": name, "steps": count} | _row(artist, scenes, {**settings, "steps": count}, settled))
+    return found
+
+
+def _row(artist: Artist, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]) -> dict:
+    """Appends the renders to `settled` if these are the first."""
+    measured: list[dict[str, float]] = []
+    times = []
+    first = not settled
+    watch = Watch(artist.model)
+    for index, scene in enumerate(scenes):
+        with watch:
+            images = artist(scene, **settings)[:, 1:]
+        times.append(watch.seconds)
+        if first:
+            settled.append(images)
+        true = scene.targets.images.expand_as(images).flatten(0, 1)
+        flat = images.flatten(0, 1)
+        measured.append(
+            {
+                "psnr": psnr(flat, true).mean().item(),
+                "ssim": ssim(flat, true).mean().item(),
+                "diversity": diversity(images),
+                "agreement": psnr(flat, settled[index].flatten(0, 1)).mean().item(),
+            }
+        )
+    means = {key: sum(row[key] for row in measured) / len(measured) for key in measured[0]}
+    return means | {"calls": watch.calls, "ms": 1000 * min(times) / artist.samples}
+
+
+class Watch:
+    """Within its context: calls of the denoiser, and the time from the conditioning to the Gaussians."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model
+        self.calls, self.seconds = 0, 0.0
+
+    def __enter__(self) -> None:
+        self.calls = 0
+        parts = self.model.conditioning, self.model.denoiser, self.model.autoreconstructor.reconstructor
+        begin, count, end = self._begin, self._count, self._end
+        self.hooks = [
+            parts[0].register_forward_pre_hook(lambda *_: begin()),
+            parts[1].register_forward_pre_hook(lambda *_: count()),
+            parts[2].register_forward_hook(lambda *_: end()),
+        ]
+
+    def __exit__(self, *_: Any) -> None:
+        for hook in self.hooks:
+            hook.remove()
+
+    def _begin(self) -> None:
+        self.start = _now()
+
+    def _count(self) -> None:
+        self.calls += 1
+
+    def _end(self) -> None:
+        self.seconds = _now() - self.start
+
+
+def _now() -> float:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def fewest(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """Of the rows whose PSNR is within 0.1 dB of the reference's (the first row's) the one with the fewest calls."""
+    close = [row for row in rows if abs(row["psnr"] - rows[0]["psnr"]) <= CLOSE]
+    return min(close, key=lambda row: (row["calls"], -row["agreement"]))
+
+
+PANELS = [
+    ("psnr", "PSNR of novel views, dB"),
+    ("ssim", "SSIM of novel views"),
+    ("agreement", "PSNR against 50 steps of DDIM, dB"),
+    ("diversity", "Difference of two samples (RMS)"),
+    ("ms", "Time of a sample, ms"),
+]
+MARKERS = "osD^v"
+
+
+def plot_samplers(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
+    """Write a PNG with a panel for each measure and a line for each sampler; the grey band is 0.1 dB wide each way."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import ScalarFormatter
+
+    figure = Figure(figsize=(17, 4), layout="constrained")
+    figure.suptitle(title)
+    names = list(dict.fromkeys(row["sampler"] for row in rows))
+    for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+        # The reference agrees with itself, at the limit of PSNR.
+        shown = rows[1:] if key == "agreement" else rows
+        for index, name in enumerate(names):
+            own = sorted((row["calls"], row[key]) for row in shown if row["sampler"] == name)
+            if own:
+                panel.plot(*zip(*own, strict=True), color=f"C{index}", marker=MARKERS[index % 5], label=name)
+        if key == "psnr":
+            panel.axhspan(rows[0][key] - CLOSE, rows[0][key] + CLOSE, color="0.85", zorder=0)
+        panel.set(xscale="log", xlabel="denoiser calls", title=label)
+        panel.set_xticks(sorted({row["calls"] for row in rows} & {1, 2, 5, 10, 20, 50}))
+        panel.xaxis.set_major_formatter(ScalarFormatter())
+        panel.xaxis.set_minor_formatter("")
+        panel.grid(alpha=0.3)
+        if key in ("diversity", "ms"):
+            panel.set_ylim(bottom=0)
+    figure.axes[0].legend()
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -1,0 +1,167 @@
+"""Samples of a trained model, scene by scene: drawn, measured, side by side."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
+from completesplat.errors import DataError
+from completesplat.export.pictures import to_bytes
+from completesplat.generation import CompleteSplat
+from completesplat.geometry.cameras import Cameras
+from completesplat.metrics.images import PSNR_LIMIT
+from completesplat.rasterizers import Rasterizer, Rendering
+from completesplat.scene import SceneBatch
+
+
+@dataclass(frozen=True)
+class Artist:
+    """Draws samples and renders them, the reference view first and then all targets.
+
+    Args:
+        background: grey value where a scene leaves a pixel open.
+        samples: scenes drawn for an input, from the same noise whatever the settings.
+    """
+
+    model: CompleteSplat
+    rasterizer: Rasterizer
+    background: float
+    samples: int
+    seed: int
+
+    def __call__(self, scene: SceneBatch, **settings: Any) -> Float[Tensor, "sample view 3 height width"]:
+        """Renders of one scene (a batch of one) over the background, in [0, 1]; see `render`."""
+        return self.over_background(self.render(scene, **settings))
+
+    def over_background(self, rendering: Rendering) -> Float[Tensor, "*batch 3 height width"]:
+        """Renders in [0, 1]."""
+        return rendering.over(self.background).clamp(0, 1)
+
+    @torch.no_grad()
+    def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
+        """Colour, depth and opacity of one scene (a batch of one), [sample view].
+
+        Args:
+            **settings: of `CompleteSplat.generate`.
+        """
+        reference = scene.reference
+        gaussians = self.model.generate(
+            reference.images,
+            reference.cameras,
+            scene.depth_range,
+            samples=self.samples,
+            seed=self.seed,
+            **settings,
+        )
+        cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
+        return self.rasterizer(gaussians, cameras)
+
+
+def first_scenes(data: Any, count: int) -> Iterator[SceneBatch]:
+    """The first test scenes of a data module, each as a batch of one.
+
+    Raises:
+        DataError: there are less.
+    """
+    data.setup("test")
+    found = 0
+    for batch in data.test_dataloader():
+        for index in range(len(batch.names)):
+            if found < count:
+                yield batch[index : index + 1]
+            found += 1
+        if found >= count:
+            return
+    raise DataError(f"there are {found} test scenes, not scenes={count}", str(data.root))
+
+
+def object_psnr(
+    images: Float[Tensor, "sample view 3 height width"],
+    true: Float[Tensor, "view 3 height width"],
+    masks: Float[Tensor, "view 1 height width"],
+) -> float | None:
+    """PSNR (dB) of the samples over the true object's pixels of all views together; None if there are none."""
+    inside = (masks > 0.5).expand_as(true)
+    if not inside.any():
+        return None
+    error = (images - true).square().mean(0)[inside].mean().item()
+    return min(-10 * math.log10(error), PSNR_LIMIT) if error > 0 else PSNR_LIMIT
+
+
+def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
+    """Which targets [view] look in the reference's direction, up to an angle between the optical axes."""
+    return _cosines(reference, targets) >= math.cos(math.radians(degrees))
+
+
+def farthest(reference: Cameras, targets: Cameras) -> int:
+    """Which of the targets [view] looks in the direction most different from the reference's."""
+    return int(_cosines(reference, targets).argmin())
+
+
+def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:
+    """Of the angles between the optical axes."""
+    return targets.world_to_camera[:, 2, :3] @ reference.world_to_camera[2, :3]
+
+
+def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """The mean of each figure, over the scenes that have it; None if none has."""
+    means: dict[str, float | None] = {}
+    for key in measured[0]:
+        values = [value for row in measured if (value := row[key]) is not None]
+        means[key] = sum(values) / len(values) if values else None
+    return means
+
+
+READABLE_SIDE = 0.9
+"""Inches of a picture."""
+GAP = 1
+"""Pixels between the pictures of a strip."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Pictures side by side under a label."""
+
+    images: Float[Tensor, "picture 3 height width"]
+    label: str = ""
+    marked: bool = False
+
+
+def draw_strips(rows: Sequence[Sequence[Strip | None]], names: Sequence[str], path: Path, title: str) -> None:
+    """Write a PNG; None leaves a place empty.
+
+    Args:
+        rows: of equal length.
+        names: of the rows.
+    """
+    from matplotlib.figure import Figure
+
+    widths = [max(len(strip.images) for strip in column if strip) for column in zip(*rows, strict=True)]
+    size = (READABLE_SIDE * sum(widths) + 1.2, (READABLE_SIDE + 0.3) * len(rows) + 0.5)
+    figure = Figure(figsize=size, layout="constrained")
+    figure.suptitle(title)
+    panels = figure.subplots(len(rows), len(widths), squeeze=False, width_ratios=widths)
+    for row, name, places in zip(rows, names, panels, strict=True):
+        places[0].set_ylabel(name, fontsize=8)
+        for strip, panel, width in zip(row, places, widths, strict=True):
+            panel.set(xticks=[], yticks=[])
+            panel.spines[:].set_visible(False)
+            if strip is not None:
+                panel.imshow(to_bytes(_side_by_side(strip.images, width)), interpolation="nearest")
+                weight = "bold" if strip.marked else "normal"
+                panel.set_title(strip.label, fontsize=8, fontweight=weight, color="crimson" if strip.marked else "k")
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=130)
+
+
+def _side_by_side(images: Float[Tensor, "picture 3 height width"], count: int) -> Float[Tensor, "3 height _"]:
+    """With white in the place of missing pictures, so that all have one scale."""
+    white = torch.ones_like(images[0])
+    pictures = [*images, *[white] * (count - len(images))]
+    return torch.cat([part for image in pictures for part in (image, white[..., :GAP])], dim=-1)[..., :-GAP]

@@ -1,0 +1,172 @@
+"""How many sequences a data set has, how its cameras see and how far they move."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from completesplat.atomic import atomic_path
+from completesplat.data.sequences import PosedSequence
+
+# Key in the results, name for people, format.
+MEASURES = [
+    ("frames_per_sequence", "frames of a sequence", ",.0f"),
+    ("fov_degrees", "horizontal field of view, degrees", ".1f"),
+    ("near", "near, scene units", ".3g"),
+    ("far", "far, scene units", ".3g"),
+    ("distance_from_first", "distance from the first camera, scene units", ".3g"),
+    ("path_extent", "largest distance of two cameras, scene units", ".3g"),
+    ("largest_angle_degrees", "largest angle between two views, degrees", ".1f"),
+]
+BINS = 30
+CHUNK = 256
+
+# A sequence's smallest, median and largest value of each measure.
+Row = dict[str, tuple[float, float, float]]
+
+
+def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, Any]:
+    """Figures of each split, with numbers and None only: the content of a JSON file.
+
+    Sequences (of at least one frame) are taken one after the other; a few numbers of each are kept. Pictures are not
+    read.
+
+    Returns:
+        `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min`, `median` and `max`: the
+        smallest and the largest of all frames, and the median of the sequences' medians; None in a split without
+        sequences. `histograms`: measure -> `edges` and, by split, `counts` of the sequences' medians (for the distance
+        from the first camera: of the largest).
+    """
+    rows = {split: [_measure(sequence) for sequence in members] for split, members in sequences.items()}
+    return {
+        "splits": {split: _summary(members) for split, members in rows.items()},
+        "histograms": {key: _histogram(key, rows) for key, _, _ in MEASURES},
+    }
+
+
+def show_statistics(results: dict[str, Any]) -> None:
+    """Print the splits side by side."""
+    splits = results["splits"]
+    counts = Table(title="Sequences and frames", title_justify="left")
+    ranges = Table(title="Smallest, median and largest", title_justify="left")
+    for heading in ("split", "sequences", "frames"):
+        counts.add_column(heading, justify="left" if heading == "split" else "right", no_wrap=True)
+    for split, summary in splits.items():
+        counts.add_row(split, f"{summary['sequences']:,}", f"{summary['frames']:,}")
+    ranges.add_column("")
+    for split in splits:
+        for heading in (f"{split}\nmin", "\nmedian", "\nmax"):
+            ranges.add_column(heading, justify="right", no_wrap=True)
+    for key, label, form in MEASURES:
+        values = [splits[split][key][part] for split in splits for part in ("min", "median", "max")]
+        ranges.add_row(label, *("-" if value is None else format(value, form) for value in values))
+    console = Console(width=None if Console().is_terminal else 120, markup=False)
+    console.print(counts)
+    console.print(ranges)
+
+
+def _measure(sequence: PosedSequence) -> Row:
+    cameras, count = sequence.cameras, float(len(sequence.frames))
+    extent = _largest_distance(cameras.centers)
+    angle = _largest_angle(cameras.world_to_camera[:, 2, :3])
+    return {
+        "frames_per_sequence": (count, count, count),
+        "fov_degrees": _range(_fields_of_view(cameras.intrinsics, cameras.image_size[1])),
+        "near": _range(sequence.depth_ranges[:, 0]),
+        "far": _range(sequence.depth_ranges[:, 1]),
+        # The first camera's own zero counts only where there is no other.
+        "distance_from_first": _range((cameras.centers - cameras.centers[0]).norm(dim=-1)[min(1, int(count) - 1) :]),
+        "path_extent": (extent, extent, extent),
+        "largest_angle_degrees": (angle, angle, angle),
+    }
+
+
+def _range(values: Float[Tensor, " _"]) -> tuple[float, float, float]:
+    values = values.double()
+    return values.min().item(), values.quantile(0.5).item(), values.max().item()
+
+
+def _fields_of_view(intrinsics: Float[Tensor, "view 3 3"], width: int) -> Float[Tensor, " view"]:
+    """Horizontal angles in degrees between the left and the right edge."""
+    focal, center = intrinsics[:, 0, 0], intrinsics[:, 0, 2]
+    return (torch.atan(center / focal) + torch.atan((width - center) / focal)).rad2deg()
+
+
+def _largest_distance(centers: Float[Tensor, "view 3"]) -> float:
+    exact = "donot_use_mm_for_euclid_dist"
+    return max(torch.cdist(part, centers, compute_mode=exact).max().item() for part in centers.split(CHUNK))
+
+
+def _largest_angle(directions: Float[Tensor, "view 3"]) -> float:
+    """Between any two unit vectors, in degrees."""
+    # Half the angle from the length of the chord: accurate for small angles, as the arc cosine is not.
+    return float(np.degrees(2 * np.arcsin(min(1.0, _largest_distance(directions) / 2))))
+
+
+def _summary(rows: list[Row]) -> dict[str, Any]:
+    frames = sum(int(row["frames_per_sequence"][0]) for row in rows)
+    return {"sequences": len(rows), "frames": frames} | {key: _merged(rows, key) for key, _, _ in MEASURES}
+
+
+def _merged(rows: list[Row], key: str) -> dict[str, float | None]:
+    if not rows:
+        return {"min": None, "median": None, "max": None}
+    low, middle, high = np.array([row[key] for row in rows]).T
+    return {"min": float(low.min()), "median": float(np.median(middle)), "max": float(high.max())}
+
+
+def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
+    column = 2 if key == "distance_from_first" else 1
+    values = {split: np.array([row[key][column] for row in members]) for split, members in rows.items()}
+    together = np.concatenate([np.empty(0), *values.values()])
+    if key == "frames_per_sequence" and len(together):
+        # Whole numbers lie in the middle of equally many whole numbers, so that no bin is empty by rounding.
+        step = int(np.ceil((np.ptp(together) + 1) / BINS))
+        edges = np.arange(together.min() - 0.5, together.max() + step, step)
+    else:
+        edges = np.histogram_bin_edges(together, BINS)
+    counts = {split: np.histogram(members, edges)[0].tolist() for split, members in values.items()}
+    return {"edges": edges.tolist(), "counts": counts}
+
+
+# Measure, what is counted, the axis.
+PANELS = [
+    ("frames_per_sequence", "Length", "frames of a sequence"),
+    ("fov_degrees", "Field of view", "horizontal angle, degrees"),
+    ("largest_angle_degrees", "Turn", "largest angle between two views, degrees"),
+    ("distance_from_first", "Baseline", "largest distance from the first camera, scene units"),
+    ("near", "Near", "nearest depth, scene units"),
+    ("far", "Far", "farthest depth, scene units"),
+]
+DASHES = ["-", "--", ":"]
+
+
+def plot_statistics(results: dict[str, Any], path: Path, title: str = "") -> None:
+    """Write a PNG with a histogram over the sequences for six measures of `statistics`, one line for each split."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    total = {split: summary["sequences"] for split, summary in results["splits"].items()}
+    numbers = ", ".join(f"{count:,} {split}" for split, count in total.items())
+    figure.suptitle(f"{title}: sequences {numbers}" if title else f"Sequences: {numbers}")
+    for panel, (key, heading, label) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
+        histogram = results["histograms"][key]
+        for index, (split, count) in enumerate(total.items()):
+            if count:
+                shares = 100 * np.array(histogram["counts"][split]) / count
+                style: dict[str, Any] = {"color": f"C{index}", "linestyle": DASHES[index % len(DASHES)]}
+                panel.stairs(shares, histogram["edges"], baseline=None, linewidth=1.8, label=split, **style)
+                panel.stairs(shares, histogram["edges"], fill=True, alpha=0.15, color=f"C{index}")
+        panel.set(title=heading, xlabel=label, ylabel="sequences of the split, %")
+        panel.set_ylim(bottom=0)
+        panel.grid(alpha=0.3)
+    if any(total.values()):
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(total))
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
