@@ -7,7 +7,7 @@ from torchmetrics import MeanMetric
 from completesplat.baselines.projection import project_to_splatter_image
 from completesplat.gaussians import Gaussians
 from completesplat.scene import SceneBatch
-from completesplat.splatter_image import Parameterization
+from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.training.per_scene import PerScene
 
 
@@ -29,11 +29,18 @@ class Preoptimized(PerScene):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene, and keep what its reference view's Splatter Image has room for."""
-        cameras, depth_range = scenes.reference.cameras, scenes.depth_range
-        gaussians = super().reconstruct(scenes, seed)
-        image, empty = project_to_splatter_image(gaussians, cameras, depth_range, self.parameterization)
+        return self.splatter_image(scenes, seed).gaussians(scenes.reference.cameras, scenes.depth_range)
+
+    def splatter_image(self, scenes: SceneBatch, seed: int = 0) -> SplatterImage:
+        """Each scene's fitted Gaussians in the pixels of its reference view."""
+        gaussians, cameras = self.fitted(scenes, seed), scenes.reference.cameras
+        image, empty = project_to_splatter_image(gaussians, cameras, scenes.depth_range, self.parameterization)
         self.empty_pixels.update(empty.float().mean(dim=(1, 2)))
-        return image.gaussians(cameras, depth_range)
+        return image
+
+    def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Gaussians fitted to each scene's reference and targets, in the reference camera's frame."""
+        return super().reconstruct(scenes, seed)
 
     def on_test_start(self) -> None:
         super().on_test_start()
