@@ -44,7 +44,7 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
 
     metrics = strict_json(run / "metrics.json")
     assert metrics["upper_bound"]
-    assert metrics["test/empty_pixels"] > 1 - 300 / 1024
+    assert metrics["test"]["model"]["empty_pixels"] > 1 - 300 / 1024
     assert {f"train/{n}" for n in ("depth", "offset", "opacity", "scale", "rotation", "color", "kl")} < metrics.keys()
 
     assert command("test", f"ckpt={checkpoint}", f"out={scores}", "trainer.accelerator=cpu").status == 0
