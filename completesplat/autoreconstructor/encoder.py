@@ -30,6 +30,7 @@ class Encoder(nn.Module):
         layers_per_block: residual blocks per level.
         latent_channels: channels of the latent.
         norm_groups: groups of the group normalisation.
+        in_channels: of what is encoded; 3 for images.
     """
 
     def __init__(
@@ -38,10 +39,11 @@ class Encoder(nn.Module):
         layers_per_block: int = 2,
         latent_channels: int = 4,
         norm_groups: int = 32,
+        in_channels: int = 3,
     ) -> None:
         super().__init__()
         self.network = vae.Encoder(
-            in_channels=3,
+            in_channels=in_channels,
             out_channels=latent_channels,
             down_block_types=("DownEncoderBlock2D",) * len(channels),
             block_out_channels=tuple(channels),
@@ -60,9 +62,15 @@ class Encoder(nn.Module):
         Returns:
             The posterior, and each level's features before its downsampling (level 0 at full resolution).
         """
+        return self.encode(images * 2 - 1)
+
+    def encode(
+        self, values: Float[Tensor, "batch channel height width"]
+    ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
+        """Encode values as they are, which should lie around zero; returns what `forward` does."""
         network: Any = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__
-        hidden = network.conv_in(images * 2 - 1)
+        hidden = network.conv_in(values)
         features = []
         for block in network.down_blocks:
             for resnet in block.resnets:

@@ -75,6 +75,11 @@ def project_to_splatter_image(
     return Projection(SplatterImage(raw, parameterization), ~filled.any(dim=1).squeeze(1))
 
 
+def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:
+    """Which places of a projection's Splatter Image have a Gaussian."""
+    return image.split()["opacity"].squeeze(2) > EMPTY_LOGIT
+
+
 def _places(
     gaussians: Gaussians, cameras: Cameras, layers: int
 ) -> tuple[Int64[Tensor, " kept"], Int64[Tensor, " kept"]]:

@@ -3,15 +3,15 @@
 from typing import Any
 
 import torch
-from torchmetrics import MeanMetric
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
 from completesplat.baselines.projection import project_to_splatter_image
+from completesplat.data.loading.loader.distributed import gathered
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum
 from completesplat.scene import SceneBatch
-from completesplat.splatter_image import Parameterization
+from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.training.scene_module import SceneModule
 
 
@@ -48,8 +48,8 @@ class PerScene(SceneModule):
 class Preoptimized(PerScene):
     """What is left of fitted Gaussians in a Splatter Image of the reference view.
 
-    Like `PerScene`, it has seen the views that it is scored on. The test logs the share of pixels without any Gaussian
-    as `test/empty_pixels`, a mean over scenes; the paper reports 80 %.
+    Like `PerScene`, it has seen the views that it is scored on. The results of a test have the share of pixels without
+    any Gaussian as `empty_pixels`, a mean over scenes; the paper reports 80 %.
 
     Args:
         parameterization: layers and activations of the Splatter Image.
@@ -59,20 +59,31 @@ class Preoptimized(PerScene):
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:
         super().__init__(**fitting_and_rendering)
         self.parameterization = parameterization
-        self.empty_pixels = MeanMetric()
+        self._empty, self._projected = 0.0, 0
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene, and keep what its reference view's Splatter Image has room for."""
-        cameras, depth_range = scenes.reference.cameras, scenes.depth_range
-        gaussians = super().reconstruct(scenes, seed)
-        image, empty = project_to_splatter_image(gaussians, cameras, depth_range, self.parameterization)
-        self.empty_pixels.update(empty.float().mean(dim=(1, 2)))
-        return image.gaussians(cameras, depth_range)
+        return self.splatter_image(scenes, seed).gaussians(scenes.reference.cameras, scenes.depth_range)
+
+    def splatter_image(self, scenes: SceneBatch, seed: int = 0) -> SplatterImage:
+        """Each scene's fitted Gaussians in the pixels of its reference view."""
+        gaussians, cameras = self.fitted(scenes, seed), scenes.reference.cameras
+        image, empty = project_to_splatter_image(gaussians, cameras, scenes.depth_range, self.parameterization)
+        self._empty += empty.float().mean(dim=(1, 2)).sum().item()
+        self._projected += len(empty)
+        return image
+
+    def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Gaussians fitted to each scene's reference and targets, in the reference camera's frame."""
+        return super().reconstruct(scenes, seed)
 
     def on_test_start(self) -> None:
         super().on_test_start()
-        self.empty_pixels.reset()
+        self._empty, self._projected = 0.0, 0
 
-    def on_test_epoch_end(self) -> None:
-        super().on_test_epoch_end()
-        self.log("test/empty_pixels", self.empty_pixels)
+    def test_results(self) -> dict[str, Any]:
+        """Those of `SceneModule`, and `empty_pixels`, of all processes, of which some may have had no scene."""
+        results = super().test_results()
+        empty, projected = zip(*gathered((self._empty, self._projected)), strict=True)
+        results["model"]["empty_pixels"] = sum(empty) / max(sum(projected), 1)
+        return results

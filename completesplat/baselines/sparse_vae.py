@@ -1,0 +1,106 @@
+"""A VAE of sparse Splatter Images, the second half of what the supplement tried and could not train.
+
+The supplement ("Pre-optimizing 3D Gaussian splats and projecting into Splatter Images") states neither the network nor
+the loss: "We find it difficult to train a VAE to encode each modalities of such sparse splatter images".
+"""
+
+from collections.abc import Callable, Iterable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.baselines.projection import occupied
+from completesplat.errors import CompleteSplatError
+from completesplat.splatter_image import CHANNELS, SplatterImage
+
+
+class SparseVAE(nn.Module):
+    """Splatter Image -> latent -> Splatter Image, in the autoreconstructor's blocks without skips.
+
+    A place is one layer of one pixel. The encoder sees the 15 raw values of every place, normalised, or zeros where the
+    place is empty, and whether it is occupied. The decoder's outputs are normalised raw values; that a place is empty
+    is said by a low opacity. In training a latent is drawn from the posterior, in evaluation its mode is used.
+
+    Args:
+        encoder: makes an `Encoder` of so many `in_channels`.
+        reconstructor: without skips, which would carry the Splatter Image past the latent. Its last convolution starts
+            as PyTorch's do, since its outputs are normalised.
+
+    Raises:
+        CompleteSplatError: a reconstructor with skips.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, encoder: Callable[..., Encoder], reconstructor: Reconstructor) -> None:
+        super().__init__()
+        if len(reconstructor.skips) > 0:
+            raise CompleteSplatError("a VAE of Splatter Images has no skips: set its reconstructor's skip_levels=[]")
+        layers = reconstructor.parameterization.layers
+        self.encoder = encoder(in_channels=layers * (CHANNELS + 1))
+        self.reconstructor = reconstructor
+        reconstructor.network.conv_out.reset_parameters()
+        # Of the raw values of occupied places, by layer and channel.
+        self.register_buffer("mean", torch.zeros(layers, CHANNELS, 1, 1))
+        self.register_buffer("std", torch.ones(layers, CHANNELS, 1, 1))
+
+    def forward(self, image: SplatterImage) -> Reconstruction:
+        """Encode and decode a sparse Splatter Image."""
+        there = occupied(image)[:, :, None]
+        seen = torch.cat([torch.where(there, self.normalize(image.raw), 0.0), there.float()], dim=2)
+        posterior, _ = self.encoder.encode(seen.flatten(1, 2))
+        latent = posterior.sample() if self.training else posterior.mode()
+        decoded = self.reconstructor(latent, ())
+        return Reconstruction(SplatterImage(self.denormalize(decoded.raw), decoded.parameterization), posterior)
+
+    def normalize(
+        self, raw: Float[Tensor, "batch layer 15 height width"]
+    ) -> Float[Tensor, "batch layer 15 height width"]:
+        """Raw values with mean 0 and deviation 1 in each channel of each layer."""
+        return (raw - self.mean) / self.std
+
+    def denormalize(
+        self, values: Float[Tensor, "batch layer 15 height width"]
+    ) -> Float[Tensor, "batch layer 15 height width"]:
+        """The raw values that `normalize` made these of."""
+        return values * self.std + self.mean
+
+    @torch.no_grad()
+    def measure(self, images: Iterable[SplatterImage]) -> None:
+        """Set the normalisation to mean and deviation over the occupied places of these.
+
+        A channel that does not vary is only centred, a layer without any Gaussian left as it is.
+        """
+        count, total, squares = (torch.zeros_like(self.mean, dtype=torch.float64) for _ in range(3))
+        for image in images:
+            there = occupied(image)[:, :, None]
+            raw = torch.where(there, image.raw, 0.0).double()
+            count += there.double().sum(dim=(0, 3, 4), keepdim=True)[0]
+            total += raw.sum(dim=(0, 3, 4), keepdim=True)[0]
+            squares += raw.square().sum(dim=(0, 3, 4), keepdim=True)[0]
+        mean = total / count.clamp(min=1)
+        variance = squares / count.clamp(min=1) - mean.square()
+        self.mean.copy_(mean)
+        self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
+
+    def errors(self, found: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
+        """How well each group of raw values is reconstructed.
+
+        Returns:
+            "depth", "offset", "scale", "rotation", "color": mean squared error of the normalised values over occupied
+            places. "opacity": binary cross entropy of the opacities over all places, in nats; an empty one's is 0.
+        """
+        there = occupied(truth)[:, :, None]
+        squared = torch.where(there, self.normalize(found.raw) - self.normalize(truth.raw), 0.0).square()
+        places = there.sum().clamp(min=1)
+        errors = {
+            name: group.sum() / (places * group.shape[2])
+            for name, group in SplatterImage(squared, truth.parameterization).split().items()
+        }
+        logits, opacities = found.split()["opacity"], truth.split()["opacity"].sigmoid()
+        return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}

@@ -1,0 +1,110 @@
+"""The supplement's second failed approach as a whole: fit Gaussians, project them, train a VAE on the projections."""
+
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.baselines.sparse_vae import SparseVAE
+from completesplat.data.loading.distributed import processes
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.scene import SceneBatch
+from completesplat.tensors import stack
+from completesplat.training.fitted_scenes import FittedScenes
+from completesplat.training.per_scene import Preoptimized
+
+
+class PreoptimizedVAE(Preoptimized):
+    """A VAE trained on `Preoptimized`'s Splatter Images, and what it makes of the test scenes' ones.
+
+    Before training, Gaussians are fitted to each training sequence, to all its pictures, and kept in files; sequences
+    of the validation set follow when they are first looked at. From these a training step makes the Splatter Images of
+    its reference views: all views of a sequence are trained on, and no more than a batch of them is in memory. Pictures
+    are used by the fits alone, so their augmentation has no effect. Scenes of the test are fitted as they are tested,
+    to the views that they are scored on.
+
+    The loss, which the paper does not state, is the mean of the errors of depth, offset, scale, rotation and colour,
+    plus the weighted error of the opacity (`SparseVAE.errors`), plus the weighted KL, divided by the number of raw
+    values as `KullbackLeibler` is by those of a picture.
+
+    Args:
+        vae: network.
+        folder: of the fitted Gaussians (see `FittedScenes`).
+        normalization_batches: of the training set, on which the normalisation of raw values is measured.
+        opacity_weight, kl_weight: of the loss.
+        **preoptimized: see `Preoptimized`.
+    """
+
+    def __init__(
+        self,
+        vae: SparseVAE,
+        folder: str,
+        normalization_batches: int,
+        opacity_weight: float,
+        kl_weight: float,
+        **preoptimized: Any,
+    ) -> None:
+        super().__init__(vae.reconstructor.parameterization, **preoptimized)
+        self.vae = vae
+        self.folder = Path(folder)
+        self.normalization_batches = normalization_batches
+        self.opacity_weight = opacity_weight
+        self.kl_weight = kl_weight
+        self._kept: FittedScenes | None = None
+
+    def on_fit_start(self) -> None:
+        """Fit the training set, each process its share of it, and measure the normalisation.
+
+        Raises:
+            CompleteSplatError: encoded pictures.
+            DataError: a training sequence or one of its pictures cannot be read.
+        """
+        trainer: Any = self.trainer
+        data = trainer.datamodule
+        if data.encoded is not None:
+            raise CompleteSplatError("data.encoded is for latent diffusion (model=latent_diffusion): set it to null")
+        terms = {name: term.weight for name, term in self.loss.terms.items()}
+        settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
+        stores = [data.store("val"), data.store("train")]
+        self._kept = FittedScenes(self.folder, stores, super().fitted, settings)
+        rank, count = processes()
+        self._kept.complete(data.store("train").names[rank::count], progress=trainer.is_global_zero)
+        trainer.strategy.barrier("FittedScenes")
+        batches = islice(data.train_dataloader(), self.normalization_batches)
+        self.vae.measure(self.splatter_image(scenes.to(self.device)) for scenes in batches)
+
+    def on_fit_end(self) -> None:
+        self._kept = None
+
+    def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """While it is trained, what is kept of whole sequences; otherwise Gaussians fitted to the scenes' views."""
+        if self._kept is None:
+            gaussians = super().fitted(scenes, seed)
+            return replace(gaussians, quaternions=normalize_quaternion(gaussians.quaternions))
+        frames = zip(scenes.names, scenes.reference_frame.tolist(), strict=True)
+        return stack([self._kept.seen_from(name, frame) for name, frame in frames]).to(self.device)
+
+    def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
+        truth = self.splatter_image(scenes)
+        reconstruction = self.vae(truth)
+        assert reconstruction.posterior is not None
+        with torch.autocast(self.device.type, enabled=False):
+            errors = self.vae.errors(reconstruction.splatter_image, truth)
+            kl = reconstruction.posterior.kl().mean() / truth.raw[0].numel()
+            opacity = errors.pop("opacity")
+            values = torch.stack(list(errors.values())).mean()
+            total = values + self.opacity_weight * opacity + self.kl_weight * kl
+        logged = {f"train/{name}": value.detach() for name, value in (errors | {"opacity": opacity, "kl": kl}).items()}
+        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        return total
+
+    def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
+        """Gaussians of the Splatter Images after they have passed through the VAE."""
+        image = self.vae(self.splatter_image(scenes, seed)).splatter_image
+        return image.gaussians(scenes.reference.cameras, scenes.depth_range)

@@ -1,0 +1,136 @@
+"""Gaussians fitted once to whole sequences, and the VAE that is trained on their Splatter Images."""
+
+import re
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import SMALL, compose_config, strict_json
+
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import transform_points
+from completesplat.scene import SceneBatch
+from completesplat.training.checkpoints import read_checkpoint
+from completesplat.training.fitted_scenes import FittedScenes
+
+SETTINGS = [
+    "experiment=toy_var",
+    "model=preoptimized_vae",
+    "model.fitting.count=300",
+    "model.fitting.steps=3",
+    *SMALL,
+]
+MORE = ["trainer.max_steps=3", "test=false"]
+
+
+def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
+    run, scores = tmp_path / "run", tmp_path / "scores"
+    settings = [*SETTINGS, f"data.root={toy_root}", f"model.folder={run}/fitted"]
+    first = command("fit", *settings, f"out={run}")
+    assert first.status == 0
+    assert "fitted Gaussians to 2 of 2 scenes" in first.out + first.err
+    files = {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()}
+    assert len(files) == 3  # two sequences of training, one of validation
+    state = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
+    assert state["vae.std"].shape == (2, 15, 1, 1)
+    assert not torch.equal(state["vae.std"], torch.ones(2, 15, 1, 1))
+
+    checkpoint = run / "checkpoints/last.ckpt"
+    again = command("fit", *settings, f"ckpt_path={checkpoint}", *MORE, f"out={tmp_path / 'more'}")
+    assert again.status == 0
+    assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3
+    assert "fitted Gaussians" not in again.out + again.err
+    assert {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()} == files
+
+    metrics = strict_json(run / "metrics.json")
+    assert metrics["upper_bound"]
+    assert metrics["test"]["model"]["empty_pixels"] > 1 - 300 / 1024
+    assert {f"train/{n}" for n in ("depth", "offset", "opacity", "scale", "rotation", "color", "kl")} < metrics.keys()
+
+    assert command("test", f"ckpt={checkpoint}", f"out={scores}", "trainer.accelerator=cpu").status == 0
+    for group in ("novel", "reference"):
+        own, after = (
+            m["model"]["full"][group]["psnr"] for m in (metrics["test"], strict_json(scores / "metrics.json"))
+        )
+        assert own == pytest.approx(after, abs=1e-3)
+    assert len(list((run / "fitted").iterdir())) == 3  # the test keeps nothing
+
+
+def test_encoded_pictures_are_refused(command, toy_root, latent_cache):
+    refused = command(
+        "fit", *SETTINGS, f"data.root={toy_root}", f"data.encoded={latent_cache}", "data.color_jitter=null"
+    )
+    assert refused.status == 2
+    assert re.search(r"^error: data\.encoded is for latent diffusion", refused.err, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("ablation", "layers"), [("full", 2), ("skips_first_two", 2), ("m1", 1)])
+def test_ablations_change_the_layers_and_bring_no_skips(ablation, layers):
+    config = compose_config("fit", *SETTINGS, f"ablation={ablation}")
+    vae = instantiate(config.model, _convert_="all").vae
+    assert len(vae.reconstructor.skips) == 0
+    # 15 raw values of each layer, and whether it is occupied.
+    assert vae.encoder.network.conv_in.in_channels == 16 * layers
+    assert vae.reconstructor.network.conv_out.out_channels == 15 * layers
+
+
+def test_the_decoder_is_all_that_the_test_sees(toy_root):
+    """The Gaussians are those of the VAE's output, as many as there are places."""
+    config = compose_config("fit", *SETTINGS, f"data.root={toy_root}")
+    torch.manual_seed(0)
+    module = instantiate(config.model, _convert_="all").eval()
+    data = instantiate(config.data, _convert_="all")
+    data.setup("test")
+    scenes = next(iter(data.test_dataloader()))
+    with torch.inference_mode():
+        found = module.reconstruct(scenes)
+        decoded = module.vae(module.splatter_image(scenes)).splatter_image
+    assert torch.equal(found.means, decoded.gaussians(scenes.reference.cameras, scenes.depth_range).means)
+    assert found.count == 2 * 32 * 32
+
+
+@pytest.fixture
+def store(toy_root):
+    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
+    return data.store("train")
+
+
+MEANS = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.2, 2.5]])
+
+
+def known_gaussians() -> Gaussians:
+    """Of one scene, in the frame of its reference."""
+    quaternions = torch.tensor([1.0, 0, 0, 0]).repeat(1, 2, 1)
+    return Gaussians(MEANS[None], quaternions, torch.full((1, 2, 3), 0.1), torch.ones(1, 2), torch.zeros(1, 2, 3))
+
+
+def test_a_scene_is_fitted_once_to_all_its_pictures_and_seen_from_any_of_its_cameras(store, tmp_path):
+    calls = []
+
+    def fit(scenes: SceneBatch) -> Gaussians:
+        calls.append((scenes.names, len(scenes.targets.images[0]), int(scenes.reference_frame)))
+        return known_gaussians()
+
+    name = store.names[0]
+    cameras = store.source.read(name).cameras.to(torch.float32)
+    kept = FittedScenes(tmp_path / "fitted", [store], fit, "settings")
+    seen = [kept.seen_from(name, frame) for frame in range(4)]
+    assert calls == [((name,), 3, 0)]
+    world = transform_points(cameras[0].camera_to_world, MEANS)
+    for frame, gaussians in enumerate(seen):
+        torch.testing.assert_close(
+            gaussians.means, transform_points(cameras[frame].world_to_camera, world), atol=1e-5, rtol=1e-5
+        )
+
+
+def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tmp_path):
+    calls = []
+
+    def fit(scenes: SceneBatch) -> Gaussians:
+        calls.append(scenes.names[0])
+        return known_gaussians()
+
+    for settings in ("one", "one", "other"):
+        FittedScenes(tmp_path, [store], fit, settings).complete(store.names, progress=False)
+    assert calls == [*store.names, *store.names]
+    assert not list(tmp_path.glob("*.unfinished"))
