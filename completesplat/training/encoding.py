@@ -20,7 +20,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.latent_cache.manifest import Array, Manifest, Origin, is_encoded, write_manifest
 from completesplat.data.latent_cache.pictures import Picture, Reading, check_space
 from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore
-from completesplat.data.loading.loader.module import SceneDataModule
+from completesplat.data.loading.module import SceneDataModule
 from completesplat.data.packed.manifest import Refusal
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError, WeightsError

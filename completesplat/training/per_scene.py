@@ -6,7 +6,7 @@ import torch
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
 from completesplat.baselines.projection import project_to_splatter_image
-from completesplat.data.loading.loader.distributed import gathered
+from completesplat.data.loading.distributed import gathered
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum

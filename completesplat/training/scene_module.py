@@ -18,7 +18,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.depths import evaluation_depths
-from completesplat.data.loading.loader.distributed import gathered
+from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from completesplat.data.loading.loader.distributed import batch_per_process
 from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 from torch import distributed, multiprocessing
 
+from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError
 from completesplat.training.reconstruction import ReconstructionModule
 
