@@ -1,7 +1,8 @@
-"""The README's commands, run as printed (and briefly), in one folder, each with what those before it left."""
+"""The documents' commands, run as printed (and briefly), in one folder, each with what those before it left."""
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -12,29 +13,16 @@ import numpy as np
 import pytest
 from PIL import Image
 from support import SMALL
-from written_commands import arguments_of, readme_commands
+from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
-# Later ones need what earlier ones make.
-ORDER = [
-    "data toy",
-    "fit experiment",
-    "data latents",
-    "fit",
-    "predict",
-    "data",
-    "test",
-    "view",
-    "report",
-    "bench",
-    "doctor",
-]
 # Appended to make them short; everything else is as printed.
 BRIEF = {
     "data toy": ["scenes=20", "frames=4", "size=32", "workers=1"],
+    "data prepare data=toy_objects": ["data.image_size=32", "workers=1"],
     "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.pictures=null"],
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],
-    "report samplers": ["scenes=1", "samples=2"],
+    **{f"report {study}": ["scenes=1", "samples=2"] for study in ("samplers", "controls", "masked", "depth")},
 }
 # What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one).
 NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1")
@@ -42,13 +30,31 @@ TAKES_MINUTES = ("completesplat bench",)
 
 
 def runnable() -> list[str]:
-    commands = [one for one in readme_commands() if not any(word in one for word in (*NEEDS_MORE, *TAKES_MINUTES))]
+    """The commands of the documents' code blocks, each once; those of the weights' cards have made the weights."""
+    commands = [command for path in DOCUMENTS if path not in CARDS for command in block_commands(path)]
+    skipped = (*NEEDS_MORE, *TAKES_MINUTES)
+    return in_order([one for one in dict.fromkeys(commands) if not any(word in one for word in skipped)])
 
-    def rank(command: str) -> int:
-        words = command.removeprefix("completesplat ")
-        return next(i for i, start in enumerate(ORDER) if words.startswith(start))
 
-    return sorted(commands, key=rank)
+def in_order(commands: list[str]) -> list[str]:
+    """Each after those that write the folders it names; what reads all runs comes last."""
+    waiting = sorted(commands, key=lambda command: "runs=" in command)
+    ordered: list[str] = []
+    while waiting:
+        unwritten = {written_by(command) for command in waiting}
+        ready = next(one for one in waiting if not (named_in(one) - {written_by(one)}) & unwritten)
+        waiting.remove(ready)
+        ordered.append(ready)
+    return ordered
+
+
+def written_by(command: str) -> str | None:
+    return next((word.removeprefix("out=") for word in arguments_of(command) if word.startswith("out=")), None)
+
+
+def named_in(command: str) -> set[str]:
+    """Its words in capitals: folders, as the documents write them."""
+    return set(re.findall(r"\b[A-Z][A-Z0-9]+\b", command))
 
 
 @pytest.fixture(scope="module")
@@ -117,5 +123,9 @@ def test_the_command_does_what_it_is_printed_for(command, folder):
     assert finished.returncode == 0, finished.stderr[-3000:]
 
 
-def test_the_order_knows_every_command():
-    assert len(runnable()) > 20
+def test_commands_come_after_those_that_write_what_they_name():
+    order = in_order(runnable()[::-1])
+    assert len(order) > 30
+    for index, command in enumerate(order):
+        later = {written_by(other) for other in order[index + 1 :]} - {written_by(command)}
+        assert not named_in(command) & later

@@ -1,8 +1,18 @@
-"""What the README and `--help` tell people to type is accepted."""
+"""What the documents and `--help` tell people to type is accepted."""
 
 import pytest
 from omegaconf import OmegaConf
-from written_commands import arguments_of, composed, experiment_commands, help_commands, readme_commands
+from written_commands import (
+    DOCUMENTS,
+    README,
+    arguments_of,
+    block_commands,
+    composed,
+    document_commands,
+    experiment_commands,
+    help_commands,
+    inline_commands,
+)
 
 from completesplat.cli import VERBS
 from completesplat.commands import conf_folder
@@ -14,11 +24,14 @@ def test_every_verb_has_examples():
     assert {arguments_of(command)[0] for command in help_commands()} == set(VERBS)
 
 
-def test_the_readme_shows_every_verb():
-    assert {arguments_of(command)[0] for command in readme_commands()} >= set(VERBS)
+def test_the_readme_names_every_verb_and_the_documents_show_it():
+    named = [*block_commands(README), *inline_commands(README)]
+    shown = [command for document in DOCUMENTS for command in block_commands(document)]
+    assert {arguments_of(command)[0] for command in named} >= set(VERBS)
+    assert {arguments_of(command)[0] for command in shown} == set(VERBS)
 
 
-@pytest.mark.parametrize("command", sorted({*help_commands(), *readme_commands()}))
+@pytest.mark.parametrize("command", sorted({*help_commands(), *document_commands()}))
 def test_the_command_composes(command):
     if arguments_of(command)[-1] != "--help":
         assert OmegaConf.to_container(composed(command))

@@ -1,4 +1,4 @@
-"""The commands that the README and the verbs' `--help` print: found, and composed as the command line would."""
+"""The commands that the documents and the verbs' `--help` print: found, and composed as the command line would."""
 
 import re
 import shlex
@@ -10,21 +10,39 @@ from support import compose_config
 from completesplat.cli import VERBS
 from completesplat.commands import TASKS, conf_folder
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+CARDS = sorted((ROOT / "completesplat/weights").rglob("README.md"))
+FOLDERS = [*sorted((ROOT / "completesplat").rglob("README.md")), ROOT / "conf/README.md"]
+DOCUMENTS = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *FOLDERS]
+
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`(completesplat [^`]+)`")
 
 
-def readme_commands() -> list[str]:
-    """Lines of the README's code blocks that start with `completesplat`; a backslash joins lines."""
-    blocks = [block.replace("\\\n", " ") for block in BLOCK.findall(README.read_text())]
+def block_commands(document: Path) -> list[str]:
+    """Lines of its code blocks that start with `completesplat`, without comments; a backslash joins lines."""
+    blocks = [block.replace("\\\n", " ") for block in BLOCK.findall(document.read_text())]
     lines = [line for block in blocks for line in block.splitlines()]
-    return [line.strip() for line in lines if line.startswith("completesplat ")]
+    return [plain(line) for line in lines if line.startswith("completesplat ")]
+
+
+def inline_commands(document: Path) -> list[str]:
+    """The commands within its sentences and tables; those without a setting may be a verb's name alone."""
+    return [plain(command) for command in INLINE.findall(BLOCK.sub("", document.read_text()))]
+
+
+def document_commands() -> list[str]:
+    """All complete commands of all documents, each once."""
+    found = [command for document in DOCUMENTS for command in block_commands(document)]
+    found += [command for document in DOCUMENTS for command in inline_commands(document) if "=" in command]
+    return list(dict.fromkeys(found))
 
 
 def help_commands() -> list[str]:
     """The examples of every verb's configuration."""
     lines = [line.strip() for verb in VERBS for line in (conf_folder() / f"{verb}.yaml").read_text().splitlines()]
-    return [line for line in lines if line.startswith("completesplat ") and "${" not in line]
+    return [plain(line) for line in lines if line.startswith("completesplat ") and "${" not in line]
 
 
 def experiment_commands(name: str) -> list[str]:
@@ -32,6 +50,11 @@ def experiment_commands(name: str) -> list[str]:
     text = (conf_folder() / "experiment" / f"{name}.yaml").read_text()
     comments = "\n".join(line[1:] for line in text.splitlines() if line.startswith("#")).replace("\\\n", " ")
     return [" ".join(line.split()) for line in comments.splitlines() if line.strip().startswith("completesplat ")]
+
+
+def plain(line: str) -> str:
+    """A command as the shell reads it: without its comment, quoted in one way."""
+    return shlex.join(shlex.split(line, comments=True))
 
 
 def arguments_of(command: str) -> list[str]:

@@ -1,0 +1,98 @@
+"""What the documents say of the repository is so: links, paths, targets of make, groups, versions, authors."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from written_commands import BLOCK, DOCUMENTS, README, ROOT
+
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+PATH = re.compile(r"`((?:completesplat|conf|tests|notebooks|\.ci)/[\w./]*)`")
+YOURS = "conf/rasterizer/mine.yaml"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def prose(path: Path) -> str:
+    return BLOCK.sub("", path.read_text())
+
+
+def anchors(path: Path) -> set[str]:
+    """The names that GitHub gives to headings."""
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def links(path: Path) -> list[str]:
+    """Those that lead into the repository."""
+    return [link for link in LINK.findall(prose(path)) if "://" not in link]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_links_and_pictures_lead_somewhere(document):
+    for link in links(document):
+        file, _, anchor = link.partition("#")
+        target = (document.parent / file).resolve() if file else document
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+def test_paths_and_targets_of_make_exist(document):
+    text = document.read_text()
+    for path in PATH.findall(text):
+        assert (ROOT / path).exists() or path == YOURS, path
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", text, re.MULTILINE)) <= targets
+
+
+def test_the_readme_is_a_page_and_leads_to_every_document():
+    assert len(README.read_text().splitlines()) <= 120
+    reached, waiting = set(), [README]
+    while waiting:
+        document = waiting.pop()
+        reached.add(document)
+        targets = {(document.parent / link.partition("#")[0]).resolve() for link in links(document)}
+        waiting += [target for target in targets & set(DOCUMENTS) if target not in reached]
+    assert reached == set(DOCUMENTS)
+
+
+def test_the_groups_of_settings_are_all_described():
+    table = [line for line in (ROOT / "conf/README.md").read_text().splitlines() if line.startswith("| `")]
+    described = {name for line in table for name in re.findall(r"`(\w+)`", line.split("|")[1])}
+    assert described == {path.name for path in (ROOT / "conf").iterdir() if path.is_dir()}
+
+
+def test_the_citation_is_the_readmes():
+    citation = OmegaConf.load(ROOT / "CITATION.cff")
+    paper, text = citation["preferred-citation"], README.read_text()
+    authors = " and ".join(f"{one['family-names']}, {one['given-names']}" for one in paper.authors)
+    for field, value in {"title": paper.title, "author": authors, "year": paper.year}.items():
+        assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
+    assert citation.version == PROJECT["version"]
+    assert citation.license == PROJECT["license"]
+
+
+def test_the_changelog_knows_this_version():
+    assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_the_hooks_are_the_checks_of_make():
+    hooks = [hook for repo in OmegaConf.load(ROOT / ".pre-commit-config.yaml").repos for hook in repo.hooks]
+    recipe = subprocess.run(["make", "--dry-run", "check"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert all(hook.language == "system" for hook in hooks)
+    assert {hook.entry.removesuffix(" --force-exclude") for hook in hooks} <= set(recipe.splitlines())
+
+
+def test_the_workflow_runs_what_must_hold_before_a_change_lands():
+    text = (ROOT / ".github/workflows/ci.yml").read_text()
+    assert "- run: .ci/run\n" in text
+    assert re.findall(r"uses: \S+", text) == re.findall(r"uses: actions/[\w-]+@v\d+(?=\n)", text)
+    lowest = PROJECT["requires-python"].removeprefix(">=")
+    assert f'python-version: "{lowest}"' in text
