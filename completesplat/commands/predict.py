@@ -9,65 +9,46 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import Progress
+from torch import Tensor
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.data.pictures.photograph import Photograph
-from completesplat.diffusion.guidance import check_guidance_weight
+from completesplat.commands.generator import check_settings, open_generator
+from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
+from completesplat.rasterizers import Rasterizer
 
-
-def open_generator(config: Any) -> Any:
-    """The generator of `weights`, with the sampler that is wanted; says so if they are the package's own.
-
-    Raises:
-        WeightsError: no weights, or not readable.
-    """
-    from omegaconf import OmegaConf
-
-    from completesplat.generation import CompleteSplat
-    from completesplat.weights import in_the_box
-
-    if config.weights in in_the_box():
-        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
-    model = CompleteSplat.from_pretrained(config.weights)
-    if config.get("sampler") is not None:
-        sampler: Any = OmegaConf.to_container(config.sampler)
-        model.replace_sampler(sampler)
-    return model
-
-
-FAR = 1.5
-
-
-def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
-    """What to tell if the field of view is far from training's: if the tangents of half of it differ 1.5 times or more.
-
-    The networks see pixels, not angles, and put them at the depths that they have learnt. Across the picture lengths
-    go with the tangent, along the depth they do not: so the ratio of the tangents is that of the wrong proportions.
-    """
-    own, trained = (math.tan(math.radians(fov) / 2) for fov in (photograph.fov_degrees, trained_degrees))
-    ratio = own / trained
-    if 1 / FAR < ratio < FAR:
-        return None
-    wrong = f"{ratio:.1f} times too flat" if ratio > 1 else f"{1 / ratio:.1f} times too deep"
-    source = "given" if photograph.fov_source == "given" else "from EXIF; fov=DEGREES overrides it"
-    return (
-        f"the field of view is {photograph.fov_degrees:.0f} degrees ({source}), {trained_degrees:.0f} in training:"
-        f" expect shapes about {wrong}"
-    )
-
-
+RANGES = {"background": (0, 1), "samples": (1, None), "frames": (1, None), "batch": (1, None), "steps": (1, 1000)}
+"""Smallest and largest value of the settings that are numbers."""
 SUFFIXES = (
     *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif"),
     *(".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm"),
 )
+FAR = 1.5
+"""Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
+
+log = logging.getLogger(__name__)
+
+
+def run(config: Any, out: Path) -> None:
+    """Write each photograph's files into `out/<its name>/`.
+
+    Raises:
+        CompleteSplatError: settings without a meaning, or at least one picture that failed.
+    """
+    check_settings(config, RANGES)
+    pictures = find_pictures(config.image)
+    if config.mask is not None and len(pictures) > 1:
+        raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
+    wanted = wanted_files(config)  # before the model runs: is the converter there?
+    predict_pictures(config, open_generator(config), pictures, wanted, out)
 
 
 def find_pictures(image: Any) -> list[Path]:
@@ -93,39 +74,6 @@ def find_pictures(image: Any) -> list[Path]:
     return found
 
 
-def folder_names(pictures: Sequence[Path]) -> list[str]:
-    """A name for each picture's folder: its stem, and for a stem that is taken `_2`, `_3` and so on behind it.
-
-    Capitals do not tell names apart, because they do not on every file system.
-    """
-    names: list[str] = []
-    taken: set[str] = set()
-    for picture in pictures:
-        name, number = picture.stem, 2
-        while name.casefold() in taken:
-            name, number = f"{picture.stem}_{number}", number + 1
-        taken.add(name.casefold())
-        names.append(name)
-    return names
-
-
-def check_settings(config: Any) -> None:
-    """Refuse settings without a meaning.
-
-    Raises:
-        CompleteSplatError: names the setting and its range.
-    """
-    allowed_skip_weight(config.skip_weight)
-    check_guidance_weight(config.guidance_weight)
-    if not 0 <= config.background <= 1:
-        raise CompleteSplatError(f"background={config.background}: must lie between 0 and 1")
-    for name in ("samples", "frames", "batch"):
-        if config[name] is not None and config[name] < 1:
-            raise CompleteSplatError(f"{name}={config[name]}: must be at least 1")
-    if config.steps is not None and not 1 <= config.steps <= 1000:
-        raise CompleteSplatError(f"steps={config.steps}: must lie between 1 and 1000")
-
-
 def wanted_files(config: Any) -> Wanted:
     """What to write of each picture; looks for the converter if a format needs it.
 
@@ -141,7 +89,7 @@ def wanted_files(config: Any) -> Wanted:
         frames=config.frames,
         background=config.background,
         maps=config.maps,
-        widen=config.widen,
+        screen_space_dilation=config.screen_space_dilation,
         converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
     )
 
@@ -155,36 +103,13 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def visible_part(config: Any, image: Path, size: int) -> Any:
-    """[1 size size], 0 where `mask` or `box` hide the photograph; None without them.
-
-    Raises:
-        ImageError: the mask is not a readable picture.
-        CompleteSplatError: mask and box at once, a box that is none, or a mask that hides nothing.
-    """
-    from completesplat.data.pictures.photograph import outside_of_box, outside_of_mask
-
-    if config.mask is not None and config.box is not None:
-        raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
-    if config.mask is not None:
-        return outside_of_mask(image, Path(config.mask), size)
-    if config.box is None:
-        return None
-    if isinstance(config.box, str | int | float) or not all(isinstance(edge, int | float) for edge in config.box):
-        raise CompleteSplatError(f"box={config.box}: give [x0,y0,x1,y1]")
-    return outside_of_box(image, list(config.box), size)
-
-
-log = logging.getLogger(__name__)
-
-
 def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder of its own below `out`.
 
     A bar shows how many samples are done; where nobody watches (no terminal), a line is printed for every picture.
 
     Raises:
-        CompleteSplatError: what is wrong with the only picture, or how many of several failed, and which.
+        CompleteSplatError: the only picture failed, or some of several, which it names.
     """
     console, failed = Console(), []
     rasterizer = instantiate(config.rasterizer, _convert_="all")
@@ -209,11 +134,32 @@ def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path]
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
 
 
+def folder_names(pictures: Sequence[Path]) -> list[str]:
+    """A name for each picture's folder: its stem, and for a stem that is taken `_2`, `_3` and so on behind it.
+
+    Capitals do not tell names apart, because they do not on every file system.
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for picture in pictures:
+        name, number = picture.stem, 2
+        while name.casefold() in taken:
+            name, number = f"{picture.stem}_{number}", number + 1
+        taken.add(name.casefold())
+        names.append(name)
+    return names
+
+
+def _one_line(picture: Path, error: Exception) -> str:
+    message = " ".join(str(error).split())
+    return message if picture.name in message else f"{picture}: {message}"
+
+
 def _predict(
     config: Any,
     model: CompleteSplat,
     image: Path,
-    rasterizer: Any,
+    rasterizer: Rasterizer,
     wanted: Wanted,
     folder: Path,
     on_sample: Callable[[], None],
@@ -231,7 +177,7 @@ def _predict(
         **settings,
         "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
         "image": image.name,
-        "widened": config.widen,
+        "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else Path(config.mask).name,
         "box": None if config.box is None else list(config.box),
         "fov_degrees": photograph.fov_degrees,
@@ -243,21 +189,37 @@ def _predict(
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 
-def _one_line(picture: Path, error: Exception) -> str:
-    message = " ".join(str(error).split())
-    return message if picture.name in message else f"{picture}: {message}"
+def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
+    """A warning if the field of view is far from training's: the tangents of their halves differ 1.5 times or more.
+
+    The networks see pixels, not angles, and put them at the depths that they have learnt. Across the picture lengths
+    go with the tangent, along the depth they do not: so the ratio of the tangents is that of the wrong proportions.
+    """
+    own, trained = (math.tan(math.radians(fov) / 2) for fov in (photograph.fov_degrees, trained_degrees))
+    ratio = own / trained
+    if 1 / FAR < ratio < FAR:
+        return None
+    wrong = f"{ratio:.1f} times too flat" if ratio > 1 else f"{1 / ratio:.1f} times too deep"
+    source = "given" if photograph.fov_source == "given" else "from EXIF; fov=DEGREES overrides it"
+    return (
+        f"the field of view is {photograph.fov_degrees:.0f} degrees ({source}), {trained_degrees:.0f} in training:"
+        f" expect shapes about {wrong}"
+    )
 
 
-def run(config: Any, out: Path) -> None:
-    """Write each photograph's files into `out/<its name>/`.
+def visible_part(config: Any, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
+    """0 where `mask` or `box` hide the photograph, 1 elsewhere; None without them.
 
     Raises:
-        CompleteSplatError: settings without a meaning, or at least one picture of which nothing could be made.
+        ImageError: the mask is not a readable picture.
+        CompleteSplatError: mask and box at once, a box without four numbers, or a mask that hides nothing.
     """
-
-    check_settings(config)
-    pictures = find_pictures(config.image)
-    if config.mask is not None and len(pictures) > 1:
-        raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
-    wanted = wanted_files(config)  # before the model runs: is the converter there?
-    predict_pictures(config, open_generator(config), pictures, wanted, out)
+    if config.mask is not None and config.box is not None:
+        raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
+    if config.mask is not None:
+        return outside_of_mask(image, Path(config.mask), size)
+    if config.box is None:
+        return None
+    if isinstance(config.box, str | int | float) or not all(isinstance(edge, int | float) for edge in config.box):
+        raise CompleteSplatError(f"box={config.box}: give [x0,y0,x1,y1]")
+    return outside_of_box(image, list(config.box), size)

@@ -12,6 +12,15 @@ from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 EXPORT = "--export"
 WEIGHTS = (CONFIG_FILE, WEIGHTS_FILE)
 MOST_CAMERAS = 24
+RANGES = {
+    "samples": (1, 8),
+    "steps": (1, 1000),
+    "seed": (0, 2**31),
+    "port": (1, 65535),
+    "frames": (1, 1000),
+    "background": (0, 1),
+}
+"""Smallest and largest value of the settings that are numbers."""
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
@@ -31,13 +40,26 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     return found
 
 
+def _parted(argument: str) -> list[str]:
+    """`--export=FILE` as two arguments."""
+    return argument.split("=", 1) if argument.startswith(f"{EXPORT}=") else [argument]
+
+
+def _setting(name: str, value: str) -> str:
+    """Quoted, so that hydra takes every character as it is."""
+    escaped = value.replace("'", "\\'")
+    return f"{name}='{escaped}'"
+
+
 def run(config: Any, out: Path) -> None:
     """Open the page and stay until Ctrl-C; with `export`, write it as a file instead."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
-    check_settings(config)
+    from completesplat.commands.generator import check_settings
+
+    check_settings(config, RANGES)
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
     page = make_page(config, out)
     try:
@@ -80,7 +102,7 @@ def make_page(config: Any, out: Path) -> Any:
     import torch
     from hydra.utils import instantiate
 
-    from completesplat.commands.predict import open_generator
+    from completesplat.commands.generator import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page, Saver, start_server, stop_server
     from completesplat.viewer.samples import read_scene
@@ -149,38 +171,3 @@ def export(page: Any, path: Path) -> None:
     if not page.stage.samples:
         raise CompleteSplatError("there is nothing to export: give a scene, or a picture and weights")
     print(write_page(page.server, path))
-
-
-def check_settings(config: Any) -> None:
-    """Refuse settings without a meaning.
-
-    Raises:
-        CompleteSplatError: names the setting and its range.
-    """
-    from completesplat.autoreconstructor.skips import allowed_skip_weight
-    from completesplat.diffusion.guidance import check_guidance_weight
-
-    allowed_skip_weight(config.skip_weight)
-    check_guidance_weight(config.guidance_weight)
-    ranges = {
-        "samples": (1, 8),
-        "steps": (1, 1000),
-        "seed": (0, 2**31),
-        "port": (1, 65535),
-        "frames": (1, 1000),
-        "background": (0, 1),
-    }
-    for name, (least, most) in ranges.items():
-        if config[name] is not None and not least <= config[name] <= most:
-            raise CompleteSplatError(f"{name}={config[name]}: must lie between {least} and {most}")
-
-
-def _parted(argument: str) -> list[str]:
-    """`--export=FILE` as two arguments."""
-    return argument.split("=", 1) if argument.startswith(f"{EXPORT}=") else [argument]
-
-
-def _setting(name: str, value: str) -> str:
-    """Quoted, so that hydra takes every character as it is."""
-    escaped = value.replace("'", "\\'")
-    return f"{name}='{escaped}'"

@@ -1,10 +1,10 @@
-"""Gaussians for files: without what is broken, and as wide as training saw them."""
+"""Gaussians for files: without those that are broken, and as large on the screen as training saw them."""
 
 import logging
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
@@ -27,7 +27,7 @@ def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
 
 
 def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
-    """One unbatched set without what cannot be stored; how much that was is logged as a warning.
+    """One unbatched set without the Gaussians that cannot be stored; their number is logged as a warning.
 
     Args:
         name: of the file or sample, for the message.
@@ -45,8 +45,10 @@ def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     return gaussians.keep(kept)
 
 
-def widened(gaussians: Gaussians, reference: Cameras, blur: float = RenderingConstants().blur) -> Gaussians:
-    """Gaussians that hold the rasterizer's blur, as it is in the reference view.
+def with_screen_space_dilation(
+    gaussians: Gaussians, reference: Cameras, blur: float = RenderingConstants().blur
+) -> Gaussians:
+    """Gaussians that are larger by the rasterizer's blur, as it is in the reference view.
 
     A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
     makes Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian
@@ -56,9 +58,6 @@ def widened(gaussians: Gaussians, reference: Cameras, blur: float = RenderingCon
         gaussians: [gaussian], in the world of the camera.
         reference: the photograph's camera, unbatched, at the size that the model was trained at.
     """
-    variance = blur * (_depth(gaussians, reference) / reference.intrinsics[0, 0]).square()
+    depth = transform_points(reference.world_to_camera, gaussians.means)[:, 2]
+    variance = blur * (depth / reference.intrinsics[0, 0]).square()
     return replace(gaussians, scales=(gaussians.scales.square() + variance[:, None]).sqrt())
-
-
-def _depth(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, " gaussian"]:
-    return torch.as_tensor(transform_points(camera.world_to_camera, gaussians.means)[:, 2])

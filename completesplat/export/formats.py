@@ -1,4 +1,4 @@
-"""One scene in all the file formats that are wanted; `.splat`, the smallest of them, is written here."""
+"""One scene in several file formats; `.splat`, the smallest of them, is written here."""
 
 import tempfile
 from collections.abc import Sequence
@@ -17,36 +17,9 @@ from completesplat.export.splat_transform import PageView, SplatTransform, write
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 
-RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
-
-
-def write_splat(path: str | Path, gaussians: Gaussians) -> int:
-    """Write one unbatched set of Gaussians, in its order; the file appears whole or not at all.
-
-    Colours beyond 0 to 1 are clamped.
-
-    Returns:
-        How many Gaussians the file holds; see `completesplat.export.cleaning` for what is left out.
-
-    Raises:
-        CompleteSplatError: none of the Gaussians can be stored.
-    """
-    kept = cleaned(gaussians, path).detach()
-    records = np.zeros(kept.count, RECORD)
-    records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
-    records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
-    records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(records.tobytes())
-    return kept.count
-
-
-def _bytes(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
-    return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()
-
-
 FORMATS = ("ply", "splat", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")
+RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
 
 
 def write_formats(
@@ -89,3 +62,28 @@ def write_formats(
             elif kind in CONVERTED and converter is not None:
                 converter.convert(source, target)
     return {name if kind == "ply" else f"{name}_{kind}": f"{name}.{kind}" for kind in formats}
+
+
+def write_splat(path: str | Path, gaussians: Gaussians) -> int:
+    """Write one unbatched set of Gaussians, in its order; the file appears whole or not at all.
+
+    Colours beyond 0 to 1 are clamped.
+
+    Returns:
+        How many Gaussians the file holds; see `completesplat.export.cleaning` for what is left out.
+
+    Raises:
+        CompleteSplatError: none of the Gaussians can be stored.
+    """
+    kept = cleaned(gaussians, path).detach()
+    records = np.zeros(kept.count, RECORD)
+    records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
+    records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
+    records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(records.tobytes())
+    return kept.count
+
+
+def _bytes(values: Tensor) -> UInt8[np.ndarray, "*shape"]:
+    return values.round().clamp(0, 255).to(torch.uint8).cpu().numpy()

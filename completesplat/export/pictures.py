@@ -1,20 +1,31 @@
-"""Tensors as pictures for people: bytes, grids, maps of depth, normals and opacity in colours."""
+"""Tensors as pictures for people: bytes, grids, sheets with labels, and depth and normals in colours."""
 
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from einops import rearrange
 from jaxtyping import Float, UInt8
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
-from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
-from completesplat.geometry.normals import normals_from_depth
-from completesplat.rasterizers import Rasterizer, Rendering
+from completesplat.rasterizers import Rendering
+
+READABLE_SIDE = 144
+GAP, LINE, MARGIN = 6, 20, 12
+INK, PAPER = "black", "white"
+NOTHING = 0.5
+OPAQUE = 0.5
+# Far to near; lightness rises steadily, so that the picture is also right in grey.
+STOPS = [
+    [0.05, 0.03, 0.20],
+    [0.30, 0.08, 0.45],
+    [0.62, 0.18, 0.45],
+    [0.90, 0.40, 0.25],
+    [0.98, 0.70, 0.20],
+    [1.00, 0.98, 0.70],
+]
 
 
 def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray, "*batch height width 3"]:
@@ -41,7 +52,7 @@ def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Ima
 
     Args:
         rows: of images of one size.
-        factor: every pixel becomes so many in both directions.
+        factor: the width and height in pixels that one pixel becomes.
 
     Raises:
         ValueError: values that are not finite.
@@ -52,16 +63,51 @@ def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Ima
     return Image.fromarray(to_bytes(enlarge(whole, factor)))
 
 
-NOTHING = 0.5
-# Far to near; lightness rises steadily, so that the picture is also right in grey.
-STOPS = [
-    [0.05, 0.03, 0.20],
-    [0.30, 0.08, 0.45],
-    [0.62, 0.18, 0.45],
-    [0.90, 0.40, 0.25],
-    [0.98, 0.70, 0.20],
-    [1.00, 0.98, 0.70],
-]
+@dataclass(frozen=True)
+class SheetCell:
+    """A picture of a sheet (sRGB, 0 to 1), and the text above it."""
+
+    image: Float[Tensor, "3 height width"]
+    label: str = ""
+
+
+def picture_sheet(
+    headings: Sequence[str], rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
+) -> Image.Image:
+    """Pictures in rows and columns, each enlarged by a whole factor to about 144 px, with room for its label above it.
+
+    Args:
+        headings: of the columns.
+        rows: at least one, none longer than the headings; None leaves a place empty. All pictures have one size.
+        title: the first line; None leaves no room for one.
+
+    Raises:
+        ValueError: pictures that are not finite.
+    """
+    first = next(cell.image for row in rows for cell in row if cell is not None)
+    factor = max(1, round(READABLE_SIDE / max(first.shape[-2:])))
+    height, width = (side * factor for side in first.shape[-2:])
+    heading_top = MARGIN + (0.0 if title is None else 1.5 * LINE)
+    lefts = [MARGIN + column * (width + GAP) for column in range(len(headings) + 1)]
+    tops = [int(heading_top) + 2 * LINE + row * (height + LINE + GAP) for row in range(len(rows) + 1)]
+    sheet = Image.new("RGB", (lefts[-1] - GAP + MARGIN, tops[-1] - LINE - GAP + MARGIN), PAPER)
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=13)
+    if title is not None:
+        draw.text((MARGIN, MARGIN), title, INK, ImageFont.load_default(size=16))
+    for heading, left in zip(headings, lefts, strict=False):
+        draw.text((left, heading_top), heading, INK, font)
+    for row, top in zip(rows, tops, strict=False):
+        for cell, left in zip(row, lefts, strict=False):
+            if cell is not None:
+                draw.text((left, top - LINE), cell.label, INK, font)
+                pixels = to_bytes(enlarge(cell.image, factor))
+                sheet.paste(Image.fromarray(np.ascontiguousarray(pixels)), (left, top))
+    return sheet
+
+
+def surface_depth(rendering: Rendering) -> Float[Tensor, "*batch 1 height width"]:
+    """The expected depth of pixels that are more than half opaque; 0 elsewhere, where no surface is seen."""
+    return torch.where(rendering.alpha > OPAQUE, rendering.expected_depth(), 0)
 
 
 def color_depth(
@@ -105,41 +151,3 @@ def color_normals(normals: Float[Tensor, "*batch 3 height width"]) -> Float[Tens
     """
     signs = torch.tensor([1.0, -1.0, -1.0], dtype=normals.dtype, device=normals.device)
     return (normals * signs[:, None, None] + 1) / 2
-
-
-OPAQUE = 0.5
-
-
-def surface_depth(rendering: Rendering) -> Float[Tensor, "*batch 1 height width"]:
-    """The expected depth of pixels that are more than half opaque; 0 elsewhere, where no surface is seen."""
-    return torch.where(rendering.alpha > OPAQUE, rendering.expected_depth(), 0)
-
-
-@torch.no_grad()
-def write_maps(
-    folder: Path, scenes: Sequence[Gaussians], camera: Cameras, rasterizer: Rasterizer
-) -> tuple[dict[str, str], tuple[float, float]]:
-    """Write `depth_00.png`, `normals_00.png`, `opacity_00.png` and so on: what a camera sees of each scene.
-
-    Depth is coloured as in `color_depth`, on one scale for all scenes, normals as in `color_normals`; both are grey
-    where a pixel is not more than half opaque. Opacity is white where nothing shines through.
-
-    Returns:
-        The files' names by purpose, and the depths at the ends of the scale.
-    """
-    views = [rasterizer(scene[None], camera[None][None])[0, 0] for scene in scenes]
-    depth = torch.stack([surface_depth(view) for view in views])
-    depth_pictures, ends = color_depth(depth)
-    files = {}
-    for index, view in enumerate(views):
-        pictures = {
-            "depth": depth_pictures[index],
-            "normals": color_normals(normals_from_depth(depth[index], camera)),
-            "opacity": view.alpha.expand(3, -1, -1),
-        }
-        for kind, picture in pictures.items():
-            name = f"{kind}_{index:02}"
-            files[name] = f"{name}.png"
-            with atomic_path(folder / files[name]) as temporary:
-                Image.fromarray(to_bytes(picture)).save(temporary, format="PNG")
-    return files, ends

@@ -24,6 +24,60 @@ TYPES = {
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
+SH_C0 = 0.28209479177387814  # the constant of the DC harmonic, 1 / (2 sqrt(pi))
+SMALLEST_ALPHA = 1e-6
+AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
+MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
+WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
+
+
+def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
+    """Write one unbatched set of Gaussians; the file appears whole or not at all.
+
+    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians that cannot be stored are left out, see
+    `completesplat.export.cleaning`. Reading the file with `read_ply` and writing it again gives the same bytes, except
+    for clamped opacities.
+
+    Args:
+        path: the file.
+        gaussians: in any one frame; quaternions of any length.
+        comments: metadata for the header, a line each; characters outside ASCII are escaped.
+
+    Returns:
+        How many Gaussians the file holds.
+
+    Raises:
+        CompleteSplatError: none of the Gaussians can be stored.
+    """
+    table = _table(cleaned(gaussians, path))
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(_header(len(table), comments))
+        file.write(table.numpy().astype("<f4").tobytes())
+    return len(table)
+
+
+def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
+    """One row for each Gaussian; computed in float64, so that the stored float32 is the nearest one."""
+    means, quaternions, scales, opacities, colors = (
+        t.detach().cpu().double()
+        for t in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
+    )
+    logits = opacities.clamp(SMALLEST_ALPHA, 1 - SMALLEST_ALPHA).logit()[:, None]
+    # A quaternion that is of unit length up to float32 rounding is kept: normalising it again would move its bits.
+    is_unit = (quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
+    rotations = torch.where(is_unit, quaternions, normalize_quaternion(quaternions))
+    rows = [means, torch.zeros_like(means), (colors - 0.5) / SH_C0, logits, scales.log(), rotations]
+    return torch.cat(rows, dim=-1).float()
+
+
+def _header(count: int, comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0"]
+    # A line break inside a comment would start a header line of its own.
+    lines += [f"comment {' '.join(comment.split())}" for comment in (AXES_COMMENT, *comments)]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in WRITTEN), "end_header", ""]
+    return "\n".join(lines).encode("ascii", "backslashreplace")
 
 
 @dataclass(frozen=True)
@@ -38,6 +92,37 @@ class Element:
     def size(self) -> int:
         """Bytes that the records take."""
         return self.count * self.dtype.itemsize
+
+
+def read_ply(path: str | Path) -> Gaussians:
+    """Read a binary little-endian 3DGS `.ply`, of this project or another.
+
+    Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
+    become 0, as in the renderers of such files.
+
+    Raises:
+        PlyError: no such file, another format, a property missing, a size that differs from what the header
+            declares (checked before anything is allocated), or values that are not finite.
+    """
+    try:
+        if not Path(path).is_file():
+            raise PlyError("no such file")
+        with Path(path).open("rb") as file:
+            elements, data_start = read_header(file)
+            declared = data_start + sum(element.size for element in elements)
+            actual = os.fstat(file.fileno()).st_size
+            if actual != declared:
+                raise PlyError(f"the header declares {declared} bytes, the file has {actual}")
+            columns = _columns(file.read(actual - data_start), elements)
+    except OSError as error:
+        raise PlyError(f"{path}: {error.strerror or error}") from error
+    except PlyError as error:
+        raise PlyError(f"{path}: {error}") from None
+    gaussians = _gaussians(columns)
+    damaged = int((~gaussians.finite()).sum())
+    if damaged:
+        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
+    return gaussians
 
 
 def read_header(file: BinaryIO) -> tuple[list[Element], int]:
@@ -82,93 +167,6 @@ def _dtype(element: str, fields: list[tuple[str, str]]) -> np.dtype:
     if len({name for name, _ in fields}) < len(fields):
         raise PlyError(f"element {element[:60]!r} names a property twice")
     return np.dtype(fields)
-
-
-SH_C0 = 0.28209479177387814  # the constant of the DC harmonic, 1 / (2 sqrt(pi))
-SMALLEST_ALPHA = 1e-6
-AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
-MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
-SCALES, QUATERNIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
-WRITTEN = (*MEANS, *NORMALS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
-REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
-
-
-def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
-    """Write one unbatched set of Gaussians; the file appears whole or not at all.
-
-    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians that cannot be stored are left out, see
-    `completesplat.export.cleaning`. Reading the file with `read_ply` and writing it again gives the same bytes, except
-    for clamped opacities.
-
-    Args:
-        path: the file.
-        gaussians: in any one frame; quaternions of any length.
-        comments: metadata for the header, a line each; characters outside ASCII are escaped.
-
-    Returns:
-        How many Gaussians the file holds.
-
-    Raises:
-        CompleteSplatError: none of the Gaussians can be stored.
-    """
-    table = _table(cleaned(gaussians, path))
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(table), comments))
-        file.write(table.numpy().astype("<f4").tobytes())
-    return len(table)
-
-
-def read_ply(path: str | Path) -> Gaussians:
-    """Read a binary little-endian 3DGS `.ply`, of this project or another.
-
-    Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
-    become 0, as in the renderers of such files.
-
-    Raises:
-        PlyError: no such file, another format, a property missing, a size that differs from what the header
-            declares (checked before anything is allocated), or values that are not finite.
-    """
-    try:
-        if not Path(path).is_file():
-            raise PlyError("no such file")
-        with Path(path).open("rb") as file:
-            elements, data_start = read_header(file)
-            declared = data_start + sum(element.size for element in elements)
-            actual = os.fstat(file.fileno()).st_size
-            if actual != declared:
-                raise PlyError(f"the header declares {declared} bytes, the file has {actual}")
-            columns = _columns(file.read(actual - data_start), elements)
-    except OSError as error:
-        raise PlyError(f"{path}: {error.strerror or error}") from error
-    except PlyError as error:
-        raise PlyError(f"{path}: {error}") from None
-    gaussians = _gaussians(columns)
-    damaged = int((~gaussians.finite()).sum())
-    if damaged:
-        raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
-    return gaussians
-
-
-def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
-    """One row for each Gaussian; computed in float64, so that the stored float32 is the nearest one."""
-    means, quaternions, scales, opacities, colors = (
-        t.detach().cpu().double()
-        for t in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    )
-    logits = opacities.clamp(SMALLEST_ALPHA, 1 - SMALLEST_ALPHA).logit()[:, None]
-    # A quaternion that is of unit length up to float32 rounding is kept: normalising it again would move its bits.
-    is_unit = (quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
-    rotations = torch.where(is_unit, quaternions, normalize_quaternion(quaternions))
-    rows = [means, torch.zeros_like(means), (colors - 0.5) / SH_C0, logits, scales.log(), rotations]
-    return torch.cat(rows, dim=-1).float()
-
-
-def _header(count: int, comments: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    # A line break inside a comment would start a header line of its own.
-    lines += [f"comment {' '.join(comment.split())}" for comment in (AXES_COMMENT, *comments)]
-    lines += [f"element vertex {count}", *(f"property float {name}" for name in WRITTEN), "end_header", ""]
-    return "\n".join(lines).encode("ascii", "backslashreplace")
 
 
 def _columns(data: bytes, elements: Sequence[Element]) -> dict[str, np.ndarray]:

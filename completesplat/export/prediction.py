@@ -1,4 +1,4 @@
-"""All files of one prediction: splats, videos, a contact sheet and a description."""
+"""All files of one prediction: splats, videos, a contact sheet, maps and a description."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -6,23 +6,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
 from completesplat.atomic import atomic_path
-from completesplat.export.cleaning import cleaned, widened
+from completesplat.export.cleaning import cleaned, with_screen_space_dilation
 from completesplat.export.formats import write_formats
-from completesplat.export.pictures import color_depth, enlarge, to_bytes, write_maps
+from completesplat.export.pictures import (
+    SheetCell,
+    color_depth,
+    color_normals,
+    picture_sheet,
+    surface_depth,
+    to_bytes,
+)
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
+from completesplat.geometry.normals import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 
+DIRECTIONS = 8
 CONVENTIONS = {
     "axes": "OpenCV: +x right, +y down, +z forward, seen from the reference camera",
     "world_to_camera": "4 x 4, rows first; maps homogeneous world points (as columns) to camera points",
@@ -32,6 +40,190 @@ CONVENTIONS = {
     "quaternions": "(w, x, y, z), unit length",
     "colors": "sRGB, 0 to 1, the same from every direction",
 }
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to write of each prediction.
+
+    Args:
+        formats: of the scenes, out of `completesplat.export.formats.FORMATS`.
+        videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`.
+        frames: of each video.
+        background: grey value where a scene leaves a pixel open.
+        maps: depth, normals and opacity of the reference view, see `write_maps`.
+        converter: writes the formats that need one.
+        screen_space_dilation: store Gaussians `with_screen_space_dilation` for viewers, which draw larger pictures
+            than training.
+    """
+
+    formats: Sequence[str] = ("ply",)
+    videos: Sequence[str] = ("orbit",)
+    frames: int = 48
+    background: float = 0.5
+    maps: bool = False
+    converter: SplatTransform | None = None
+    screen_space_dilation: bool = True
+
+
+@dataclass(frozen=True)
+class SampleViews:
+    """One sample: its renderings from several directions, and the depth seen from the first of them."""
+
+    label: str
+    images: Float[Tensor, "view 3 height width"]
+    depth: Float[Tensor, "1 height width"]
+
+
+def write_prediction(
+    folder: Path,
+    image: Float[Tensor, "3 size size"],
+    scenes: Sequence[Gaussians],
+    reference: Cameras,
+    rasterizer: Rasterizer,
+    up: Float[Tensor, "3"],
+    wanted: Wanted,
+    settings: Mapping[str, Any],
+    on_sample: Callable[[], None] = lambda: None,
+) -> None:
+    """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
+
+    Args:
+        folder: of the files; made when it is missing.
+        image: the input image.
+        scenes: the samples, in the reference camera's frame; what cannot be drawn is left out, with a warning.
+        reference: the input's camera.
+        rasterizer: draws the videos and the sheet.
+        up: where up is in the scene; the views turn about it.
+        wanted: which files.
+        settings: recorded in `scene.json`; must hold the seed and the image's name.
+        on_sample: called when a sample's files are written.
+
+    Raises:
+        CompleteSplatError: a sample without anything to draw, or a converter that fails.
+    """
+    # Before anything is written: a sample of which nothing is left is refused.
+    scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: list[SampleViews] = []
+    files: dict[str, str] = {}
+    for i, scene in enumerate(scenes):
+        comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
+        row, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
+        rows.append(row)
+        files |= written
+        on_sample()
+    angles = [360 / DIRECTIONS * k for k in range(DIRECTIONS)]
+    contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows, angles)
+    recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
+    if wanted.maps:
+        written, ends = write_maps(folder, scenes, reference, rasterizer)
+        files |= written
+        recorded["depth_map_ends"] = list(ends)
+    write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+
+
+def _write_sample(
+    folder: Path,
+    index: int,
+    scene: Gaussians,
+    reference: Cameras,
+    rasterizer: Rasterizer,
+    up: Float[Tensor, "3"],
+    wanted: Wanted,
+    comments: Sequence[str],
+) -> tuple[SampleViews, dict[str, str]]:
+    """A sample's splats and videos, and its row of the contact sheet; the files' names by purpose."""
+    pivot = seen_center(rasterizer, scene, reference)
+    view = PageView(reference, pivot, up, wanted.background)
+    stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
+    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
+    for kind in wanted.videos:
+        files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
+        cameras = PATHS[kind](reference, pivot, up, wanted.frames)
+        frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
+        write_video(folder / f"{kind}_{index:02}.mp4", frames)
+    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
+    return SampleViews(f"sample {index}", views, depths[0]), files
+
+
+@torch.no_grad()
+def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) -> Float[Tensor, "3"]:
+    """The point that a turn goes around: on the optical axis, at the median depth of the image's central ninth.
+
+    Where nothing is seen there, the median depth of all Gaussians stands in.
+    """
+    depth = rasterizer(scene[None], reference[None][None]).expected_depth()[0, 0, 0]
+    height, width = depth.shape
+    center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
+    seen = center[center > 0]
+    if len(seen) == 0:
+        seen = transform_points(reference.world_to_camera, scene.means)[:, 2]
+    return reference.camera_to_world[:3, 3] + reference.camera_to_world[:3, 2] * seen.median()
+
+
+def contact_sheet(
+    path: str | Path,
+    title: str,
+    reference: Float[Tensor, "3 height width"],
+    samples: Sequence[SampleViews],
+    angles: Sequence[float],
+) -> None:
+    """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
+
+    Depth is coloured on one scale for all rows (near bright, far dark); places that show nothing are grey.
+
+    Args:
+        path: the file.
+        title: its first line.
+        reference: the input image, of the size of the views.
+        samples: at least one.
+        angles: of the views in degrees, the same for all samples.
+
+    Raises:
+        ValueError: images that are not finite, or numbers of views and angles that differ.
+    """
+    if any(len(sample.images) != len(angles) for sample in samples):
+        raise ValueError(f"{len(angles)} angles given for rows of {[len(sample.images) for sample in samples]} views")
+    depths, (near, far) = color_depth(torch.stack([sample.depth for sample in samples]))
+    rows = [
+        [None, SheetCell(sample.images[0], sample.label), *map(SheetCell, sample.images[1:]), SheetCell(depth)]
+        for sample, depth in zip(samples, depths, strict=True)
+    ]
+    rows[0][0] = SheetCell(reference)
+    headings = ["input", *(f"{angle:g}°" for angle in angles), f"depth {near:.3g} to {far:.3g}"]
+    with atomic_path(path) as temporary:
+        picture_sheet(headings, rows, title).save(temporary, format="PNG")
+
+
+@torch.no_grad()
+def write_maps(
+    folder: Path, scenes: Sequence[Gaussians], camera: Cameras, rasterizer: Rasterizer
+) -> tuple[dict[str, str], tuple[float, float]]:
+    """Write `depth_00.png`, `normals_00.png`, `opacity_00.png` and so on: what a camera sees of each scene.
+
+    Depth is coloured as in `color_depth`, on one scale for all scenes, normals as in `color_normals`; both are grey
+    where a pixel is not more than half opaque. Opacity is white where nothing shines through.
+
+    Returns:
+        The files' names by purpose, and the depths at the ends of the scale.
+    """
+    views = [rasterizer(scene[None], camera[None][None])[0, 0] for scene in scenes]
+    depth = torch.stack([surface_depth(view) for view in views])
+    depth_pictures, ends = color_depth(depth)
+    files = {}
+    for index, view in enumerate(views):
+        pictures = {
+            "depth": depth_pictures[index],
+            "normals": color_normals(normals_from_depth(depth[index], camera)),
+            "opacity": view.alpha.expand(3, -1, -1),
+        }
+        for kind, picture in pictures.items():
+            name = f"{kind}_{index:02}"
+            files[name] = f"{name}.png"
+            with atomic_path(folder / files[name]) as temporary:
+                Image.fromarray(to_bytes(picture)).save(temporary, format="PNG")
+    return files, ends
 
 
 def write_scene_json(
@@ -66,194 +258,3 @@ def write_scene_json(
     text = json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False)
     with atomic_path(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
-
-
-READABLE_SIDE = 144
-GAP, LINE, MARGIN = 6, 20, 12
-INK, PAPER = "black", "white"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One sample: its renderings from several directions, and the depth seen from the first of them."""
-
-    label: str
-    images: Float[Tensor, "view 3 height width"]
-    depth: Float[Tensor, "1 height width"]
-
-
-def contact_sheet(
-    path: str | Path,
-    title: str,
-    reference: Float[Tensor, "3 height width"],
-    rows: Sequence[Row],
-    angles: Sequence[float],
-) -> None:
-    """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
-
-    All images share one size and are enlarged by a whole factor to cells of about 144 px. Depth is coloured on one
-    scale for all rows (near bright, far dark); places that show nothing are grey.
-
-    Args:
-        path: the file.
-        title: its first line.
-        reference: the input image.
-        rows: the samples, at least one.
-        angles: of the views in degrees, the same for all rows.
-
-    Raises:
-        ValueError: images that are not finite, or numbers of views and angles that differ.
-    """
-    if any(len(row.images) != len(angles) for row in rows):
-        raise ValueError(f"{len(angles)} angles given for rows of {[len(row.images) for row in rows]} views")
-    factor = max(1, round(READABLE_SIDE / max(reference.shape[-2:])))
-    height, width = (side * factor for side in reference.shape[-2:])
-    sheet = Image.new("RGB", _sheet_size(height, width, len(rows), len(angles) + 2), PAPER)
-    draw = ImageDraw.Draw(sheet)
-    font = ImageFont.load_default(size=13)
-    depth_pictures, (near, far) = color_depth(torch.stack([row.depth for row in rows]))
-
-    draw.text((MARGIN, MARGIN), title, INK, ImageFont.load_default(size=16))
-    headings = ["input", *(f"{angle:g}°" for angle in angles), f"depth {near:.3g} to {far:.3g}"]
-    for column, heading in enumerate(headings):
-        draw.text((_left(column, width), MARGIN + 1.5 * LINE), heading, INK, font)
-    for index, (row, depth_picture) in enumerate(zip(rows, depth_pictures, strict=True)):
-        top = _top(index, height)
-        draw.text((_left(1, width), top - LINE), row.label, INK, font)
-        cells = [*row.images, depth_picture]
-        if index == 0:
-            _paste(sheet, reference, factor, _left(0, width), top)
-        for column, cell in enumerate(cells, start=1):
-            _paste(sheet, cell, factor, _left(column, width), top)
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="PNG")
-
-
-def _sheet_size(height: int, width: int, rows: int, columns: int) -> tuple[int, int]:
-    return _left(columns, width) - GAP + MARGIN, _top(rows, height) - LINE - GAP + MARGIN
-
-
-def _left(column: int, width: int) -> int:
-    return MARGIN + column * (width + GAP)
-
-
-def _top(row: int, height: int) -> int:
-    """Upper edge of a row's cells; above it stands its label, above the first row also the title and headings."""
-    return MARGIN + int(2.5 * LINE) + LINE + row * (height + LINE + GAP)
-
-
-def _paste(sheet: Image.Image, image: Float[Tensor, "3 height width"], factor: int, left: int, top: int) -> None:
-    sheet.paste(Image.fromarray(np.ascontiguousarray(to_bytes(enlarge(image, factor)))), (left, top))
-
-
-DIRECTIONS = 8
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What to write of each prediction.
-
-    Args:
-        formats: of the scenes, out of `completesplat.export.formats.FORMATS`.
-        videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`.
-        frames: of each video.
-        background: grey value where a scene leaves a pixel open.
-        maps: depth, normals and opacity of the reference view, see `completesplat.export.pictures`.
-        converter: writes the formats that need one.
-        widen: store Gaussians `widened` for viewers, which draw larger pictures than training.
-    """
-
-    formats: Sequence[str] = ("ply",)
-    videos: Sequence[str] = ("orbit",)
-    frames: int = 48
-    background: float = 0.5
-    maps: bool = False
-    converter: SplatTransform | None = None
-    widen: bool = True
-
-
-def write_prediction(
-    folder: Path,
-    image: Float[Tensor, "3 size size"],
-    scenes: Sequence[Gaussians],
-    reference: Cameras,
-    rasterizer: Rasterizer,
-    up: Float[Tensor, "3"],
-    wanted: Wanted,
-    settings: Mapping[str, Any],
-    on_sample: Callable[[], None] = lambda: None,
-) -> None:
-    """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
-
-    Args:
-        folder: where to; made when missing.
-        image: the input image.
-        scenes: the samples, in the reference camera's frame; what cannot be drawn is left out, with a warning.
-        reference: the input's camera.
-        rasterizer: draws the videos and the sheet.
-        up: where up is in the scene; the views turn about it.
-        wanted: which files.
-        settings: recorded in `scene.json`; must hold the seed and the image's name.
-        on_sample: called when a sample's files are written.
-
-    Raises:
-        CompleteSplatError: a sample without anything to draw, or a converter that fails.
-    """
-    # Before anything is written: a sample of which nothing is left is refused.
-    scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
-    folder.mkdir(parents=True, exist_ok=True)
-    rows: list[Row] = []
-    files: dict[str, str] = {}
-    for i, scene in enumerate(scenes):
-        comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        row, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
-        rows.append(row)
-        files |= written
-        on_sample()
-    angles = [360 / DIRECTIONS * k for k in range(DIRECTIONS)]
-    contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows, angles)
-    recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
-    if wanted.maps:
-        written, ends = write_maps(folder, scenes, reference, rasterizer)
-        files |= written
-        recorded["depth_map_ends"] = list(ends)
-    write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
-
-
-def _write_sample(
-    folder: Path,
-    index: int,
-    scene: Gaussians,
-    reference: Cameras,
-    rasterizer: Rasterizer,
-    up: Float[Tensor, "3"],
-    wanted: Wanted,
-    comments: Sequence[str],
-) -> tuple[Row, dict[str, str]]:
-    """A sample's splats and videos, and its row of the contact sheet; the files' names by purpose."""
-    pivot = seen_center(rasterizer, scene, reference)
-    view = PageView(reference, pivot, up, wanted.background)
-    stored = widened(scene, reference) if wanted.widen else scene
-    files = write_formats(folder, f"sample_{index:02}", stored, wanted.formats, view, wanted.converter, comments)
-    for kind in wanted.videos:
-        files[f"{kind}_{index:02}"] = f"{kind}_{index:02}.mp4"
-        cameras = PATHS[kind](reference, pivot, up, wanted.frames)
-        frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
-        write_video(folder / f"{kind}_{index:02}.mp4", frames)
-    views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
-    return Row(f"sample {index}", views, depths[0]), files
-
-
-@torch.no_grad()
-def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) -> Float[Tensor, "3"]:
-    """The point that a turn goes around: on the optical axis, at the median depth of the image's central ninth.
-
-    Where nothing is seen there, the median depth of all Gaussians stands in.
-    """
-    depth = rasterizer(scene[None], reference[None][None]).expected_depth()[0, 0, 0]
-    height, width = depth.shape
-    center = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
-    seen = center[center > 0]
-    if len(seen) == 0:
-        seen = transform_points(reference.world_to_camera, scene.means)[:, 2]
-    return reference.camera_to_world[:3, 3] + reference.camera_to_world[:3, 2] * seen.median()

@@ -25,6 +25,8 @@ from completesplat.geometry.cameras import Cameras, transform_points
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
+WIDEST_WINDOW = 16 / 9
+LARGEST_FOV = 120.0
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,9 @@ def _run(command: Sequence[str]) -> str:
 
 
 def _reason(complaint: str) -> str:
-    """What a program said, without npm's hints and node's list of calls."""
-    told = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
-    return " ".join(" ".join(told).split())[:500] or "it does not say why"
-
-
-WIDEST_WINDOW = 16 / 9
-LARGEST_FOV = 120.0
+    """The error output of a program, without npm's hints and node's list of calls."""
+    lines = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
+    return " ".join(" ".join(lines).split())[:500] or "it does not say why"
 
 
 @dataclass(frozen=True)

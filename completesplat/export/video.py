@@ -11,7 +11,9 @@ from completesplat.export.pictures import enlarge, to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
-from completesplat.rasterizers.protocol import Rasterizer
+from completesplat.rasterizers import Rasterizer
+
+SMALLEST_SIDE = 256
 
 
 def orbit_views(
@@ -66,9 +68,6 @@ def render_views(
         images.append(rendering.over(background)[0])
         depths.append(rendering.expected_depth()[0])
     return torch.cat(images), torch.cat(depths)
-
-
-SMALLEST_SIDE = 256
 
 
 def write_video(path: str | Path, frames: Float[Tensor, "frame 3 height width"], fps: int = 24) -> None:

@@ -1,23 +1,22 @@
-"""What latent diffusion draws for a few fixed scenes while it trains: several samples, and how one of them forms."""
+"""Samples of latent diffusion for a few fixed scenes while it trains, and how one of them forms."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from lightning import Trainer
-from lightning.pytorch.loggers import WandbLogger
 from PIL import Image
 from torch import Tensor
 
+from completesplat.export.pictures import SheetCell, color_depth, picture_sheet
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.samples import diversity
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.pictures import DrawsFixedScenes, depth_panels, sheet
+from completesplat.training.pictures import DrawsFixedScenes, log_drawings
 from completesplat.training.scene_module import SceneModule
 
 
@@ -25,15 +24,16 @@ class Samples(DrawsFixedScenes):
     """Several samples of each scene, seen from its reference and its targets; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has for each scene a row of true pictures (the input first), one for each sample, and the
-    depth of the first sample (`depth_panels`). `folder/strip_000500.png` shows the first sample while it is denoised:
-    the scenes that estimates of the clean latent stand for, from the reference and from the middle target. All
-    loggers get, of the targets' views, `samples/diversity` (see `diversity`; not of one sample), `samples/psnr` (mean
-    over the samples) and `samples/psnr_of_mean` (of their mean picture); Weights & Biases also both pictures.
+    depth of the first sample (`color_depth`, on one scale for a scene's views). `folder/strip_000500.png` shows the
+    first sample while it is denoised: the scenes that estimates of the clean latent stand for, from the reference and
+    from the middle target. All loggers get, of the targets' views, `samples/diversity` (see `diversity`; not of one
+    sample), `samples/psnr` (mean over the samples) and `samples/psnr_of_mean` (of their mean picture); Weights & Biases
+    also both pictures.
 
     Args:
         folder, every_n_steps, scenes, views: see `DrawsFixedScenes`.
         samples: of a scene, always from the same noise.
-        strip: at most so many denoiser calls, evenly spaced from the first to the last.
+        strip: the largest number of denoiser calls shown, evenly spaced from the first to the last.
     """
 
     def __init__(
@@ -51,14 +51,7 @@ class Samples(DrawsFixedScenes):
             picture.save(self.folder / f"{kind}_{trainer.global_step:06}.png")
         each = [one.scores() for one in drawn]
         scalars = {f"samples/{name}": sum(scores[name] for scores in each) / len(each) for name in each[0]}
-        for logger in trainer.loggers:
-            # As Lightning counts: a row bears the number of the optimizer steps before its own.
-            logger.log_metrics(scalars, step=trainer.global_step - 1)
-            if isinstance(logger, WandbLogger):
-                import wandb
-
-                media: Any = {"samples": wandb.Image(pictures["step"]), "denoising": wandb.Image(pictures["strip"])}
-                logger.log_metrics(media, step=trainer.global_step - 1)
+        log_drawings(trainer, scalars, {"samples": pictures["step"], "denoising": pictures["strip"]})
 
     def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
         sampler, views = module.completesplat.sampler, scene.all_views()
@@ -108,26 +101,34 @@ class SceneDrawings:
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most so many of the numbers below `count`, the last one always."""
+    """At most `most` of the numbers below `count`, the last one always."""
     return sorted({round(place) for place in np.linspace(count - 1, 0, most)})
 
 
 def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
     """A column for each view; views that a scene has less than others stay white."""
-    rows: list[Float[Tensor, "view 3 height width"]] = []
-    names: list[str] = []
+    rows: list[list[SheetCell | None]] = []
     for scene in drawn:
-        rows += [scene.true, *scene.samples, depth_panels(scene.depth)[0]]
-        names += ["true", *(f"sample {i + 1}" for i in range(len(scene.samples))), "depth of 1"]
+        named = {
+            "true": scene.true,
+            **{f"sample {i + 1}": images for i, images in enumerate(scene.samples)},
+            "depth of 1": color_depth(scene.depth[0])[0],
+        }
+        rows += [labelled(name, images) for name, images in named.items()]
     most = max(map(len, rows))
-    white = torch.ones_like(rows[0][:1])
-    grid = torch.stack([torch.cat([row, white.expand(most - len(row), -1, -1, -1)]) for row in rows])
-    columns = ["input's view", *(f"target {i + 1}" for i in range(most - 1))]
-    return sheet(dict(zip(columns, grid.unbind(1), strict=True)), names)
+    return picture_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
 
 
 def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
     """A column for each denoiser call that was kept."""
-    grid = torch.cat([scene.strip.transpose(0, 1) for scene in drawn])
-    columns = ["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)]
-    return sheet(dict(zip(columns, grid.unbind(1), strict=True)), ["input's view", "middle target"] * len(drawn))
+    views = ("input's view", "middle target")
+    rows = [
+        labelled(name, images) for scene in drawn for name, images in zip(views, scene.strip.unbind(1), strict=True)
+    ]
+    return picture_sheet(["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)], rows)
+
+
+def labelled(name: str, images: Float[Tensor, "picture 3 height width"]) -> list[SheetCell | None]:
+    """A row of a sheet, its name above the first picture. What is not finite is black."""
+    first, *others = images.nan_to_num()
+    return [SheetCell(first, name), *map(SheetCell, others)]

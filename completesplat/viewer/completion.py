@@ -1,4 +1,4 @@
-"""Pictures that come through the page."""
+"""Completing photographs on the page: the picture that is loaded, its samples, and how they form."""
 
 import tempfile
 import time
@@ -20,31 +20,11 @@ from completesplat.viewer.page import Page
 from completesplat.viewer.samples import Sample
 
 MOST_BYTES = 32 * 2**20
-
-
-def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
-    """The picture at the model's size. Its name is used in refusals only, never as a path.
-
-    Raises:
-        ImageError: more than 32 MiB, or what `read_photograph` refuses: no image, damaged, too many pixels, ...
-    """
-    shown = "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
-    if len(content) > MOST_BYTES:
-        raise ImageError(f"{shown}: {len(content) / 2**20:.0f} MiB; at most {MOST_BYTES // 2**20} MiB are taken")
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "upload"
-        file.write_bytes(content)
-        try:
-            return model.read(file)
-        except ImageError as error:
-            raise ImageError(str(error).replace(str(file), shown)) from error
-
-
 PAUSE = 0.2  # seconds between two pictures of a scene that forms
 
 
 class Completion:
-    """Adds the controls to a page.
+    """The controls that complete a photograph, added to a page.
 
     Args:
         model: completes the photographs, in the page's worker only.
@@ -69,7 +49,7 @@ class Completion:
         self.request(client)
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
-        """Draw with the settings of this moment, when what is being done is done."""
+        """Draw with the present settings, after the jobs that wait."""
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load a picture first"), client)
         job = partial(self._draw, *self.photograph, self.controls.settings(), client)
@@ -132,3 +112,21 @@ class Completion:
             for i, scene in enumerate(scenes)
         ]
         return [*earlier, *new][-MOST_SAMPLES:]
+
+
+def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
+    """The picture at the model's size. Its name is used in refusals only, never as a path.
+
+    Raises:
+        ImageError: more than 32 MiB, or what `read_photograph` refuses: no image, damaged, too many pixels, ...
+    """
+    shown = "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
+    if len(content) > MOST_BYTES:
+        raise ImageError(f"{shown}: {len(content) / 2**20:.0f} MiB; at most {MOST_BYTES // 2**20} MiB are taken")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "upload"
+        file.write_bytes(content)
+        try:
+            return model.read(file)
+        except ImageError as error:
+            raise ImageError(str(error).replace(str(file), shown)) from error

@@ -1,4 +1,4 @@
-"""Which numbers of denoising steps a model's sampler can make."""
+"""The controls of the page: what completes a photograph, what is shown of the samples, what is saved."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,30 +10,14 @@ from diffusers import DDIMScheduler
 from completesplat.diffusion.sampling import Sampler
 from completesplat.generation import CompleteSplat
 
-MOST_STEPS = 100
-
-
-def possible_steps(sampler: Sampler) -> list[int]:
-    """Up to 100, and the sampler's own number: DDIM's must divide the number of noise levels."""
-    numbers = range(1, min(MOST_STEPS, sampler.training_timesteps) + 1)
-    divides = isinstance(sampler.scheduler, DDIMScheduler)
-    found = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
-    return sorted(found | {sampler.steps})
-
-
-def nearest_steps(sampler: Sampler, steps: int) -> int:
-    """The possible number that is nearest, the smaller of two."""
-    return min(possible_steps(sampler), key=lambda n: abs(n - steps))
-
-
-MOST_SAMPLES, MOST_SEED = 8, 99
+MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SIDE_BY_SIDE = "all, side by side"
 KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """What a photograph is completed with."""
+class CompletionControls:
+    """The photograph, and the settings of its completion."""
 
     upload: viser.GuiUploadButtonHandle
     preview: viser.GuiImageHandle
@@ -49,16 +33,16 @@ class Drawing:
     progress: Any
 
     def settings(self) -> dict[str, Any]:
-        """Arguments of the model."""
+        """Arguments of `CompleteSplat`."""
         names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
         return {name: getattr(self, name).value for name in names}
 
     def sliders(self) -> list[Any]:
-        """What makes another drawing when it is moved."""
+        """The controls that start another drawing when they are moved."""
         return [self.samples, self.skip_weight, self.guidance_weight, self.steps, self.seed]
 
 
-def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> Drawing:
+def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> CompletionControls:
     """The folders `Photograph` and `Completion`.
 
     Args:
@@ -70,7 +54,7 @@ def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) 
         upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_image(blank, label="none yet", format="png")
     with gui.add_folder("Completion", order=2):
-        return Drawing(
+        return CompletionControls(
             upload,
             preview,
             gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
@@ -89,8 +73,8 @@ def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) 
 
 
 @dataclass(frozen=True)
-class Looking:
-    """What is shown of the samples."""
+class ViewControls:
+    """Which samples, layers and cameras are shown, and in which colours."""
 
     chosen: viser.GuiDropdownHandle[str]
     layers: list[viser.GuiCheckboxHandle]
@@ -99,11 +83,11 @@ class Looking:
     front: viser.GuiButtonHandle
 
 
-def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> Looking:
+def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> ViewControls:
     """The folder `View`."""
     names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
     with gui.add_folder("View", order=3):
-        return Looking(
+        return ViewControls(
             gui.add_dropdown("Show", (SIDE_BY_SIDE,)),
             [gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
             gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
@@ -116,3 +100,16 @@ def add_saving(gui: viser.GuiApi) -> dict[str, viser.GuiButtonHandle]:
     """The folder `Save`: buttons by the kind of file."""
     with gui.add_folder("Save", order=4):
         return {kind: gui.add_button(name) for kind, name in KINDS.items()}
+
+
+def possible_steps(sampler: Sampler) -> list[int]:
+    """Numbers of denoising steps up to 100, and the sampler's own one. DDIM's divide the number of noise levels."""
+    numbers = range(1, min(MOST_STEPS, sampler.training_timesteps) + 1)
+    divides = isinstance(sampler.scheduler, DDIMScheduler)
+    found = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
+    return sorted(found | {sampler.steps})
+
+
+def nearest_steps(sampler: Sampler, steps: int) -> int:
+    """The possible number of steps that is nearest, the smaller of two."""
+    return min(possible_steps(sampler), key=lambda n: abs(n - steps))

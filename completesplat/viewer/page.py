@@ -22,6 +22,8 @@ from completesplat.viewer.worker import Worker
 
 HOST = "127.0.0.1"
 
+log = logging.getLogger(__name__)
+
 
 def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
     """Listen on the port or, if it is taken, on the next free one; 0 takes any.
@@ -37,12 +39,6 @@ def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
     server.gui.set_panel_label("completesplat")
     server.gui.main_panel.dock_right()
     return server
-
-
-def stop_server(server: viser.ViserServer) -> None:
-    """End it, and with it what browsers show."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
 
 
 class Saver:
@@ -100,17 +96,6 @@ class Saver:
     def _next(self, stem: str, suffix: str) -> Path:
         taken = {path.name for path in self.folder.glob(f"{stem}_*{suffix}")}
         return self.folder / next(name for i in range(10**6) if (name := f"{stem}_{i:02}{suffix}") not in taken)
-
-
-def write_page(server: viser.ViserServer, path: Path) -> Path:
-    """What the server shows, as one offline HTML file."""
-    text = server.get_scene_serializer().as_html()
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return path
-
-
-log = logging.getLogger(__name__)
 
 
 class Page:
@@ -185,3 +170,17 @@ class Page:
             self.status.content = f"saved {', '.join(file.name for file in files)} in {self.saver.folder}"
 
         self.worker.submit(kind, save)
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """End it, and with it what browsers show."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def write_page(server: viser.ViserServer, path: Path) -> Path:
+    """What the server shows, as one offline HTML file."""
+    text = server.get_scene_serializer().as_html()
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.cleaning import widened
+from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
@@ -29,7 +29,7 @@ class Sample:
         reference: the camera of its photograph, or one that sees all of it.
         settings: what it was drawn with, for the files that are saved.
         finished: or an estimate on the way.
-        exact: as the model gives it, for our rasterizers; files hold Gaussians that are widened already.
+        exact: as the model gives it, for our rasterizers; files hold Gaussians with screen-space dilation already.
     """
 
     gaussians: Gaussians
@@ -40,8 +40,8 @@ class Sample:
     exact: bool = False
 
     def for_viewers(self) -> Gaussians:
-        """`widened` once: what the page draws and what is stored."""
-        return widened(self.gaussians, self.reference) if self.exact else self.gaussians
+        """With screen-space dilation once: what the page draws and what is stored."""
+        return with_screen_space_dilation(self.gaussians, self.reference) if self.exact else self.gaussians
 
     def pivot(self) -> Float[Tensor, "3"]:
         """On the optical axis, at the median depth (by opacity) of the Gaussians in the picture's central ninth."""

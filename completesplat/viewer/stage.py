@@ -20,62 +20,15 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.viewer.samples import Sample
 
 LARGEST_COVARIANCE = 3e4
-
-
-class Splats(NamedTuple):
-    """What `add_gaussian_splats` takes, in units of `scale` scene units.
-
-    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: the unit is chosen so that
-    the largest one is just below that end, and thin Gaussians keep their shape.
-    """
-
-    centers: Float[np.ndarray, "gaussian 3"]
-    covariances: Float[np.ndarray, "gaussian 3 3"]
-    colors: UInt8[np.ndarray, "gaussian 3"]
-    opacities: UInt8[np.ndarray, "gaussian 1"]
-    scale: float
-
-
-def to_splats(gaussians: Gaussians) -> Splats:
-    """One unbatched set. Gaussians that are not finite are left out, and colours above 1 become 1."""
-    kept = gaussians.keep(gaussians.finite()).to("cpu")
-    largest = kept.scales.max().item() if kept.count else 1.0
-    scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
-    unit = replace(kept, means=kept.means / scale, scales=kept.scales / scale)
-    return Splats(
-        unit.means.float().numpy(),
-        unit.covariances().float().numpy(),
-        _bytes(kept.colors),
-        _bytes(kept.opacities[:, None]),
-        scale,
-    )
-
-
-def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
-    """One layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
-    size = gaussians.count // layers
-    return gaussians[layer * size : (layer + 1) * size]
-
-
-def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
-    """The scenes in the colours of their depths (z), near bright and far dark, on one scale for all of them."""
-    depths = torch.cat([scene.means[:, 2] for scene in scenes])
-    colors, _ = color_depth(depths[None, None, :])
-    parts = colors[:, 0].T.split([scene.count for scene in scenes])
-    return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]
-
-
-def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
-    return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
-
-
 GAP = 1.25
 NARROWEST_WINDOW = 1.1
 SAME = 0.15
+ORBIT_CAMERAS = 12
+REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
 
 
 @dataclass(frozen=True)
-class Framing:
+class Arrangement:
     """One row of samples. A single one is seen exactly as its reference camera sees it.
 
     Attributes:
@@ -102,13 +55,13 @@ class Framing:
         """How a sample is moved: the row has its middle where the first sample was."""
         return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
 
-    def looks_like(self, other: "Framing") -> bool:
+    def looks_like(self, other: "Arrangement") -> bool:
         """Whether a camera that was put there may stay: as many samples, about as far away."""
         apart = np.linalg.norm(self.look_at - other.look_at) + np.linalg.norm(self.position - other.position)
         return len(self.pivots) == len(other.pivots) and float(apart) < SAME * other.distance
 
 
-def framing_of(samples: Sequence[Sample]) -> Framing:
+def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
     """The row of these samples, looked at by the first one's reference camera, moved back until all are seen."""
     reference = samples[0].reference
     pivots = [sample.pivot() for sample in samples]
@@ -121,11 +74,7 @@ def framing_of(samples: Sequence[Sample]) -> Framing:
     spacing = GAP * picture
     if len(samples) > 1:
         distance = max(distance, len(samples) * spacing / 2 / (tangent * NARROWEST_WINDOW))
-    return Framing(pivots, pose[:3, 0], spacing, pivot - forward * distance, pivot, 2 * math.atan(tangent))
-
-
-ORBIT_CAMERAS = 12
-REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
+    return Arrangement(pivots, pose[:3, 0], spacing, pivot - forward * distance, pivot, 2 * math.atan(tangent))
 
 
 class Stage:
@@ -146,7 +95,7 @@ class Stage:
         self.hidden_layers: set[int] = set()
         self.depth = False
         self.cameras: set[str] = set()
-        self._framing: Framing | None = None
+        self._arrangement: Arrangement | None = None
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.RLock()
@@ -180,36 +129,40 @@ class Stage:
             shown = self.shown
             if not shown:
                 return
-            framing = framing_of(shown)
-            self._draw_splats(shown, framing)
-            self._draw_cameras(shown, framing)
-            if self._framing is None or not framing.looks_like(self._framing):
-                self._framing = framing
+            arrangement = arrangement_of(shown)
+            self._draw_splats(shown, arrangement)
+            self._draw_cameras(shown, arrangement)
+            if self._arrangement is None or not arrangement.looks_like(self._arrangement):
+                self._arrangement = arrangement
                 self.look_from_the_front()
 
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
         """Put a browser's camera (all browsers', and those of browsers to come) where the photograph was taken."""
         with self._lock:
-            if self._framing is None:
+            if self._arrangement is None:
                 return
             clients = list(self.server.get_clients().values()) if client is None else [client]
             start = self.server.initial_camera
-            start.position, start.look_at = self._framing.position, self._framing.look_at
-            start.fov = self._framing.fov
+            start.position, start.look_at = self._arrangement.position, self._arrangement.look_at
+            start.fov = self._arrangement.fov
             for one in clients:
                 with one.atomic():
                     one.camera.up_direction = self.up
-                    one.camera.position, one.camera.look_at = self._framing.position, self._framing.look_at
-                    one.camera.fov = self._framing.fov
+                    one.camera.position, one.camera.look_at = self._arrangement.position, self._arrangement.look_at
+                    one.camera.fov = self._arrangement.fov
 
-    def _draw_splats(self, shown: Sequence[Sample], framing: Framing) -> None:
+    def _draw_splats(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
         scenes = [sample.for_viewers() for sample in shown]
         if self.depth:
             scenes = depth_colored(scenes)
         wanted = {}
         for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True)):
             for layer in range(sample.layers):
-                wanted[f"/sample_{i}/layer_{layer}"] = layer_of(scene, layer, sample.layers), framing.shift(i), layer
+                wanted[f"/sample_{i}/layer_{layer}"] = (
+                    layer_of(scene, layer, sample.layers),
+                    arrangement.shift(i),
+                    layer,
+                )
         for name in self._splats.keys() - wanted.keys():
             self._splats.pop(name).remove()
         for name, (gaussians, shift, layer) in wanted.items():
@@ -223,28 +176,24 @@ class Stage:
             handle.scale, handle.position = splats.scale, shift
             handle.visible = layer not in self.hidden_layers
 
-    def _draw_cameras(self, shown: Sequence[Sample], framing: Framing) -> None:
+    def _draw_cameras(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
         for frustum in self._frusta:
             frustum.remove()
         self._frusta = []
         for i, sample in enumerate(shown):
             reference = sample.reference
+            up = reference.intrinsics.new_tensor(self.up.tolist())
             groups = {
                 "reference": (reference[None], REFERENCE_COLOR),
-                "orbit": (
-                    orbit(
-                        reference, framing.pivots[i], reference.intrinsics.new_tensor(self.up.tolist()), ORBIT_CAMERAS
-                    ),
-                    ORBIT_COLOR,
-                ),
+                "orbit": (orbit(reference, arrangement.pivots[i], up, ORBIT_CAMERAS), ORBIT_COLOR),
                 "data set": (self.data_cameras, DATA_COLOR),
             }
             for name, (cameras, color) in groups.items():
                 if name in self.cameras and cameras is not None:
-                    self._add_frusta(f"/cameras/{i}/{name.replace(' ', '_')}", cameras, color, framing, i)
+                    self._add_frusta(f"/cameras/{i}/{name.replace(' ', '_')}", cameras, color, arrangement, i)
 
     def _add_frusta(
-        self, name: str, cameras: Cameras, color: tuple[int, int, int], framing: Framing, index: int
+        self, name: str, cameras: Cameras, color: tuple[int, int, int], arrangement: Arrangement, index: int
     ) -> None:
         height, width = cameras.image_size
         poses = cameras.camera_to_world
@@ -254,11 +203,58 @@ class Stage:
                     f"{name}/{i}",
                     fov=2 * math.atan(height / 2 / intrinsics[1, 1].item()),
                     aspect=width / height,
-                    scale=0.08 * framing.distance,
+                    scale=0.08 * arrangement.distance,
                     thickness=1.5,
                     thickness_units="screen",
                     color=color,
                     wxyz=matrix_to_quaternion(pose[:3, :3]).cpu().numpy(),
-                    position=(pose[:3, 3].cpu().numpy() + framing.shift(index)),
+                    position=(pose[:3, 3].cpu().numpy() + arrangement.shift(index)),
                 )
             )
+
+
+class ViserSplats(NamedTuple):
+    """What `add_gaussian_splats` takes, in units of `scale` scene units.
+
+    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: the unit is chosen so that
+    the largest one is just below that end, and thin Gaussians keep their shape.
+    """
+
+    centers: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colors: UInt8[np.ndarray, "gaussian 3"]
+    opacities: UInt8[np.ndarray, "gaussian 1"]
+    scale: float
+
+
+def to_splats(gaussians: Gaussians) -> ViserSplats:
+    """One unbatched set. Gaussians that are not finite are left out, and colours above 1 become 1."""
+    kept = gaussians.keep(gaussians.finite()).to("cpu")
+    largest = kept.scales.max().item() if kept.count else 1.0
+    scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
+    unit = replace(kept, means=kept.means / scale, scales=kept.scales / scale)
+    return ViserSplats(
+        unit.means.float().numpy(),
+        unit.covariances().float().numpy(),
+        _bytes(kept.colors),
+        _bytes(kept.opacities[:, None]),
+        scale,
+    )
+
+
+def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
+    return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
+
+
+def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
+    """One layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
+    size = gaussians.count // layers
+    return gaussians[layer * size : (layer + 1) * size]
+
+
+def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
+    """The scenes in the colours of their depths (z), near bright and far dark, on one scale for all of them."""
+    depths = torch.cat([scene.means[:, 2] for scene in scenes])
+    colors, _ = color_depth(depths[None, None, :])
+    parts = colors[:, 0].T.split([scene.count for scene in scenes])
+    return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]

@@ -11,7 +11,7 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json, tiny_generator
 
-from completesplat.commands.predict import check_settings, find_pictures, folder_names, unusual_field_of_view
+from completesplat.commands.predict import RANGES, check_settings, find_pictures, folder_names, unusual_field_of_view
 from completesplat.data.pictures.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
@@ -197,5 +197,5 @@ def test_every_example_of_the_help_composes(command):
     assert len(examples) >= 4
     for settings in examples:
         config = compose_config("predict", *settings)
-        check_settings(config)
+        check_settings(config, RANGES)
         assert config.image

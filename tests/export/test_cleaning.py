@@ -1,18 +1,27 @@
-import dataclasses
+"""Gaussians that files can hold, and that viewers draw without gaps."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.cleaning import cleaned, storable
-from completesplat.gaussians import concatenate
+from completesplat.export.cleaning import cleaned, storable, with_screen_space_dilation
+from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers import RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+SIZE = 32
+CAMERA = Cameras(torch.eye(4), pinhole(40.0, SIZE), (SIZE, SIZE))
+WITHOUT_BLUR = ReferenceRasterizer(replace(RenderingConstants(), blur=1e-6))
 
 
 def scene(count: int = 3):
     """Twice as many Gaussians, each in a place of its own."""
     together = concatenate([some_gaussians(1)[0]] * count)
-    return dataclasses.replace(together, means=torch.arange(6.0 * count).view(-1, 3))
+    return replace(together, means=torch.arange(6.0 * count).view(-1, 3))
 
 
 @pytest.mark.parametrize(
@@ -34,7 +43,7 @@ def test_what_is_broken_in_one_place_is_taken_out_and_counted(caplog, field, val
     whole = scene().to(torch.float64)
     damaged = getattr(whole, field).clone()
     damaged.view(6, -1)[[1, 4], -1] = value
-    broken = dataclasses.replace(whole, **{field: damaged})
+    broken = replace(whole, **{field: damaged})
     assert storable(broken).tolist() == [True, False, True, True, False, True]
     kept = cleaned(broken, "photo.jpg: sample 0")
     assert torch.equal(kept.means, broken.means[[0, 2, 3, 5]])
@@ -50,9 +59,38 @@ def test_a_set_without_a_fault_is_the_same_set_and_says_nothing(caplog):
 def test_a_set_of_nothing_but_faults_is_refused():
     whole = scene()
     with pytest.raises(CompleteSplatError, match=r"photo: all 6 Gaussians are broken"):
-        cleaned(dataclasses.replace(whole, opacities=whole.opacities * torch.nan), "photo")
+        cleaned(replace(whole, opacities=whole.opacities * torch.nan), "photo")
 
 
 def test_an_empty_set_is_no_fault():
     nothing = scene().keep(torch.zeros(6, dtype=torch.bool))
     assert cleaned(nothing, "x").count == 0
+
+
+def on_the_axis(scales: list[float], depth: float) -> Gaussians:
+    one = some_gaussians(1)[0][:1]
+    return replace(
+        one,
+        means=torch.tensor([[0.0, 0.0, depth]]),
+        scales=torch.tensor([scales]),
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+    )
+
+
+@pytest.mark.parametrize("depth", [0.7, 3.0])
+@pytest.mark.parametrize("scales", [[1e-4, 1e-4, 1e-4], [0.05, 0.002, 0.01]])
+def test_a_picture_without_blur_is_the_one_that_training_saw_with_it(scales, depth):
+    gaussians = on_the_axis(scales, depth)
+    seen = ReferenceRasterizer()(gaussians[None], CAMERA[None, None]).over(0.5)
+    drawn = WITHOUT_BLUR(with_screen_space_dilation(gaussians, CAMERA)[None], CAMERA[None, None]).over(0.5)
+    assert (seen - 0.5).abs().max() > 0.01
+    assert torch.allclose(seen, drawn, atol=2e-4)
+
+
+def test_nothing_but_the_size_changes_and_it_only_grows():
+    gaussians = some_gaussians(1)[0]
+    gaussians = replace(gaussians, means=gaussians.means + torch.tensor([0.0, 0.0, 2.0]))
+    dilated = with_screen_space_dilation(gaussians, CAMERA)
+    assert (dilated.scales > gaussians.scales).all()
+    for name in ("means", "quaternions", "opacities", "colors"):
+        assert torch.equal(getattr(dilated, name), getattr(gaussians, name))

@@ -1,9 +1,17 @@
+import dataclasses
+
 import imageio.v2 as imageio
 import numpy as np
 import pytest
 import torch
 
-from completesplat.export.video import write_video
+from completesplat.export.video import orbit_views, write_video
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers.reference import ReferenceRasterizer
+
+PIVOT = torch.tensor([0.0, 0.0, 3.0])
+CAMERA = Cameras(torch.eye(4), pinhole(50.0, 33), (33, 33))
 
 
 def read(path):
@@ -48,3 +56,56 @@ def test_frames_that_are_not_finite_leave_no_file(tmp_path):
     with pytest.raises(ValueError, match="not finite"):
         write_video(tmp_path / "a.mp4", torch.full((2, 3, 64, 64), float("nan")))
     assert list(tmp_path.iterdir()) == []
+
+
+def ball(center, color):
+    """One opaque round Gaussian."""
+    return Gaussians(
+        means=torch.tensor([center]),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]),
+        scales=torch.full((1, 3), 0.2),
+        opacities=torch.tensor([1.0]),
+        colors=torch.tensor([color]),
+    )
+
+
+def test_the_pivot_stays_in_the_centre_at_one_distance():
+    images, depth = orbit_views(ReferenceRasterizer(), ball([0.0, 0.0, 3.0], [1.0, 0.5, 0.0]), CAMERA, PIVOT, 6)
+    assert images.shape == (6, 3, 33, 33)
+    torch.testing.assert_close(depth[:, 0, 16, 16], torch.full((6,), 3.0), rtol=0, atol=1e-4)
+    torch.testing.assert_close(images[:, :, 16, 16], torch.tensor([1.0, 0.5, 0.0]).expand(6, 3), rtol=0, atol=3e-3)
+
+
+def test_the_first_view_is_the_reference_view_and_up_is_the_cameras_own():
+    gaussians = ball([0.3, -0.5, 3.0], [1.0, 0.0, 0.0])
+    world_to_camera = torch.eye(4)
+    world_to_camera[:3, :3] = torch.tensor([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    turned = dataclasses.replace(CAMERA, world_to_camera=world_to_camera)
+    rasterizer = ReferenceRasterizer()
+    for camera in (CAMERA, turned):
+        pivot = camera.camera_to_world[:3, :3] @ PIVOT
+        here = gaussians.transform(camera.camera_to_world)
+        images, _ = orbit_views(rasterizer, here, camera, pivot, 4, background=0.0)
+        direct = rasterizer(here[None], camera[None, None])
+        torch.testing.assert_close(images[0], direct.over(0.0)[0, 0], rtol=0, atol=1e-5)
+        # Half a turn about the camera's vertical mirrors left and right, and keeps what is up.
+        rows, columns = (images[:, 0].sum(axis).argmax(-1) for axis in (-1, -2))
+        assert (rows < 14).all()
+        assert columns[0] > 17
+        assert columns[2] < 15
+
+
+def test_chunks_do_not_change_the_result():
+    gaussians = ball([0.2, 0.1, 2.5], [0.0, 1.0, 0.0])
+    whole = orbit_views(ReferenceRasterizer(), gaussians, CAMERA, PIVOT, 5, chunk=5)
+    parts = orbit_views(ReferenceRasterizer(), gaussians, CAMERA, PIVOT, 5, chunk=2)
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+
+
+def test_the_background_is_a_number_or_a_colour():
+    gaussians = ball([0.0, 0.0, 3.0], [0.0, 1.0, 0.0])
+    color = torch.tensor([0.1, 0.2, 0.3])
+    images, depth = orbit_views(ReferenceRasterizer(), gaussians, CAMERA, PIVOT, 2, background=color)
+    assert torch.equal(images[:, :, 0, 0], color.expand(2, 3))
+    assert (depth[:, :, 0, 0] == 0).all()
+    assert (orbit_views(ReferenceRasterizer(), gaussians, CAMERA, PIVOT, 2)[0][:, :, 0, 0] == 1).all()

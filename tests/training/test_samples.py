@@ -7,6 +7,7 @@ import pandas
 import pytest
 import torch
 from hydra.utils import instantiate
+from picture_sheets import cells
 from PIL import Image
 from support import SMALL, compose_config
 
@@ -15,7 +16,7 @@ from completesplat.metrics.samples import diversity
 from completesplat.training.pictures import fixed_scenes
 from completesplat.training.samples import SceneDrawings, evenly_spaced, samples_sheet, strip_sheet
 
-MARGIN, LINE, CELL, GAP, SIDE = 72, 16, 128, 4, 32
+SIDE = 32
 
 
 @pytest.mark.parametrize(("count", "most"), [(50, 8), (50, 2), (50, 1), (8, 8), (3, 8), (1, 8), (99, 7)])
@@ -34,22 +35,13 @@ def some_drawings(samples: int = 2, views: int = 3) -> SceneDrawings:
     return SceneDrawings(pictures[0], pictures[1:], torch.ones(1, views, 1, SIDE, SIDE), [999, 499, 0], strip)
 
 
-def cells(picture: Image.Image) -> torch.Tensor:
-    """[row column 3 height width], in [0, 1], as they were before they were enlarged."""
-    pixels = np.asarray(picture)[LINE:, MARGIN:]
-    rows, columns = (length // (CELL + GAP) for length in pixels.shape[:2])
-    grid = pixels.reshape(rows, CELL + GAP, columns, CELL + GAP, 3)
-    small = grid[:, : CELL : CELL // SIDE, :, : CELL : CELL // SIDE]
-    return torch.from_numpy(small / np.float32(255)).permute(0, 2, 4, 1, 3)
-
-
 def assert_shows(found: torch.Tensor, expected: torch.Tensor) -> None:
     torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
 def test_rows_are_true_pictures_samples_and_depths_scene_by_scene():
     drawn = [some_drawings(), some_drawings(views=2)]
-    found = cells(samples_sheet(drawn))
+    found = cells(samples_sheet(drawn), SIDE, SIDE)
     assert found.shape[:2] == (8, 3)
     for top, scene in zip((0, 4), drawn, strict=True):
         views = len(scene.true)
@@ -60,7 +52,7 @@ def test_rows_are_true_pictures_samples_and_depths_scene_by_scene():
 
 def test_the_strip_has_a_row_for_each_of_two_views():
     drawn = [some_drawings(), some_drawings()]
-    found = cells(strip_sheet(drawn))
+    found = cells(strip_sheet(drawn), SIDE, SIDE)
     assert found.shape[:2] == (4, 4)
     for scene, rows in zip(drawn, found.split(2), strict=True):
         assert_shows(rows.transpose(0, 1), scene.strip)
@@ -86,11 +78,11 @@ def test_a_run_leaves_samples_and_what_they_score(pipeline):
     data.setup("fit")
     # One validation scene with two targets, four samples, two denoising steps.
     (scene,) = fixed_scenes(data, 2, 8)
-    found = cells(Image.open(run / "samples/step_000002.png"))
+    found = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
     assert found.shape[:2] == (1 + 4 + 1, 3)
     assert_shows(found[0, 0], scene.reference.images)
     assert_shows(found[0, 1:], scene.targets.images)
-    strip = cells(Image.open(run / "samples/strip_000002.png"))
+    strip = cells(Image.open(run / "samples/strip_000002.png"), SIDE, SIDE)
     assert strip.shape[:2] == (2, 3)
     assert_shows(strip[:, 0], torch.stack([scene.reference.images, scene.targets.images[1]]))
     # DDIM ends at its last estimate.

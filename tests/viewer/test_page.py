@@ -14,7 +14,7 @@ from support import tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.cleaning import widened
+from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.ply import read_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -288,7 +288,7 @@ def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page,
         lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None),
     )
     (ply,), _ = page.saver.save("ply", [sample]), page.saver.save("video", [sample])
-    wide = widened(sample.gaussians, sample.reference) if exact else sample.gaussians
+    wide = with_screen_space_dilation(sample.gaussians, sample.reference) if exact else sample.gaussians
     assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)
     assert torch.equal(drawn[0].scales, sample.gaussians.scales)
 

@@ -1,13 +1,19 @@
+"""Pictures that are loaded on the page, and the numbers of denoising steps that can be chosen."""
+
 import io
 
 import numpy as np
 import pytest
+import torch
+from diffusers import DDIMScheduler, DPMSolverMultistepScheduler
 from PIL import Image
 from support import tiny_generator
 
-from completesplat.errors import ImageError
+from completesplat.diffusion.sampling import Sampler
+from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.viewer import completion
 from completesplat.viewer.completion import read_upload
+from completesplat.viewer.controls import nearest_steps, possible_steps
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +55,30 @@ def test_a_name_is_no_path_and_no_markup(model):
     with pytest.raises(ImageError) as caught:
         read_upload(model, "../../\n\x1betc/passwd", b"nothing")
     assert str(caught.value).startswith("../../??etc/passwd: not an image")
+
+
+@pytest.mark.parametrize(
+    "scheduler", [DDIMScheduler(), DDIMScheduler(num_train_timesteps=30), DPMSolverMultistepScheduler()]
+)
+def test_the_sampler_takes_just_these_numbers(scheduler):
+    sampler = Sampler(scheduler, steps=2)
+    noise, conditioning = torch.zeros(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)
+
+    def taken(steps: int) -> bool:
+        try:
+            sampler(lambda latent, *_: torch.zeros_like(latent), noise, conditioning, steps=steps)
+        except CompleteSplatError:
+            return False
+        return True
+
+    asked = [1, 2, 3, 4, 7, 10, 15, 20, 30, 31, 40]
+    assert [n for n in asked if taken(n)] == [n for n in asked if n in possible_steps(sampler)]
+
+
+def test_the_nearest_possible_number():
+    sampler = Sampler(DDIMScheduler(), steps=50)
+    assert [nearest_steps(sampler, n) for n in (1, 11, 23, 30, 70, 100)] == [1, 10, 25, 25, 50, 100]
+
+
+def test_the_samplers_own_number_is_always_there():
+    assert 500 in possible_steps(Sampler(DDIMScheduler(), steps=500))
