@@ -142,9 +142,8 @@ def test_validation_reads_pictures(root, cache):
     [
         {"color_jitter": {"brightness": 0.1, "contrast": 0, "saturation": 0, "hue": 0}},
         {"mirroring": True},
-        {"streaming": True},
     ],
-    ids=["jitter", "mirroring", "streaming"],
+    ids=["jitter", "mirroring"],
 )
 def test_what_would_change_pictures_is_refused(tmp_path, changes):
     with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):

@@ -3,7 +3,6 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any
 
 import torch
@@ -11,7 +10,6 @@ from torch.utils.data import DataLoader, Sampler
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
-from completesplat.data.loading.streaming import StreamedScenes
 from completesplat.data.loading.view_selection import draws
 from completesplat.errors import CompleteSplatError, DataError
 
@@ -68,7 +66,7 @@ class SceneLoader:
     It is a loader of its own for Lightning, which restores `state_dict` in the middle of an epoch.
 
     Args:
-        sampler: the order (streamed scenes are their own); None: as they are.
+        sampler: the order of a training epoch; None: as they are.
         workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
         most_bad: skipping more than this share of an epoch's items is an error.
@@ -76,9 +74,9 @@ class SceneLoader:
 
     def __init__(
         self,
-        scenes: TrainingScenes | EvaluationScenes | StreamedScenes,
+        scenes: TrainingScenes | EvaluationScenes,
         batch_size: int,
-        sampler: EpochSampler | StreamedScenes | None,
+        sampler: EpochSampler | None,
         workers: int,
         on_bad: str = "skip",
         most_bad: float = 0.1,
@@ -96,11 +94,9 @@ class SceneLoader:
         self._loader = DataLoader(
             scenes,
             batch_size,
-            sampler=None if isinstance(sampler, StreamedScenes) else sampler,
+            sampler=sampler,
             num_workers=workers,
-            # Workers hold what is cached, so they live on from one epoch to the next; those of a stream hold nothing,
-            # and learn from a new start which epoch it is.
-            persistent_workers=workers > 0 and not isinstance(sampler, StreamedScenes),
+            persistent_workers=workers > 0,  # They hold what is cached, so they live on from one epoch to the next.
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
             # Its own, so that the numbers which training draws do not depend on the number of workers.
@@ -118,13 +114,10 @@ class SceneLoader:
         """
         self.refused, resume, self._resume = [], self._resume, {}
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
-        surplus = 0
         if self.sampler is not None:
             self.sampler.start = self._batches * self.batch_size
-        if isinstance(self.sampler, StreamedScenes):
-            surplus = self.sampler.unfinished_round(self._loader.num_workers)
         try:
-            for scenes, refused in islice(self._loader, surplus, surplus + len(self) - self._batches):
+            for scenes, refused in self._loader:
                 self._batches += 1
                 self._account(refused, scenes is None)
                 if self._batches == len(self):
@@ -132,8 +125,6 @@ class SceneLoader:
                     self._report()
                 if scenes is not None:
                     yield scenes
-            if self._batches < len(self):
-                raise DataError("no sequences for this process: there are more processes than sequences")
         except GeneratorExit:  # The rest of the epoch is not wanted.
             if self._batches < len(self):
                 self._report()

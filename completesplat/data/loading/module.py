@@ -17,7 +17,6 @@ from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augme
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.loader import EpochSampler, SceneLoader, check_policy
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
-from completesplat.data.loading.streaming import StreamedScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
 from completesplat.data.packed.manifest import is_prepared, read_manifest, settings_must_match
 from completesplat.data.packed.source import PreparedSource
@@ -31,7 +30,7 @@ def check_settings(targets: int, mask_threshold: float | None, encoded: str | No
 
     Args:
         encoded: folder of encoded pictures; an empty name is one that is still to be given.
-        changed: whether training pictures are augmented or streamed.
+        changed: whether training pictures are augmented.
 
     Raises:
         CompleteSplatError: one of them is out of its range, or encoded pictures are to be changed.
@@ -43,7 +42,7 @@ def check_settings(targets: int, mask_threshold: float | None, encoded: str | No
     if encoded == "":
         raise CompleteSplatError("data.encoded is needed: give data.encoded=DIR, which `data latents` wrote")
     if encoded is not None and changed:
-        asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
+        asked = "data.color_jitter=null data.mirroring=false"
         raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
 
 
@@ -71,7 +70,6 @@ class SceneDataModule(LightningDataModule):
         mirroring: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none.
         cache: keep decoded pictures in memory.
-        streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
         encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
             validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
@@ -92,7 +90,6 @@ class SceneDataModule(LightningDataModule):
         mirroring: bool = False,
         workers: int = 0,
         cache: bool = False,
-        streaming: bool = False,
         encoded: str | None = None,
         on_bad: str = "skip",
         most_bad: float = 0.1,
@@ -100,7 +97,7 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         check_policy(on_bad)
-        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring or streaming)
+        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -111,7 +108,7 @@ class SceneDataModule(LightningDataModule):
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
-        self.workers, self.cache, self.streaming = workers, cache, streaming
+        self.workers, self.cache = workers, cache
         self.encoded = None if encoded is None else Path(encoded)
         self.policy = on_bad, most_bad
         self.seed = seed
@@ -219,11 +216,7 @@ class SceneDataModule(LightningDataModule):
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
-        order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
-        if self.streaming:
-            order = StreamedScenes(scenes, self.source("train"), batch_size)
-        items = order if isinstance(order, StreamedScenes) else scenes
-        return SceneLoader(items, batch_size, order, self.workers, *self.policy)
+        return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views

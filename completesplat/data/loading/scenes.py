@@ -137,14 +137,7 @@ class TrainingScenes(Dataset[Loaded]):
         Raises:
             DataError: the sequence or a picture cannot be read.
         """
-        return self.make(self.store.source.read(name), rng)
-
-    def make(self, sequence: PosedSequence, rng: np.random.Generator) -> SceneBatch:
-        """A scene of random views of a sequence.
-
-        Raises:
-            DataError: a picture that cannot be read.
-        """
+        sequence = self.store.source.read(name)
         scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
         return self.augment(scene, rng)
 
