@@ -12,11 +12,15 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Views(TensorDataclass):
-    """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1)."""
+    """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1).
+
+    `depths` is the true depth along the optical axes in units of the cameras, 0 where it is unknown; None: not read.
+    """
 
     images: Float[Tensor, "*batch 3 height width"]
     cameras: Cameras
     masks: Float[Tensor, "*batch 1 height width"]
+    depths: Float[Tensor, "*batch 1 height width"] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,10 +55,14 @@ class SceneBatch(TensorDataclass):
             _prepend(reference.cameras.intrinsics, targets.cameras.intrinsics, axis=-3),
             reference.cameras.image_size,
         )
+        depths = None
+        if reference.depths is not None and targets.depths is not None:
+            depths = _prepend(reference.depths, targets.depths, axis=-4)
         return Views(
             _prepend(reference.images, targets.images, axis=-4),
             cameras,
             _prepend(reference.masks, targets.masks, axis=-4),
+            depths,
         )
 
 

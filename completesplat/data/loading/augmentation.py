@@ -152,7 +152,8 @@ def mirrored(scene: SceneBatch) -> SceneBatch:
 
 
 def _mirrored_views(views: Views) -> Views:
-    return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1))
+    depths = None if views.depths is None else views.depths.flip(-1)
+    return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1), depths)
 
 
 def _jittered(scene: SceneBatch, color_jitter: ColorJitter, rng: np.random.Generator) -> SceneBatch:

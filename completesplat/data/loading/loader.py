@@ -89,6 +89,7 @@ class SceneLoader:
         self.on_bad = on_bad
         self.most_bad = most_bad
         self.refused: list[DataError] = []
+        self.refused_depths: list[DataError] = []
         self._batches = 0
         self._resume: dict[str, int] = {}
         self._loader = DataLoader(
@@ -112,14 +113,16 @@ class SceneLoader:
         Raises:
             DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.
         """
-        self.refused, resume, self._resume = [], self._resume, {}
+        resume, self._resume = self._resume, {}
+        self.refused, self.refused_depths = [], []
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
         if self.sampler is not None:
             self.sampler.start = self._batches * self.batch_size
         try:
-            for scenes, refused in self._loader:
+            for scenes, refused, refused_depths in self._loader:
                 self._batches += 1
                 self._account(refused, scenes is None)
+                self.refused_depths += refused_depths
                 if self._batches == len(self):
                     # Not behind the loop: whoever knows how many batches there are, as Lightning, asks for no more.
                     self._report()

@@ -235,7 +235,8 @@ class SceneDataModule(LightningDataModule):
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
         seen = None if self.at_model_size is None else self.at_model_size.store(split)
-        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split), seen=seen)
+        choose, depths = partial(self.evaluation_views, split=split), split == "test"
+        scenes = EvaluationScenes(self.store(split), choose, seen=seen, depths=depths)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)

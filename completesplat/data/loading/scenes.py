@@ -25,10 +25,16 @@ Choice = tuple[int, list[int]]  # reference, targets
 
 
 class Loaded(NamedTuple):
-    """A scene, or a batch of them, and what could not be read on the way."""
+    """A scene, or a batch of them, and what could not be read on the way.
+
+    Attributes:
+        refused: why scenes could not be read.
+        refused_depths: why scenes are here without their true depth, although the data have it.
+    """
 
     scenes: SceneBatch | EncodedScene | None
     refused: tuple[DataError, ...]
+    refused_depths: tuple[DataError, ...] = ()
 
 
 class SceneStore:
@@ -155,6 +161,7 @@ class EvaluationScenes(Dataset[Loaded]):
         choose: sequence -> views. Raises `DataError` where it has not got them.
         names: the sequences; None: all.
         seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
+        depths: read the true depth too, where the data have it.
     """
 
     def __init__(
@@ -163,11 +170,13 @@ class EvaluationScenes(Dataset[Loaded]):
         choose: Callable[[PosedSequence], Choice],
         names: Sequence[str] | None = None,
         seen: SceneStore | None = None,
+        depths: bool = False,
     ) -> None:
         self.store = store
         self.choose = choose
         self.names = store.names if names is None else names
         self.seen = seen
+        self.depths = depths
 
     def __len__(self) -> int:
         return len(self.names)
@@ -177,7 +186,7 @@ class EvaluationScenes(Dataset[Loaded]):
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
         own = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, own, self.seen)
+        return EvaluationScenes(self.store, self.choose, own, self.seen, self.depths)
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]
@@ -187,9 +196,13 @@ class EvaluationScenes(Dataset[Loaded]):
             scene = self.store.scene(sequence, *views)
             if self.seen is not None:
                 scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
-            return Loaded(scene, ())
         except DataError as error:
             return Loaded(None, (error,))
+        try:
+            depths = _depths(sequence, *views) if self.depths else None
+        except DataError as error:
+            return Loaded(scene, (), (error,))
+        return Loaded(scene if depths is None else with_depths(scene, depths), ())
 
     def stackable(self) -> bool:
         """Whether all scenes have the same number of targets, as far as they can be read."""
@@ -200,7 +213,40 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(counts) <= 1
 
 
+def _depths(
+    sequence: PosedSequence, reference: int, targets: Sequence[int]
+) -> Float[Tensor, "view 1 height width"] | None:
+    """True depth of these frames, the reference first; None where the data have none.
+
+    Raises:
+        DataError: a depth map cannot be read.
+    """
+    if sequence.read_depth is None:
+        return None
+    return torch.stack([sequence.read_depth(view) for view in (reference, *targets)])
+
+
+def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
+    """One scene (without batch axis) with the depths of its reference and its targets."""
+    reference, targets = replace(scene.reference, depths=depths[0]), replace(scene.targets, depths=depths[1:])
+    return replace(scene, reference=reference, targets=targets)
+
+
 def collate(items: Sequence[Loaded]) -> Loaded:
-    """A batch of the scenes that are there."""
+    """A batch of the scenes that are there; where only some of them have depths, those of the others are 0, unknown."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    return Loaded(stack(scenes) if scenes else None, tuple(error for item in items for error in item.refused))
+    if any(_has_depths(scene) for scene in scenes):
+        scenes = [scene if _has_depths(scene) else _with_unknown_depths(scene) for scene in scenes]
+    return Loaded(
+        stack(scenes) if scenes else None,
+        tuple(error for item in items for error in item.refused),
+        tuple(error for item in items for error in item.refused_depths),
+    )
+
+
+def _has_depths(scene: SceneBatch | EncodedScene) -> bool:
+    return isinstance(scene, SceneBatch) and scene.reference.depths is not None
+
+
+def _with_unknown_depths(scene: SceneBatch | EncodedScene) -> SceneBatch | EncodedScene:
+    return with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene
