@@ -18,6 +18,7 @@ from written_commands import arguments_of, readme_commands
 ORDER = [
     "data toy",
     "fit experiment",
+    "data prepare data=toy_objects",
     "data latents",
     "fit",
     "predict",
@@ -31,6 +32,7 @@ ORDER = [
 # Appended to make them short; everything else is as printed.
 BRIEF = {
     "data toy": ["scenes=20", "frames=4", "size=32", "workers=1"],
+    "data prepare data=toy_objects": ["data.image_size=32", "workers=1"],
     "fit": [*SMALL, "test=false", "data.scenes=20", "callbacks.pictures=null"],
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],

@@ -66,6 +66,7 @@ def test_arrays_of_objects_are_not_loaded(copy):
         (("sequences",), {}),
         (("sequences", 0, "stored"), [0, 0]),
         (("sequences", 0, "stored"), [1]),
+        (("sequences", 0, "stored"), []),
         (("sequences", 0, "frames"), 2),
         (("sequences", 0, "first"), 10**6),
         (("sequences", 0, "first"), -1),

@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.packed.manifest import MANIFEST, Refusal, Scalar, refusal_from_json, write_json
+from completesplat.data.packed.manifest import MANIFEST, Scalar, write_json
 from completesplat.data.validation import (
     BadAnnotation,
     UnreadableFile,
@@ -18,7 +18,7 @@ from completesplat.data.validation import (
     read_json,
 )
 
-FORMAT = 1
+FORMAT = 2
 ARRAYS = ("mean", "log_variance", "condition")
 DTYPES = ("float32", "float16", "uint8")
 
@@ -74,7 +74,6 @@ class Manifest:
     scale: float
     arrays: dict[str, Array]
     sequences: tuple[Sequence, ...]
-    refused: tuple[Refusal, ...]
 
 
 def is_encoded(root: Path) -> bool:
@@ -107,7 +106,6 @@ def read_manifest(root: Path) -> Manifest:
             field(content, "scale", float),
             {name: _array(root, field(arrays, name, dict)) for name in ARRAYS},
             tuple(_sequence(entry) for entry in field(content, "sequences", list)),
-            tuple(refusal_from_json(entry) for entry in field(content, "refused", list)),
         )
         _check(manifest)
         return manifest
@@ -136,7 +134,7 @@ def _array(root: Path, entry: Mapping[str, Any]) -> Array:
 def _sequence(entry: object) -> Sequence:
     frames, stored = field(entry, "frames", int), list_field(entry, "stored", int)
     # Strictly increasing from 0 on and below `frames`.
-    if any(b <= a for a, b in pairwise((-1, *stored, frames))):
+    if not stored or any(b <= a for a, b in pairwise((-1, *stored, frames))):
         raise BadAnnotation("stored frames must be places in the sequence, in order")
     return Sequence(field(entry, "name", str), frames, field(entry, "first", int), stored)
 

@@ -159,15 +159,10 @@ class EncodedStore:
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
-    def missing(self, name: str, frame: int | None = None) -> DataError:
-        """What to raise where a sequence, or a frame of it, is asked for and not there."""
-        what = "its pictures" if frame is None else f"its picture {frame + 1}"
-        return DataError(f"{what} could not be read when the training set was encoded", str(self.folder), name)
-
     def _row(self, sequence: Sequence, frame: int) -> int:
         place = int(np.searchsorted(sequence.stored, frame))
         if place == len(sequence.stored) or sequence.stored[place] != frame:
-            raise self.missing(sequence.name, frame)
+            raise DataError("was not encoded", str(self.folder), sequence.name, frame)
         return sequence.first + place
 
     def _floats(self, array: str, row: int) -> Float[Tensor, "_ _ _"]:
@@ -181,9 +176,8 @@ class EncodedStore:
 class EncodedTraining(TrainingScenes):
     """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
 
-    Where all frames were to be encoded, an item with a frame (target views included) that could not be read is
-    replaced by the very item that `TrainingScenes` puts in its place. Where only some frames of a sequence were, the
-    nearest of those that are there takes the reference's place (the earlier one of two).
+    Where only some frames of a sequence were encoded, the nearest of those that are there takes the reference's place
+    (the earlier one of two).
 
     Args:
         encoded: where the items come from.
@@ -214,21 +208,11 @@ class EncodedTraining(TrainingScenes):
         self.box_masks = box_masks
 
     def draw(self, name: str, rng: np.random.Generator) -> EncodedScene:
-        """An encoded reference frame of the sequence of this name.
-
-        Raises:
-            DataError: it is not in the store.
-        """
+        """An encoded reference frame of the sequence of this name."""
         sequence = self.encoded.sequences[name]
-        if not sequence.frames:
-            raise self.encoded.missing(name)
-        reference, targets = self.choose(sequence.frames, rng)
-        if self.encoded.origin.frames is not None and sequence.stored:
-            stored = np.array(sequence.stored)
-            reference = int(stored[np.abs(stored - reference).argmin()])
-        elif missing := {reference, *targets}.difference(sequence.stored):
-            raise self.encoded.missing(name, min(missing))
-        scene = self.encoded.scene(name, reference)
+        reference, _ = self.choose(sequence.frames, rng)
+        stored = np.array(sequence.stored)
+        scene = self.encoded.scene(name, int(stored[np.abs(stored - reference).argmin()]))
         if self.box_masks is None:
             return scene
         boxes_rng = rng.spawn(3)[2]  # the third, as in `augment`

@@ -71,20 +71,30 @@ def check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
             frames.append(len(sequence.frames))
         except DataError:
             continue
-    free = shutil.disk_usage(writer.folder).free
     if not frames or not sizes:
-        logger.warning(
-            "no estimate of the size: none of the sequences looked at can be read; %s are free", decimal(free)
-        )
+        free = decimal(shutil.disk_usage(writer.folder).free)
+        logger.warning("no estimate of the size: none of the sequences looked at can be read; %s are free", free)
         return
     count = round(float(np.mean(frames)) * len(names))
     size = round(count * (float(np.mean(sizes)) + BYTES_PER_FRAME))
-    needed = (
-        f"about {decimal(size)} for {count:,} frames of {len(names):,} sequences in {len(plans):,} shards; "
-        f"{decimal(free)} are free"
-    )
+    contents = f"{count:,} frames of {len(names):,} sequences in {len(plans):,} shards"
+    require_space(size, contents, writer.folder)
+
+
+def require_space(size: int, contents: str, folder: Path, advice: str = "") -> None:
+    """Say how many bytes are going to be written.
+
+    Args:
+        contents: what they are for.
+        advice: how to need less, appended to the error.
+
+    Raises:
+        DataError: the disk has less space than that.
+    """
+    free = shutil.disk_usage(folder).free
+    needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
     if size > free:
-        raise DataError(f"not enough space: {needed}", str(writer.folder))
+        raise DataError(f"not enough space: {needed}{advice}", str(folder))
     logger.info(needed)
 
 
