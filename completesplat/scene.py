@@ -1,4 +1,4 @@
-"""What a data module yields: images with their cameras, for a reference view and its targets; or encoded ones."""
+"""What a data module yields: images with their cameras, for a reference view and its targets; or their latents."""
 
 from dataclasses import dataclass, replace
 
@@ -67,7 +67,7 @@ class SceneBatch(TensorDataclass):
 
 
 @dataclass(frozen=True)
-class EncodedScene(TensorDataclass):
+class CachedScene(TensorDataclass):
     """What stage 2 needs of scenes whose reference pictures were encoded beforehand.
 
     `mean` and `log_variance` are those of the autoreconstructor's posterior, not scaled. `condition` is the reference
@@ -81,7 +81,7 @@ class EncodedScene(TensorDataclass):
     reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
 
-    def __getitem__(self, index: int | slice) -> "EncodedScene":
+    def __getitem__(self, index: int | slice) -> "CachedScene":
         """One scene of a batch, or some of them."""
         return replace(super().__getitem__(index), names=self.names[index])
 

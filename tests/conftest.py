@@ -64,7 +64,7 @@ def packed_toys(pipeline, tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def latent_cache(pipeline, packed_toys, tmp_path_factory) -> Path:
     """The training set, encoded by the pipeline's stage 1."""
-    cache = tmp_path_factory.mktemp("encoded") / "cache"
+    cache = tmp_path_factory.mktemp("latents") / "cache"
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(cache.parent)
         given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]

@@ -24,23 +24,23 @@ from completesplat.data.latent_cache.manifest import (
     Manifest,
     Origin,
     Sequence,
-    is_encoded,
+    is_latent_cache,
     write_manifest,
 )
-from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore
+from completesplat.data.latent_cache.store import ArrayWriter, LatentCache
 from completesplat.data.loading.module import SceneDataModule
-from completesplat.data.packed.source import PreparedSource
+from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.scene import EncodedScene
+from completesplat.scene import CachedScene
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 
 logger = logging.getLogger(__name__)
 
 
-def latent_draw(batch: EncodedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
+def latent_draw(batch: CachedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
     """One draw of each scaled latent: the same noise as `CompleteSplat.encode` draws."""
     return Posterior(batch.mean, batch.log_variance).sample() * scale
 
@@ -55,7 +55,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def check_cache(
-    store: EncodedStore,
+    store: LatentCache,
     autoreconstructor: VariationalAutoReconstructor,
     source: SequenceSource,
     conditioning: nn.Module | None = None,
@@ -144,7 +144,7 @@ def encode_training_set(
     batch_size: int = 64,
     device: torch.device | str = "cpu",
     progress: bool = True,
-) -> EncodedStore:
+) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, as it is without augmentation.
 
     A finished store of the same is left as it is. Nothing that opens is left behind by a run that was interrupted.
@@ -164,11 +164,11 @@ def encode_training_set(
     if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
         raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
     source = data.source("train")
-    if not isinstance(source, PreparedSource):
+    if not isinstance(source, PackedSource):
         advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
         raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
     origin = _origin(autoreconstructor, data, conditioning, frames, precision)
-    if is_encoded(out):
+    if is_latent_cache(out):
         return _kept(out, origin)
     out.mkdir(parents=True, exist_ok=True)
     features = None if conditioning is None else conditioning.to(device).eval()
@@ -180,10 +180,10 @@ def encode_training_set(
     pictures = _pictures(source, frames, sequences, progress)
     arrays, scale = _write_arrays(out, encode, blank, pictures, batch_size)
     write_manifest(out, Manifest(__version__, origin, scale, arrays, tuple(sequences)))
-    return EncodedStore(out)
+    return LatentCache(out)
 
 
-class EncodedFrame(NamedTuple):
+class FrameToEncode(NamedTuple):
     """A picture that is to be encoded, and the frame that it is of."""
 
     image: UInt8[Tensor, "3 size size"]
@@ -199,8 +199,8 @@ def evenly_spaced(count: int, most: int | None) -> list[int]:
 
 
 def _pictures(
-    source: PreparedSource, frames: int | None, sequences: list[Sequence], progress: bool
-) -> Iterator[EncodedFrame]:
+    source: PackedSource, frames: int | None, sequences: list[Sequence], progress: bool
+) -> Iterator[FrameToEncode]:
     """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of.
 
     Raises:
@@ -213,10 +213,10 @@ def _pictures(
         sequences.append(Sequence(name, len(sequence.frames), rows, tuple(places)))
         rows += len(places)
         for place in places:
-            yield EncodedFrame(sequence.read(place).image, name, sequence.frames[place])
+            yield FrameToEncode(sequence.read(place).image, name, sequence.frames[place])
 
 
-def _check_space(source: PreparedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
+def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
     """Say how large the store is going to be.
 
     Raises:
@@ -232,7 +232,7 @@ def _write_arrays(
     out: Path,
     encode: PictureEncoder,
     blank: Mapping[str, np.ndarray],
-    pictures: Iterator[EncodedFrame],
+    pictures: Iterator[FrameToEncode],
     batch_size: int,
 ) -> tuple[dict[str, Array], float]:
     """Rows like those of `blank` for all pictures; what was written, and the scale."""
@@ -264,27 +264,27 @@ def _origin(
         fingerprint(autoreconstructor.encoder),
         features_fingerprint(conditioning),
         data.source("train").fingerprint(),
-        data.prepared_settings(),
+        data.packed_settings(),
         data.image_size,
         frames,
         precision,
     )
 
 
-def _kept(out: Path, origin: Origin) -> EncodedStore:
+def _kept(out: Path, origin: Origin) -> LatentCache:
     """The finished store that is there already.
 
     Raises:
         DataError: it is damaged, or another one than is to be made.
     """
-    store = EncodedStore(out)
+    store = LatentCache(out)
     if store.origin != origin:
         raise DataError("already holds another store: choose another folder, or remove this one", str(out))
     logger.info("%s already holds these encodings", out)
     return store
 
 
-def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: list[EncodedFrame]) -> None:
+def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: list[FrameToEncode]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support import SMALL, strict_json
 
-from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.latent_cache.store import LatentCache
 from completesplat.generation import CompleteSplat
 
 
@@ -15,7 +15,7 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, packed_toys, 
     assert made.status == 0
     assert made.out.splitlines()[-1] == str(cache)
     assert "for 8 frames of 2 sequences" in made.out + made.err
-    store = EncodedStore(cache)
+    store = LatentCache(cache)
     encoder = CompleteSplat.from_pretrained(pipeline.weights).autoreconstructor.encoder
     for name, sequence in store.sequences.items():
         assert sequence.stored == tuple(range(4))
@@ -29,7 +29,7 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, packed_toys, 
     assert (cache / "mean.npy").stat().st_mtime_ns == before
 
     stage2 = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_diffusion", "sampler.steps=2", "test=false"]
-    stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.encoded={cache}"]
+    stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.latent_cache={cache}"]
     assert command("fit", *stage2, f"out={tmp_path / 'run'}").status == 0
     assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
 
@@ -61,7 +61,7 @@ def test_few_frames_and_half_precision_can_be_asked_for(command, pipeline, packe
     change = f"overrides=['data.root={packed_toys}']"
     settings = [f"ckpt={checkpoint}", change, "frames=2", "precision=float16", "batch_size=1", f"out={cache}"]
     assert command("data", "latents", *settings).status == 0
-    store = EncodedStore(cache)
+    store = LatentCache(cache)
     assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)] * 2
     assert store.arrays["mean"].dtype == "float16"
     assert store.arrays["condition"].dtype == "uint8"
@@ -69,6 +69,6 @@ def test_few_frames_and_half_precision_can_be_asked_for(command, pipeline, packe
 
 def test_stage_one_does_not_train_from_what_it_would_encode(command, pipeline, latent_cache, tmp_path):
     settings = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_var", "data.color_jitter=null", "test=false"]
-    refused = command("fit", *settings, f"data.encoded={latent_cache}", f"out={tmp_path / 'run'}")
+    refused = command("fit", *settings, f"data.latent_cache={latent_cache}", f"out={tmp_path / 'run'}")
     assert refused.status == 2
-    assert "data.encoded is for latent diffusion" in refused.err.splitlines()[-1]
+    assert "data.latent_cache is for latent diffusion" in refused.err.splitlines()[-1]

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from encoded_stores import FRAMES, rooms, small_autoreconstructor, sound_rooms
+from latent_caches import FRAMES, rooms, small_autoreconstructor, sound_rooms
 from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.latent_cache.store import LatentCache
 from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.scene import EncodedScene
+from completesplat.scene import CachedScene
 from completesplat.tensors import stack
 from completesplat.training.encoding import Moments, check_cache, encode_training_set, fingerprint, latent_draw
 
@@ -27,13 +27,13 @@ def root(tmp_path_factory) -> Path:
     return sound_rooms(tmp_path_factory.mktemp("root"))
 
 
-def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> EncodedStore:
+def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> LatentCache:
     settings = {"progress": False, **options}
     return encode_training_set(model or small_autoreconstructor(), rooms(root), out, **settings)
 
 
 @pytest.fixture(scope="module")
-def cache(root, tmp_path_factory) -> EncodedStore:
+def cache(root, tmp_path_factory) -> LatentCache:
     return encode(root, tmp_path_factory.mktemp("cache"))
 
 
@@ -116,7 +116,7 @@ def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
     model.latent_scale.fill_(0.7)
     data = rooms(sound_rooms(tmp_path / "root", image_size=32), image_size=32)
     store = encode_training_set(model.autoreconstructor, data, tmp_path / "cache", progress=False)
-    batch: EncodedScene = stack([store.scene(name, 2) for name in store.sequences])
+    batch: CachedScene = stack([store.scene(name, 2) for name in store.sequences])
     torch.manual_seed(5)
     on_the_fly = model.encode(batch.condition).latent
     torch.manual_seed(5)
@@ -148,8 +148,8 @@ def test_what_a_killed_run_leaves_does_not_open_and_is_written_over(root, cache,
     encode(root, tmp_path / "cache", model, batch_size=4)
     assert len(calls) > 3
     assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy"}
-    with pytest.raises(DataError, match="no finished store"):
-        EncodedStore(left)
+    with pytest.raises(DataError, match="no finished latent cache"):
+        LatentCache(left)
     again = encode(root, left)
     assert again.manifest == cache.manifest
     assert all(np.array_equal(again.arrays[name], array) for name, array in cache.arrays.items())
@@ -283,11 +283,11 @@ def test_latents_of_another_shape_are_refused(root, cache, tmp_path, change):
     (copy / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match=r"latents of \(4, 2, 2\)"):
         check_cache(
-            EncodedStore(copy), wide if change == "channels" else small_autoreconstructor(), rooms(root).source("train")
+            LatentCache(copy), wide if change == "channels" else small_autoreconstructor(), rooms(root).source("train")
         )
 
 
 def test_a_manifest_is_read_as_it_was_written(cache):
-    again = EncodedStore(cache.folder).manifest
+    again = LatentCache(cache.folder).manifest
     assert again == cache.manifest
     assert again != replace(again, scale=2 * again.scale)

@@ -1,4 +1,4 @@
-"""What an encoded store says of itself: `manifest.json`, written last, so that only a finished store opens."""
+"""What a latent cache says of itself: `manifest.json`, written last, so that only a finished one opens."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -76,27 +76,27 @@ class Manifest:
     sequences: tuple[Sequence, ...]
 
 
-def is_encoded(root: Path) -> bool:
+def is_latent_cache(root: Path) -> bool:
     """Whether a folder holds a finished store."""
     return (root / MANIFEST).is_file()
 
 
 def write_manifest(root: Path, manifest: Manifest) -> None:
     """`manifest.json` in the store's folder, there as a whole or not at all."""
-    write_json(root / MANIFEST, {"format": FORMAT, "kind": "encoded", **asdict(manifest)})
+    write_json(root / MANIFEST, {"format": FORMAT, "kind": "latent_cache", **asdict(manifest)})
 
 
 def read_manifest(root: Path) -> Manifest:
     """The manifest of a store.
 
     Raises:
-        DataError: missing, damaged, of another version of the format, or not that of an encoded store.
+        DataError: missing, damaged, of another version of the format, or not that of a latent cache.
     """
     path = root / MANIFEST
     with at(file=path):
         content = read_json(path)
-        if field(content, "kind", str) != "encoded":
-            raise UnreadableFile("no store of encoded pictures: completesplat data latents makes one")
+        if field(content, "kind", str) != "latent_cache":
+            raise UnreadableFile("no latent cache: completesplat data latents makes one")
         if field(content, "format", int) != FORMAT:
             raise UnreadableFile(f"format {content['format']}, this version reads {FORMAT}: encode the pictures again")
         arrays = field(content, "arrays", dict)

@@ -69,7 +69,7 @@ class SceneLoader:
         sampler: the order of a training epoch; None: as they are.
         workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
-        most_bad: skipping more than this share of an epoch's items is an error.
+        max_bad_fraction: skipping more than this share of an epoch's items is an error.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class SceneLoader:
         sampler: EpochSampler | None,
         workers: int,
         on_bad: str = "skip",
-        most_bad: float = 0.1,
+        max_bad_fraction: float = 0.1,
     ) -> None:
         check_policy(on_bad)
         self.dataset = scenes
@@ -87,7 +87,7 @@ class SceneLoader:
         self.sampler = sampler
         self.batch_sampler = None  # Lightning asks for it wherever there is a sampler
         self.on_bad = on_bad
-        self.most_bad = most_bad
+        self.max_bad_fraction = max_bad_fraction
         self.refused: list[DataError] = []
         self.refused_depths: list[DataError] = []
         self._batches = 0
@@ -108,7 +108,7 @@ class SceneLoader:
         return len(self._loader)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches of an epoch (`SceneBatch`, or `EncodedScene`), or the rest of it after `load_state_dict`.
+        """The batches of an epoch (`SceneBatch`, or `CachedScene`), or the rest of it after `load_state_dict`.
 
         Raises:
             DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.
@@ -164,11 +164,12 @@ class SceneLoader:
         if refused and self.on_bad == "raise":
             raise refused[0]
         self.refused += refused
-        too_many = len(self.refused) > max(1, self.most_bad * self._items)
+        too_many = len(self.refused) > max(1, self.max_bad_fraction * self._items)
         # Evaluation has nothing in the place of what cannot be read.
         nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
         if too_many or nothing:
-            reason = f"more than data.most_bad={self.most_bad:g} allows" if too_many else "and nothing in their place"
+            limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"
+            reason = limit if too_many else "and nothing in their place"
             raise DataError(
                 f"{len(self.refused)} of {self._items} items cannot be read, {reason}; see `completesplat data check`; "
                 f"the last one: {self.refused[-1]}"

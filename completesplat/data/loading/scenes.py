@@ -15,7 +15,7 @@ from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import draws
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.errors import DataError
-from completesplat.scene import EncodedScene, SceneBatch, Views
+from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
 # So many other items are tried in the place of one that cannot be read.
@@ -32,7 +32,7 @@ class Loaded(NamedTuple):
         refused_depths: why scenes are here without their true depth, although the data have it.
     """
 
-    scenes: SceneBatch | EncodedScene | None
+    scenes: SceneBatch | CachedScene | None
     refused: tuple[DataError, ...]
     refused_depths: tuple[DataError, ...] = ()
 
@@ -137,7 +137,7 @@ class TrainingScenes(Dataset[Loaded]):
                 index = int(rng.integers(len(self)))
         return Loaded(None, tuple(refused))
 
-    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | EncodedScene:
+    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | CachedScene:
         """A scene of random views of the sequence of this name.
 
         Raises:
@@ -244,9 +244,9 @@ def collate(items: Sequence[Loaded]) -> Loaded:
     )
 
 
-def _has_depths(scene: SceneBatch | EncodedScene) -> bool:
+def _has_depths(scene: SceneBatch | CachedScene) -> bool:
     return isinstance(scene, SceneBatch) and scene.reference.depths is not None
 
 
-def _with_unknown_depths(scene: SceneBatch | EncodedScene) -> SceneBatch | EncodedScene:
+def _with_unknown_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
     return with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene

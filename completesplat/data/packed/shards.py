@@ -1,4 +1,4 @@
-"""Making one shard of a prepared store, in whichever process."""
+"""Making one shard of a packed store, in whichever process."""
 
 import hashlib
 import os

@@ -45,9 +45,9 @@ def pack(raw: Path, **settings: object) -> Path:
     data = rooms(raw, **settings)
     sources = {split: data.source(split) for split in ("train", "val", "test")}
     out = raw.with_name("packed")
-    return prepare(sources, data.prepared_settings(), out, workers=1, most_bad=1.0, progress=False)
+    return prepare(sources, data.packed_settings(), out, workers=1, max_bad_fraction=1.0, progress=False)
 
 
 def rooms(root: Path, **settings: object) -> RE10KDataModule:
     """All clips but one for training, at 16 pixels; as many items as want may be replaced."""
-    return module(root, **{"val_fraction": 0.0, "most_bad": 10.0, "batch_size": 3, **settings})
+    return module(root, **{"val_fraction": 0.0, "max_bad_fraction": 10.0, "batch_size": 3, **settings})
