@@ -1,4 +1,4 @@
-"""What a data module yields: images with their cameras, for a reference view and its targets; or encoded ones."""
+"""What a data module yields: images with their cameras, for a reference view and its targets; or their latents."""
 
 from dataclasses import dataclass, replace
 
@@ -12,11 +12,15 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Views(TensorDataclass):
-    """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1)."""
+    """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1).
+
+    `depths` is the true depth along the optical axes in units of the cameras, 0 where it is unknown; None: not read.
+    """
 
     images: Float[Tensor, "*batch 3 height width"]
     cameras: Cameras
     masks: Float[Tensor, "*batch 1 height width"]
+    depths: Float[Tensor, "*batch 1 height width"] | None = None
 
 
 @dataclass(frozen=True)
@@ -51,15 +55,19 @@ class SceneBatch(TensorDataclass):
             _prepend(reference.cameras.intrinsics, targets.cameras.intrinsics, axis=-3),
             reference.cameras.image_size,
         )
+        depths = None
+        if reference.depths is not None and targets.depths is not None:
+            depths = _prepend(reference.depths, targets.depths, axis=-4)
         return Views(
             _prepend(reference.images, targets.images, axis=-4),
             cameras,
             _prepend(reference.masks, targets.masks, axis=-4),
+            depths,
         )
 
 
 @dataclass(frozen=True)
-class EncodedScene(TensorDataclass):
+class CachedScene(TensorDataclass):
     """What stage 2 needs of scenes whose reference pictures were encoded beforehand.
 
     `mean` and `log_variance` are those of the autoreconstructor's posterior, not scaled. `condition` is the reference
@@ -73,7 +81,7 @@ class EncodedScene(TensorDataclass):
     reference_frame: Int64[Tensor, "*batch"]
     names: str | tuple[str, ...]
 
-    def __getitem__(self, index: int | slice) -> "EncodedScene":
+    def __getitem__(self, index: int | slice) -> "CachedScene":
         """One scene of a batch, or some of them."""
         return replace(super().__getitem__(index), names=self.names[index])
 

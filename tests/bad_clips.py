@@ -77,7 +77,7 @@ def changed(change: Callable[[StoredClip], object]) -> list[StoredClip]:
 def read_tree(folder: Path, policy: str, **settings) -> RE10KDataModule:
     """The clips of a folder, for training and as the test split."""
     shutil.copytree(folder, folder.with_name("test"), symlinks=True)
-    return module(folder.parent, **{**SETTINGS, "on_bad": policy, "most_bad": 10.0, **settings})
+    return module(folder.parent, **{**SETTINGS, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
 
 
 def count_readings(data: RE10KDataModule) -> Counter[str]:

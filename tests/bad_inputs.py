@@ -23,7 +23,13 @@ def write_three(root: Path, frames: int) -> Path:
 
 def module(root: Path, on_bad: str, category: str = CATEGORY, **settings: Any) -> CO3DDataModule:
     """Small pictures, one scene in a batch, and no limit on what is skipped."""
-    defaults = {"image_size": 8, "batch_size": 1, "targets": 1, "references_per_sequence": ITEMS, "most_bad": 10.0}
+    defaults = {
+        "image_size": 8,
+        "batch_size": 1,
+        "targets": 1,
+        "references_per_sequence": ITEMS,
+        "max_bad_fraction": 10.0,
+    }
     return CO3DDataModule(str(root), category, **{"subset": SUBSET, "on_bad": on_bad, **defaults, **settings})
 
 

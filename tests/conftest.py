@@ -51,13 +51,24 @@ def pipeline(toy_root, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def latent_cache(pipeline, tmp_path_factory) -> Path:
+def packed_toys(pipeline, tmp_path_factory) -> Path:
+    """The pipeline's scenes, packed."""
+    store = tmp_path_factory.mktemp("packed") / "store"
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(store.parent)
+        given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
+        assert call(monkeypatch, "data", "prepare", *given, f"out={store}") == 0
+    return store
+
+
+@pytest.fixture(scope="session")
+def latent_cache(pipeline, packed_toys, tmp_path_factory) -> Path:
     """The training set, encoded by the pipeline's stage 1."""
-    cache = tmp_path_factory.mktemp("encoded") / "cache"
+    cache = tmp_path_factory.mktemp("latents") / "cache"
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.chdir(cache.parent)
-        given = f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}"
-        assert call(monkeypatch, "data", "latents", given, f"out={cache}") == 0
+        given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
+        assert call(monkeypatch, "data", "latents", *given, f"out={cache}") == 0
     return cache
 
 

@@ -175,12 +175,12 @@ def test_the_cached_experiment_is_the_papers_without_jitter_and_asks_for_its_cac
         OmegaConf.to_container(compose_config("fit", f"experiment=co3d_diffusion{name}", *needed), resolve=True)
         for name in ("", "_cached")
     )
-    data = cached["data"] | {"encoded": None, "color_jitter": pictures["data"]["color_jitter"]}
+    data = cached["data"] | {"latent_cache": None, "color_jitter": pictures["data"]["color_jitter"]}
     assert cached | {"data": data} == pictures
     assert cached["data"]["color_jitter"] is None
     with pytest.raises(InstantiationException) as caught:
         instantiate(compose_config("fit", "experiment=co3d_diffusion_cached", *needed).data, _convert_="all")
-    assert "data.encoded is needed: give data.encoded=DIR" in str(caught.value.__cause__)
+    assert "data.latent_cache is needed: give data.latent_cache=DIR" in str(caught.value.__cause__)
 
 
 @pytest.mark.parametrize("data", ["co3d", "re10k"])
@@ -235,7 +235,7 @@ NOT_IN_THE_PAPER = [
     ("data/_scenes", "color_jitter"),
     ("data/_scenes", "box_masks"),
     ("data/_scenes", "mask_threshold"),
-    ("data/_scenes", "mirroring"),
+    ("data/_scenes", "horizontal_flip"),
     ("data/co3d_category", "val_fraction"),
     ("data/co3d_category", "depth_before"),
     ("data/co3d_category", "evaluation_targets"),

@@ -17,7 +17,7 @@ def make_views(*batch: int, start: float) -> Views:
     poses[..., 0, 3] = numbers
     cameras = Cameras(poses, pinhole(60, 6).repeat(*batch, 1, 1), SIZE)
     images = numbers[..., None, None, None].expand(*batch, 3, *SIZE)
-    return Views(images, cameras, images[..., :1, :, :] / 100)
+    return Views(images, cameras, images[..., :1, :, :] / 100, depths=images[..., :1, :, :] + 1)
 
 
 def make_scene(index: int, targets: int = 3) -> SceneBatch:
@@ -32,6 +32,7 @@ def test_a_scene_without_batch_axis_puts_the_reference_first() -> None:
     assert torch.equal(views.images[:, 0, 0, 0], expected)
     assert torch.equal(views.cameras.world_to_camera[:, 0, 3], expected)
     assert torch.equal(views.masks[:, 0, 0, 0], expected / 100)
+    assert torch.equal(views.depths[:, 0, 0, 0], expected + 1)
     assert views.cameras.intrinsics.shape == (4, 3, 3)
     assert views.cameras.image_size == SIZE
 
@@ -55,6 +56,7 @@ def test_all_views_commutes_with_collation() -> None:
     assert torch.equal(one.images, other.images)
     assert torch.equal(one.cameras.world_to_camera, other.cameras.world_to_camera)
     assert torch.equal(one.masks, other.masks)
+    assert torch.equal(one.depths, other.depths)
 
 
 def test_scenes_with_different_image_sizes_do_not_collate() -> None:

@@ -187,7 +187,7 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
         By name, the module that reads the prepared form.
     """
     module = data()
-    sources, settings = {"train": module.source("train")}, module.prepared_settings()
+    sources, settings = {"train": module.source("train")}, module.packed_settings()
     return {
         f"prepared {codec}": partial(data, root=str(prepare(sources, settings, folder / codec, codec)))
         for codec in codecs
@@ -195,12 +195,12 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
 
 
 def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeData:
-    """A prepared store of so many sequences for training and validation, made of a module's few training sequences."""
+    """A packed store of so many sequences for training and validation, made of a module's few training sequences."""
     module = data()
     validation = max(1, round(VALIDATION_SHARE * sequences))
     counts = {"train": sequences - validation, "val": validation}
     sources = {split: RepeatedSource(module.source("train"), count) for split, count in counts.items()}
-    return partial(data, root=str(prepare(sources, module.prepared_settings(), folder, codec)))
+    return partial(data, root=str(prepare(sources, module.packed_settings(), folder, codec)))
 
 
 # Where image files become pixels, of a published data set and of a prepared one.
@@ -331,7 +331,7 @@ def show(results: dict[str, Any]) -> None:
     console.print(table("Training batches", [*READING, DECODING], results["rows"]))
     if "opening" in results:
         opening = results["opening"]
-        console.print(table(f"A prepared store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
+        console.print(table(f"A packed store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
     if "clips" in results:
         console.print(table("Training batches of clips", READING, results["clips"]))
         chunks = results["chunks"]

@@ -17,6 +17,7 @@ from rich.console import Console
 from torch.optim import Optimizer
 
 from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
@@ -110,14 +111,15 @@ def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule
     """Steps on batches that are loaded within the time.
 
     Args:
-        data: settings (`encoded`) -> the data module, whose scenes are there.
-        folder: where the training set is encoded.
+        data: settings (`latent_cache`, `root`) -> the data module, whose scenes are there.
+        folder: where the training set is encoded; it is packed beside it.
     """
     parts = training.module.completesplat
-    pictures = data()
+    pictures, packed = data(), folder.with_name("packed")
+    prepare({"train": pictures.source("train")}, pictures.packed_settings(), packed, workers=1, progress=False)
     store = encode_training_set(
         parts.autoreconstructor,
-        pictures,
+        data(root=str(packed)),
         folder,
         conditioning=parts.conditioning if parts.conditioning.frozen else None,
         device=training.module.device,
@@ -126,7 +128,7 @@ def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule
     parts.latent_scale.fill_(store.scale)
     parts.train()
     fill_cache(pictures)
-    cached, fly = batches(data(encoded=str(folder))), batches(pictures)
+    cached, fly = batches(data(latent_cache=str(folder))), batches(pictures)
     return Comparison(
         "cached_vs_on_the_fly",
         ("step from the latent cache", lambda: training.step(next(cached))),

@@ -60,12 +60,12 @@ def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
 
 def prepare(data: Any, splits: Sequence[str], out: Path, **settings: Any) -> None:
     """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
-    from completesplat.data.packed.manifest import is_prepared
+    from completesplat.data.packed.manifest import is_packed
     from completesplat.data.packed.writing import prepare as prepare_sources
 
-    if is_prepared(data.root):
+    if is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
-    prepare_sources(_sources(data, splits), data.prepared_settings(), out, **settings)
+    prepare_sources(_sources(data, splits), data.packed_settings(), out, **settings)
 
 
 def latents(ckpt: str | Path, overrides: Sequence[str], conditioning: Any, out: Path, **settings: Any) -> None:

@@ -19,7 +19,7 @@ def scored_data(run_config: Any, evaluation: Any) -> Any:
     """
     from hydra.utils import instantiate
 
-    from completesplat.data.packed.manifest import is_prepared
+    from completesplat.data.packed.manifest import is_packed
 
     if "scoring" not in evaluation:
         raise CompleteSplatError(f"evaluation={evaluation.name}: fit scores pictures only; set test=false")
@@ -39,7 +39,7 @@ def scored_data(run_config: Any, evaluation: Any) -> Any:
         return data
     if resolution < size:
         raise CompleteSplatError(f"evaluation.resolution={resolution}: below the model's {size}")
-    if is_prepared(data.root):
+    if is_packed(data.root):
         said = f"evaluation.resolution={resolution}: prepared pictures have one size"
         raise CompleteSplatError(f"{said}; give the data as they were published (data.root)")
     larger = instantiate(run_config.data, image_size=resolution, _convert_="all")

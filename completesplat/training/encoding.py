@@ -2,36 +2,45 @@
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float, Shaped, UInt8
+from rich.progress import track
 from torch import Tensor, nn
 
 from completesplat import __version__
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache.manifest import Array, Manifest, Origin, is_encoded, write_manifest
-from completesplat.data.latent_cache.pictures import Picture, Reading, check_space
-from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore
+from completesplat.data.latent_cache.manifest import (
+    Array,
+    Manifest,
+    Origin,
+    Sequence,
+    is_latent_cache,
+    write_manifest,
+)
+from completesplat.data.latent_cache.store import ArrayWriter, LatentCache
 from completesplat.data.loading.module import SceneDataModule
-from completesplat.data.packed.manifest import Refusal
+from completesplat.data.packed.source import PackedSource
+from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.scene import EncodedScene
+from completesplat.scene import CachedScene
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 
 logger = logging.getLogger(__name__)
 
 
-def latent_draw(batch: EncodedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
+def latent_draw(batch: CachedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
     """One draw of each scaled latent: the same noise as `CompleteSplat.encode` draws."""
     return Posterior(batch.mean, batch.log_variance).sample() * scale
 
@@ -46,7 +55,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def check_cache(
-    store: EncodedStore,
+    store: LatentCache,
     autoreconstructor: VariationalAutoReconstructor,
     source: SequenceSource,
     conditioning: nn.Module | None = None,
@@ -133,14 +142,12 @@ def encode_training_set(
     precision: str = "float32",
     conditioning: nn.Module | None = None,
     batch_size: int = 64,
-    workers: int = 0,
     device: torch.device | str = "cpu",
     progress: bool = True,
-) -> EncodedStore:
-    """Encode every frame of every training sequence, as it is without augmentation.
+) -> LatentCache:
+    """Encode every frame of every sequence of a packed training set, as it is without augmentation.
 
-    A finished store of the same is left as it is. What cannot be read is skipped as `data.on_bad` and `data.most_bad`
-    say. Nothing that opens is left behind by a run that was interrupted.
+    A finished store of the same is left as it is. Nothing that opens is left behind by a run that was interrupted.
 
     Args:
         out: folder of the store.
@@ -149,31 +156,84 @@ def encode_training_set(
             first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
         conditioning: frozen, images -> features, which are stored; None: the pictures are.
         batch_size: pictures that are encoded together.
-        workers: processes that read pictures; 0: none.
 
     Raises:
-        DataError: no space, unreadable data, another store in the folder, or encodings that are not finite.
+        DataError: data that are not packed or are damaged, no space, another store in the folder, or encodings that
+            are not finite.
     """
     if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
         raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
+    source = data.source("train")
+    if not isinstance(source, PackedSource):
+        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
+        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
     origin = _origin(autoreconstructor, data, conditioning, frames, precision)
-    if is_encoded(out):
+    if is_latent_cache(out):
         return _kept(out, origin)
     out.mkdir(parents=True, exist_ok=True)
     features = None if conditioning is None else conditioning.to(device).eval()
     encoder = autoreconstructor.to(device).eval().encoder
     encode = PictureEncoder(encoder, features, PRECISIONS[precision], torch.device(device))
     blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
-    check_space(data.source("train"), frames, sum(array.nbytes for array in blank.values()), out)
-    reading = Reading(data.source("train"), frames, workers, *data.policy, progress)
-    arrays, scale = _write_arrays(out, encode, blank, reading, batch_size)
-    refused = tuple(Refusal.of(error) for error in reading.refused)
-    write_manifest(out, Manifest(__version__, origin, scale, arrays, reading.stored(), refused))
-    return EncodedStore(out)
+    _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
+    sequences: list[Sequence] = []
+    pictures = _pictures(source, frames, sequences, progress)
+    arrays, scale = _write_arrays(out, encode, blank, pictures, batch_size)
+    write_manifest(out, Manifest(__version__, origin, scale, arrays, tuple(sequences)))
+    return LatentCache(out)
+
+
+class FrameToEncode(NamedTuple):
+    """A picture that is to be encoded, and the frame that it is of."""
+
+    image: UInt8[Tensor, "3 size size"]
+    sequence: str
+    number: int
+
+
+def evenly_spaced(count: int, most: int | None) -> list[int]:
+    """At most `most` of `count` places: the middles of equal parts; None: all."""
+    if most is None or most >= count:
+        return list(range(count))
+    return [(2 * part + 1) * count // (2 * most) for part in range(most)]
+
+
+def _pictures(
+    source: PackedSource, frames: int | None, sequences: list[Sequence], progress: bool
+) -> Iterator[FrameToEncode]:
+    """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of.
+
+    Raises:
+        DataError: the store is damaged.
+    """
+    rows = 0
+    for name in track(source.names, "encoding sequences", disable=not progress):
+        sequence = source.read(name)
+        places = evenly_spaced(len(sequence.frames), frames)
+        sequences.append(Sequence(name, len(sequence.frames), rows, tuple(places)))
+        rows += len(places)
+        for place in places:
+            yield FrameToEncode(sequence.read(place).image, name, sequence.frames[place])
+
+
+def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
+    """Say how large the store is going to be.
+
+    Raises:
+        DataError: the disk has less space than that.
+    """
+    most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
+    total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
+    contents = f"{total:,} frames of {len(source.names):,} sequences"
+    require_space(total * bytes_per_frame, contents, out, "; frames=N takes fewer frames of a sequence")
 
 
 def _write_arrays(
-    out: Path, encode: PictureEncoder, blank: Mapping[str, np.ndarray], reading: Reading, batch_size: int
+    out: Path,
+    encode: PictureEncoder,
+    blank: Mapping[str, np.ndarray],
+    pictures: Iterator[FrameToEncode],
+    batch_size: int,
 ) -> tuple[dict[str, Array], float]:
     """Rows like those of `blank` for all pictures; what was written, and the scale."""
     moments = Moments()
@@ -182,7 +242,6 @@ def _write_arrays(
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in blank.items()
         }
-        pictures = iter(reading)
         while batch := list(islice(pictures, batch_size)):
             rows = encode(torch.stack([picture.image for picture in batch]))
             _refuse_not_finite(rows, batch)
@@ -205,27 +264,27 @@ def _origin(
         fingerprint(autoreconstructor.encoder),
         features_fingerprint(conditioning),
         data.source("train").fingerprint(),
-        data.prepared_settings(),
+        data.packed_settings(),
         data.image_size,
         frames,
         precision,
     )
 
 
-def _kept(out: Path, origin: Origin) -> EncodedStore:
+def _kept(out: Path, origin: Origin) -> LatentCache:
     """The finished store that is there already.
 
     Raises:
         DataError: it is damaged, or another one than is to be made.
     """
-    store = EncodedStore(out)
+    store = LatentCache(out)
     if store.origin != origin:
         raise DataError("already holds another store: choose another folder, or remove this one", str(out))
     logger.info("%s already holds these encodings", out)
     return store
 
 
-def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: Sequence[Picture]) -> None:
+def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: list[FrameToEncode]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():

@@ -13,7 +13,7 @@ from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
-from completesplat.scene import EncodedScene, SceneBatch
+from completesplat.scene import CachedScene, SceneBatch
 from completesplat.training.checkpoints import load_part
 from completesplat.training.encoding import check_cache, latent_draw
 from completesplat.training.scene_module import SceneModule, prepare_network
@@ -86,11 +86,13 @@ class LatentDiffusion(SceneModule):
             self._refuse_random_parts()
         parts = self.completesplat
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
-        if data.encoded is not None:
-            check_cache(data.encoded_store, parts.autoreconstructor, data.source("train"), parts.conditioning)
+        if data.latent_cache is not None:
+            check_cache(data.cached_latents, parts.autoreconstructor, data.source("train"), parts.conditioning)
         if parts.latent_scale != 1:  # a continued run keeps what it measured
             return
-        self._measure_latents(data.train_dataloader(), data.encoded_store.scale if data.encoded is not None else None)
+        self._measure_latents(
+            data.train_dataloader(), data.cached_latents.scale if data.latent_cache is not None else None
+        )
         camera = data.typical_camera()
         parts.fov_degrees.fill_(camera.fov_degrees)
         parts.depth_range.copy_(torch.tensor(camera.depth_range))
@@ -135,7 +137,7 @@ class LatentDiffusion(SceneModule):
             logger.log_metrics(values, step=self.trainer.global_step)
 
     def inputs(
-        self, batch: SceneBatch | EncodedScene
+        self, batch: SceneBatch | CachedScene
     ) -> tuple[Float[Tensor, "batch channel height width"], Float[Tensor, "batch features _ _"]]:
         """A draw of the scaled latents, and phi_ref.
 
@@ -148,7 +150,7 @@ class LatentDiffusion(SceneModule):
         latent = latent_draw(batch, parts.latent_scale)
         return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
 
-    def training_step(self, batch: SceneBatch | EncodedScene, index: int) -> Float[Tensor, ""]:
+    def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = self.inputs(batch)
         kept = torch.rand(len(latent), device=self.device) >= self.unconditional_probability

@@ -67,8 +67,8 @@ class PreoptimizedVAE(Preoptimized):
         """
         trainer: Any = self.trainer
         data = trainer.datamodule
-        if data.encoded is not None:
-            raise CompleteSplatError("data.encoded is for latent diffusion (model=latent_diffusion): set it to null")
+        if data.latent_cache is not None:
+            raise CompleteSplatError("data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null")
         terms = {name: term.weight for name, term in self.loss.terms.items()}
         settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
         stores = [data.store("val"), data.store("train")]

@@ -48,9 +48,11 @@ class ReconstructionModule(SceneModule):
         prepare_network(model, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Refuse encoded pictures: this stage trains what would encode them."""
-        if getattr(self.trainer.datamodule, "encoded", None) is not None:  # type: ignore[attr-defined]
-            raise CompleteSplatError("data.encoded is for latent diffusion (model=latent_diffusion): set it to null")
+        """Refuse a latent cache: this stage trains what would encode it."""
+        if getattr(self.trainer.datamodule, "latent_cache", None) is not None:  # type: ignore[attr-defined]
+            raise CompleteSplatError(
+                "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
+            )
 
     @property
     def method(self) -> str:

@@ -17,9 +17,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.baselines.naive import copy_reference, repeat_image
-from completesplat.data.depths import evaluation_depths
 from completesplat.data.loading.distributed import gathered
-from completesplat.errors import DataError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.evaluation import DepthViews, Evaluation
@@ -182,17 +180,14 @@ class SceneModule(LightningModule):
 
     def _score_depth(self, name: str, predicted: Float[Tensor, "view 1 _ _"], truth: Views) -> None:
         """Where the truth is known, at the size of the renders."""
-        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
-        try:
-            true = evaluation_depths(data, "test", name)
-        except DataError as error:
-            self.evaluation.missing["depth"] = f"missing: {error}"
-            return
-        if true is not None and true.shape == predicted.shape:
-            self.evaluation.update_depth(name, predicted, DepthViews(true.to(predicted), truth.masks))
+        if truth.depths is not None and truth.depths.shape == predicted.shape:
+            self.evaluation.update_depth(name, predicted, DepthViews(truth.depths.to(predicted), truth.masks))
 
     def on_test_end(self) -> None:
-        self.evaluation.skipped = len(self.trainer.test_dataloaders.refused)  # type: ignore[union-attr]
+        loader: Any = self.trainer.test_dataloaders
+        self.evaluation.skipped = len(loader.refused)
+        if loader.refused_depths:
+            self.evaluation.missing["depth"] = f"missing: {loader.refused_depths[-1]}"
 
     def test_results(self) -> dict[str, Any]:
         """`Evaluation.results` of all processes, each of which must call it, with the model's seconds for a scene."""

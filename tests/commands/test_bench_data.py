@@ -71,7 +71,7 @@ def test_everything_is_measured_written_and_shown(quick):
     assert [step["after"] for step in opening["steps"]] == ["imports", "opening", "epoch 1", "epoch 2"]
     chunks = results["chunks"]
     assert (chunks["files"], chunks["read_in_an_epoch"], chunks["most_in_memory"]) == (3, 3, 2)
-    for title in ("Training batches", "A prepared store of 7 sequences", "Training batches of clips", "3 chunks"):
+    for title in ("Training batches", "A packed store of 7 sequences", "Training batches of clips", "3 chunks"):
         assert title in benchmark.printed
     assert results["machine"]["processor"] in benchmark.printed
     assert not list(benchmark.out.glob("bench_data_*"))

@@ -4,17 +4,18 @@ import pytest
 import torch
 from support import SMALL, strict_json
 
-from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.latent_cache.store import LatentCache
 from completesplat.generation import CompleteSplat
 
 
-def test_a_run_is_encoded_once_and_trained_from(command, pipeline, tmp_path):
+def test_a_run_is_encoded_once_and_trained_from(command, pipeline, packed_toys, tmp_path):
     cache, checkpoint = tmp_path / "cache", pipeline.var / "checkpoints/last.ckpt"
-    made = command("data", "latents", f"ckpt={checkpoint}", f"out={cache}")
+    given = [f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", f"out={cache}"]
+    made = command("data", "latents", *given)
     assert made.status == 0
     assert made.out.splitlines()[-1] == str(cache)
     assert "for 8 frames of 2 sequences" in made.out + made.err
-    store = EncodedStore(cache)
+    store = LatentCache(cache)
     encoder = CompleteSplat.from_pretrained(pipeline.weights).autoreconstructor.encoder
     for name, sequence in store.sequences.items():
         assert sequence.stored == tuple(range(4))
@@ -24,11 +25,11 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, tmp_path):
         torch.testing.assert_close(scene.mean, posterior.mean[0], rtol=1e-4, atol=1e-5)
 
     before = (cache / "mean.npy").stat().st_mtime_ns
-    assert command("data", "latents", f"ckpt={checkpoint}", f"out={cache}").status == 0
+    assert command("data", "latents", *given).status == 0
     assert (cache / "mean.npy").stat().st_mtime_ns == before
 
     stage2 = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_diffusion", "sampler.steps=2", "test=false"]
-    stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.encoded={cache}"]
+    stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.latent_cache={cache}"]
     assert command("fit", *stage2, f"out={tmp_path / 'run'}").status == 0
     assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
 
@@ -40,30 +41,34 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, tmp_path):
         ("var", "conditioning=learned", "needs pictures"),
         ("var", "precision=float8", "needs precision"),
         ("var", "ckpt=gone.ckpt", "no such checkpoint"),
+        ("var", "overrides=[]", "run `completesplat data prepare` first"),
     ],
 )
-def test_what_cannot_be_encoded_is_refused_in_one_line(command, pipeline, tmp_path, stage, setting, message):
+def test_what_cannot_be_encoded_is_refused_in_one_line(
+    command, pipeline, packed_toys, tmp_path, stage, setting, message
+):
     checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-    refused = command("data", "latents", f"ckpt={checkpoint}", setting, f"out={tmp_path / 'cache'}")
+    given = [f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", f"out={tmp_path / 'cache'}"]
+    refused = command("data", "latents", *given, setting)
     assert refused.status == 2
     assert len(refused.err.splitlines()) == 1
     assert message in refused.err
     assert not list((tmp_path / "cache").glob("*.npy"))
 
 
-def test_few_frames_and_other_settings_of_the_run_can_be_asked_for(command, pipeline, tmp_path):
+def test_few_frames_and_half_precision_can_be_asked_for(command, pipeline, packed_toys, tmp_path):
     checkpoint, cache = pipeline.var / "checkpoints/last.ckpt", tmp_path / "cache"
-    change = "overrides=['data.most_training_sequences=1']"
+    change = f"overrides=['data.root={packed_toys}']"
     settings = [f"ckpt={checkpoint}", change, "frames=2", "precision=float16", "batch_size=1", f"out={cache}"]
     assert command("data", "latents", *settings).status == 0
-    store = EncodedStore(cache)
-    assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)]
+    store = LatentCache(cache)
+    assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)] * 2
     assert store.arrays["mean"].dtype == "float16"
     assert store.arrays["condition"].dtype == "uint8"
 
 
 def test_stage_one_does_not_train_from_what_it_would_encode(command, pipeline, latent_cache, tmp_path):
     settings = [f"data.root={pipeline.toy}", *SMALL, "experiment=toy_var", "data.color_jitter=null", "test=false"]
-    refused = command("fit", *settings, f"data.encoded={latent_cache}", f"out={tmp_path / 'run'}")
+    refused = command("fit", *settings, f"data.latent_cache={latent_cache}", f"out={tmp_path / 'run'}")
     assert refused.status == 2
-    assert "data.encoded is for latent diffusion" in refused.err.splitlines()[-1]
+    assert "data.latent_cache is for latent diffusion" in refused.err.splitlines()[-1]

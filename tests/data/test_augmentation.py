@@ -71,13 +71,13 @@ def assert_same_scene(one: SceneBatch, other: SceneBatch) -> None:
 
 
 def test_without_any_part_a_scene_stays_as_it_is() -> None:
-    assert_same_scene(augment(scene(), rng(), None, None, mirroring=False), scene())
+    assert_same_scene(augment(scene(), rng(), None, None, horizontal_flip=False), scene())
 
 
 def test_a_scene_depends_on_the_generator_only() -> None:
-    first, again = (augment(scene(), rng(5), STRONG, BoxMasks(1.0), mirroring=True) for _ in range(2))
+    first, again = (augment(scene(), rng(5), STRONG, BoxMasks(1.0), horizontal_flip=True) for _ in range(2))
     assert_same_scene(first, again)
-    other = augment(scene(), rng(6), STRONG, BoxMasks(1.0), mirroring=True)
+    other = augment(scene(), rng(6), STRONG, BoxMasks(1.0), horizontal_flip=True)
     assert not torch.equal(first.reference.images, other.reference.images)
     assert not torch.equal(first.visible, other.visible)
 
@@ -88,13 +88,13 @@ def was_mirrored(changed: SceneBatch) -> bool:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> None:
-    everything = augment(scene(), rng(seed), STRONG, BoxMasks(), mirroring=True)
-    jitter = augment(scene(), rng(seed), STRONG, None, mirroring=False)
-    boxes = augment(scene(), rng(seed), None, BoxMasks(), mirroring=False)
-    mirroring = augment(scene(), rng(seed), None, None, mirroring=True)
+    everything = augment(scene(), rng(seed), STRONG, BoxMasks(), horizontal_flip=True)
+    jitter = augment(scene(), rng(seed), STRONG, None, horizontal_flip=False)
+    boxes = augment(scene(), rng(seed), None, BoxMasks(), horizontal_flip=False)
+    flipped = augment(scene(), rng(seed), None, None, horizontal_flip=True)
     assert torch.equal(everything.visible, boxes.visible)
-    assert was_mirrored(everything) == was_mirrored(mirroring)
-    expected = mirrored(jitter) if was_mirrored(mirroring) else jitter
+    assert was_mirrored(everything) == was_mirrored(flipped)
+    expected = mirrored(jitter) if was_mirrored(flipped) else jitter
     assert torch.equal(everything.all_views().images, expected.all_views().images)
 
 
@@ -102,21 +102,21 @@ def test_earlier_draws_from_the_generator_do_not_matter() -> None:
     used = rng(3)
     used.random(100)
     assert_same_scene(
-        augment(scene(), used, STRONG, BoxMasks(1.0), mirroring=True),
-        augment(scene(), rng(3), STRONG, BoxMasks(1.0), mirroring=True),
+        augment(scene(), used, STRONG, BoxMasks(1.0), horizontal_flip=True),
+        augment(scene(), rng(3), STRONG, BoxMasks(1.0), horizontal_flip=True),
     )
 
 
 def test_every_other_scene_is_mirrored() -> None:
     """Of 400 draws, 4 standard deviations to either side."""
-    count = sum(was_mirrored(augment(scene(), rng(seed), None, None, mirroring=True)) for seed in range(400))
+    count = sum(was_mirrored(augment(scene(), rng(seed), None, None, horizontal_flip=True)) for seed in range(400))
     assert abs(count - 200) < 4 * (400 * 0.25) ** 0.5
 
 
 def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
     before = scene()
     same = replace(before, targets=replace(before.targets, images=before.reference.images.repeat(3, 1, 1, 1)))
-    after = augment(same, rng(4), STRONG, None, mirroring=False)
+    after = augment(same, rng(4), STRONG, None, horizontal_flip=False)
     assert not torch.allclose(after.reference.images, before.reference.images, atol=1e-2)
     assert torch.equal(after.targets.images, after.reference.images.expand(3, -1, -1, -1))
     assert_same_scene(replace(after, reference=before.reference, targets=before.targets), before)
@@ -124,6 +124,6 @@ def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
 
 
 def test_boxes_leave_the_pictures_alone() -> None:
-    after = augment(scene(), rng(), None, BoxMasks(1.0), mirroring=False)
+    after = augment(scene(), rng(), None, BoxMasks(1.0), horizontal_flip=False)
     assert (after.visible == 0).any()
     assert torch.equal(after.reference.images, scene().reference.images)

@@ -144,7 +144,7 @@ def test_a_folder_without_any_use_is_raised_under_either_policy(name, policy, tm
     write_text_form(tmp_path / "train", CLIPS)
     damage(tmp_path / "train")
     with pytest.raises(DataError) as caught:
-        module(tmp_path, on_bad=policy, most_bad=10.0).setup("fit")
+        module(tmp_path, on_bad=policy, max_bad_fraction=10.0).setup("fit")
     assert type(caught.value) is kind
     assert str(tmp_path) in str(caught.value)
 

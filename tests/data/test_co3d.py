@@ -243,7 +243,7 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
 def test_without_targets_one_picture_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
     read, picture = [], SceneStore._picture
     monkeypatch.setattr(SceneStore, "_picture", lambda *given: read.append(given) or picture(*given))
-    settings = {"references_per_sequence": 4, "mirroring": True, "box_masks": {"probability": 0.5}}
+    settings = {"references_per_sequence": 4, "horizontal_flip": True, "box_masks": {"probability": 0.5}}
     without = epoch(module(toy_root, targets=0, **settings).train_dataloader(), 0)
     assert len(read) == sum(len(batch.names) for batch in without) == 8
     for batch, other in zip(without, epoch(module(toy_root, targets=1, **settings).train_dataloader(), 0), strict=True):

@@ -95,7 +95,7 @@ def mirrored(batch: SceneBatch) -> bool:
 def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_point):
     write(tmp_path, SIZES[size], layout, PRINCIPAL_POINTS[principal_point])
     data = CO3DDataModule(
-        str(tmp_path), CATEGORY, image_size=48, batch_size=1, targets=3, on_bad="raise", mirroring=True,
+        str(tmp_path), CATEGORY, image_size=48, batch_size=1, targets=3, on_bad="raise", horizontal_flip=True,
         references_per_sequence=5,
     )  # fmt: skip
     training = list(data.train_dataloader())

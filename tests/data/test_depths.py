@@ -7,15 +7,17 @@ import pytest
 import torch
 from plyfile import PlyData
 
+from completesplat.data.co3d import source
 from completesplat.data.co3d.annotations import CO3DFrame, DepthMap
-from completesplat.data.co3d.module import source
 from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
 from completesplat.data.co3d.source import OBJECT_HALF_SIZE, object_placement
-from completesplat.data.depths import evaluation_depths
+from completesplat.data.loading.scenes import Loaded, collate
 from completesplat.data.pictures.crop import Square
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.objects import SUBSET
+from completesplat.data.validation import BadPicture
 from completesplat.geometry.cameras import Cameras, pinhole, project
+from completesplat.scene import SceneBatch
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +27,15 @@ def data(toy_root) -> ToyObjectsDataModule:
     return module
 
 
+def scene_of(data: ToyObjectsDataModule) -> SceneBatch:
+    """The only test scene."""
+    (batch,) = data.test_dataloader()
+    return batch[0]
+
+
 def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
     (name,) = data.store("test").names
-    sequence, depths = data.source("test").read(name), evaluation_depths(data, "test", name)
+    sequence, depths = data.source("test").read(name), scene_of(data).all_views().depths
     assert depths.shape == (4, 1, 32, 32)
     file = toy_root / "toy_objects" / name / "pointcloud.ply"
     vertices = PlyData.read(str(file))["vertex"]
@@ -45,11 +53,42 @@ def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
         assert ((z - seen).abs() < 0.03 * seen).double().mean() > 0.2
 
 
-def test_data_without_depth_have_none(data, monkeypatch):
+def read_depth_with(data: ToyObjectsDataModule, monkeypatch: pytest.MonkeyPatch, reader: object) -> None:
     (name,) = data.store("test").names
-    sequence = replace(data.source("test").read(name), read_depth=None)
+    sequence = replace(data.source("test").read(name), read_depth=reader)
     monkeypatch.setattr(type(data.source("test")), "read", lambda *_: sequence)
-    assert evaluation_depths(data, "test", name) is None
+
+
+def test_data_without_depth_have_none(data, monkeypatch):
+    read_depth_with(data, monkeypatch, None)
+    assert scene_of(data).all_views().depths is None
+
+
+def test_a_depth_map_that_cannot_be_read_costs_the_depths_of_its_scene_not_the_scene(data, monkeypatch):
+    def damaged(_: int) -> torch.Tensor:
+        raise BadPicture("no finite depth in it", "depth.png")
+
+    read_depth_with(data, monkeypatch, damaged)
+    loader = data.test_dataloader()
+    (batch,) = loader
+    assert batch.all_views().depths is None
+    assert (loader.refused, [error.file for error in loader.refused_depths]) == ([], ["depth.png"])
+
+
+def test_only_the_test_reads_depths(data):
+    for loader in (data.train_dataloader(), data.val_dataloader()):
+        assert next(iter(loader)).all_views().depths is None
+
+
+def test_depths_are_unknown_where_only_other_scenes_of_a_batch_have_them(data):
+    known = scene_of(data)
+    unknown = replace(
+        known, reference=replace(known.reference, depths=None), targets=replace(known.targets, depths=None)
+    )
+    depths = collate([Loaded(unknown, ()), Loaded(known, ())]).scenes.all_views().depths
+    assert torch.equal(depths[1], known.all_views().depths)
+    assert depths[1].any()
+    assert not depths[0].any()
 
 
 @pytest.mark.parametrize("shape", [(8, 12), (4, 6), (16, 24)])

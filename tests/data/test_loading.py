@@ -13,7 +13,7 @@ from completesplat.scene import SceneBatch
 AUGMENTED = {
     "color_jitter": {"brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.1},
     "box_masks": {"probability": 0.7},
-    "mirroring": True,
+    "horizontal_flip": True,
 }
 
 
@@ -27,7 +27,7 @@ def root(request, tmp_path_factory) -> Path:
 
 def loader(root: Path, workers: int = 0, **settings) -> SceneLoader:
     """Eight items an epoch in batches of three."""
-    settings = {"batch_size": 3, "val_fraction": 0.0, "most_bad": 10.0, **AUGMENTED, **settings}
+    settings = {"batch_size": 3, "val_fraction": 0.0, "max_bad_fraction": 10.0, **AUGMENTED, **settings}
     return module(root, workers=workers, **settings).train_dataloader()
 
 

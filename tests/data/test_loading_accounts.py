@@ -38,7 +38,7 @@ def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
 
 @pytest.mark.slow
 def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog):
-    data = module(make_tree(tmp_path, ["c5"], ["c2"]), val_fraction=0.0, most_bad=1.0)
+    data = module(make_tree(tmp_path, ["c5"], ["c2"]), val_fraction=0.0, max_bad_fraction=1.0)
     loader = data.train_dataloader()
     for number in (0, 1):
         caplog.clear()
@@ -53,7 +53,9 @@ def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog
 
 
 def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
-    loader = module(make_tree(tmp_path, ["c5"], ["c2"]), most_bad=0.5, evaluation_batch_size=2).test_dataloader()
+    loader = module(
+        make_tree(tmp_path, ["c5"], ["c2"]), max_bad_fraction=0.5, evaluation_batch_size=2
+    ).test_dataloader()
     assert [name for batch in loader for name in batch.names] == [key for key in KEYS if key not in ("c2", "c5")]
     assert [error.sequence for error in loader.refused] == ["c2", "c5"]
     assert [r.getMessage()[:20] for r in caplog.records if r.levelno >= logging.WARNING] == ["skipped 2 of 9 items"]
@@ -61,21 +63,26 @@ def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
 
 def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     root = make_tree(tmp_path, ["c5"], ["c2", "c6"])
-    loader = module(root, most_bad=0.25).test_dataloader()
-    with pytest.raises(DataError, match=r"3 of 9 items .* data\.most_bad=0\.25 .*last one: .*c6, frame 1") as caught:
+    loader = module(root, max_bad_fraction=0.25).test_dataloader()
+    with pytest.raises(
+        DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"
+    ) as caught:
         list(loader)
     assert "\n" not in str(caught.value)
-    assert len(list(module(root, most_bad=0.34, evaluation_batch_size=1).test_dataloader())) == 6
+    assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
 
 
 def test_one_bad_item_is_no_share(tmp_path):
-    assert len(list(module(make_tree(tmp_path, ["c5"]), most_bad=0.0, evaluation_batch_size=1).test_dataloader())) == 8
+    assert (
+        len(list(module(make_tree(tmp_path, ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1).test_dataloader()))
+        == 8
+    )
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("most_bad", [0.1, 100.0])
-def test_nothing_that_can_be_read_is_an_error(tmp_path, workers, most_bad):
-    data = module(make_tree(tmp_path, KEYS), most_bad=most_bad, workers=workers)
+@pytest.mark.parametrize("max_bad_fraction", [0.1, 100.0])
+def test_nothing_that_can_be_read_is_an_error(tmp_path, workers, max_bad_fraction):
+    data = module(make_tree(tmp_path, KEYS), max_bad_fraction=max_bad_fraction, workers=workers)
     for loader in (data.train_dataloader(), data.test_dataloader()):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
@@ -99,7 +106,7 @@ class Listener(LightningModule):
 @pytest.mark.parametrize("limit", [1.0, 3])
 def test_lightning_hears_it_at_the_end_of_each_epoch(tmp_path, caplog, limit):
     """Lightning stops after the number of batches it knows of, and never looks whether there is another."""
-    data = module(make_tree(tmp_path, [], ["c1", "c2", "c5"]), val_fraction=0.0, most_bad=10.0, batch_size=2)
+    data = module(make_tree(tmp_path, [], ["c1", "c2", "c5"]), val_fraction=0.0, max_bad_fraction=10.0, batch_size=2)
     trainer = Trainer(
         max_epochs=2, limit_train_batches=limit, accelerator="cpu", logger=False, enable_checkpointing=False,
         enable_progress_bar=False, enable_model_summary=False,

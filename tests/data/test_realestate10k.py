@@ -260,7 +260,7 @@ def test_a_model_trains_on_it(root, tmp_path):
 
 def test_a_scene_can_be_its_reference_alone(tmp_path):
     clips = [make_clip(f"c{i}") for i in range(2)]
-    data = module(write_tree(tmp_path, "text", clips, clips[:1]), targets=0, mirroring=True, val_fraction=0.0)
+    data = module(write_tree(tmp_path, "text", clips, clips[:1]), targets=0, horizontal_flip=True, val_fraction=0.0)
     (batch,) = epoch(data.train_dataloader(), 0)
     assert batch.targets.images.shape == (len(batch.names), 0, 3, 16, 16)
     assert torch.equal(batch.all_views().images, batch.reference.images[:, None])

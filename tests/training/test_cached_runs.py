@@ -7,7 +7,7 @@ import pytest
 import torch
 from support import SMALL, call
 
-from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.latent_cache.store import LatentCache
 
 STEPS = 3
 QUICK = [
@@ -61,7 +61,7 @@ def logged(run: Path, pattern: str) -> pandas.DataFrame:
 )
 def test_losses_are_those_of_training_from_pictures(fit, latent_cache, tmp_path, settings):
     pictures = logged(fit(tmp_path / "pictures", "stage 2", *settings), "^train/loss")
-    cached = logged(fit(tmp_path / "cached", "stage 2", *settings, f"data.encoded={latent_cache}"), "^train/loss")
+    cached = logged(fit(tmp_path / "cached", "stage 2", *settings, f"data.latent_cache={latent_cache}"), "^train/loss")
     assert list(pictures.index) == list(range(STEPS))
     assert (pictures["train/loss"] > 0).all()
     assert pictures["train/loss"].nunique() == STEPS
@@ -69,9 +69,11 @@ def test_losses_are_those_of_training_from_pictures(fit, latent_cache, tmp_path,
 
 
 def test_the_scale_is_the_caches_and_near_the_one_that_is_measured(fit, pipeline, latent_cache, tmp_path):
-    (exact,) = logged(fit(tmp_path / "run", "stage 1", f"data.encoded={latent_cache}"), "^latent_scale")["latent_scale"]
+    (exact,) = logged(fit(tmp_path / "run", "stage 1", f"data.latent_cache={latent_cache}"), "^latent_scale")[
+        "latent_scale"
+    ]
     (measured,) = logged(pipeline.diffusion, "^latent_scale")["latent_scale"]
-    assert exact == pytest.approx(EncodedStore(latent_cache).scale)
+    assert exact == pytest.approx(LatentCache(latent_cache).scale)
     assert exact == pytest.approx(measured, rel=0.1)
 
 
@@ -81,7 +83,13 @@ def test_the_cache_of_another_autoreconstructor_is_refused_in_one_line(command, 
     checkpoint["state_dict"][name].view(-1)[0] += 1
     torch.save(checkpoint, tmp_path / "other.ckpt")
     start = f"model.autoreconstructor_checkpoint={tmp_path / 'other.ckpt'}"
-    given = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, f"data.encoded={latent_cache}", start]
+    given = [
+        "experiment=toy_diffusion",
+        f"data.root={pipeline.toy}",
+        *QUICK,
+        f"data.latent_cache={latent_cache}",
+        start,
+    ]
     finished = command("fit", *given, f"out={tmp_path / 'run'}")
     assert finished.status == 2
     (line,) = [line for line in finished.err.splitlines() if line.startswith("error: ")]

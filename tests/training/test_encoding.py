@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from encoded_stores import FRAMES, broken_rooms, rooms, small_autoreconstructor, sound_rooms
+from latent_caches import FRAMES, rooms, small_autoreconstructor, sound_rooms
 from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache import pictures
-from completesplat.data.latent_cache.store import EncodedStore
+from completesplat.data.latent_cache.store import LatentCache
+from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.scene import EncodedScene
+from completesplat.scene import CachedScene
 from completesplat.tensors import stack
 from completesplat.training.encoding import Moments, check_cache, encode_training_set, fingerprint, latent_draw
 
@@ -27,13 +27,13 @@ def root(tmp_path_factory) -> Path:
     return sound_rooms(tmp_path_factory.mktemp("root"))
 
 
-def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> EncodedStore:
+def encode(root: Path, out: Path, model: nn.Module | None = None, **options) -> LatentCache:
     settings = {"progress": False, **options}
     return encode_training_set(model or small_autoreconstructor(), rooms(root), out, **settings)
 
 
 @pytest.fixture(scope="module")
-def cache(root, tmp_path_factory) -> EncodedStore:
+def cache(root, tmp_path_factory) -> LatentCache:
     return encode(root, tmp_path_factory.mktemp("cache"))
 
 
@@ -63,9 +63,9 @@ def changed_where(model: nn.Module, picture: torch.Tensor, value: float) -> nn.M
     return model
 
 
-@pytest.mark.parametrize(("batch_size", "workers"), [(1, 0), (7, 0), (64, 2)])
-def test_every_frame_has_the_encoders_posterior(root, tmp_path, batch_size, workers):
-    store = encode(root, tmp_path / "cache", batch_size=batch_size, workers=workers)
+@pytest.mark.parametrize("batch_size", [1, 7, 64])
+def test_every_frame_has_the_encoders_posterior(root, tmp_path, batch_size):
+    store = encode(root, tmp_path / "cache", batch_size=batch_size)
     encoder, source = small_autoreconstructor().encoder, rooms(root).source("train")
     assert list(store.sequences) == source.names
     for name in source.names:
@@ -114,9 +114,9 @@ def test_the_scale_is_that_of_draws_within_their_error(cache):
 def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
     model = tiny_generator()
     model.latent_scale.fill_(0.7)
-    data = rooms(sound_rooms(tmp_path / "root"), image_size=32)
+    data = rooms(sound_rooms(tmp_path / "root", image_size=32), image_size=32)
     store = encode_training_set(model.autoreconstructor, data, tmp_path / "cache", progress=False)
-    batch: EncodedScene = stack([store.scene(name, 2) for name in store.sequences])
+    batch: CachedScene = stack([store.scene(name, 2) for name in store.sequences])
     torch.manual_seed(5)
     on_the_fly = model.encode(batch.condition).latent
     torch.manual_seed(5)
@@ -148,8 +148,8 @@ def test_what_a_killed_run_leaves_does_not_open_and_is_written_over(root, cache,
     encode(root, tmp_path / "cache", model, batch_size=4)
     assert len(calls) > 3
     assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy"}
-    with pytest.raises(DataError, match="no finished store"):
-        EncodedStore(left)
+    with pytest.raises(DataError, match="no finished latent cache"):
+        LatentCache(left)
     again = encode(root, left)
     assert again.manifest == cache.manifest
     assert all(np.array_equal(again.arrays[name], array) for name, array in cache.arrays.items())
@@ -175,29 +175,31 @@ def test_another_store_is_not_written_over(root, cache, tmp_path):
             encode(*made)
 
 
-@pytest.mark.parametrize(
-    ("sound_pictures", "settings", "message"),
-    [
-        (False, {"on_bad": "raise"}, "not an image"),
-        # 5 of the 35 frames of 7 sequences, and 1 of 8 sequences.
-        (False, {"most_bad": 0.14}, r"14\.3% of the frames cannot be read"),
-        (True, {"most_bad": 0.12}, r"12\.5% of the sequences cannot be read"),
-    ],
-    ids=["raise", "frames", "sequences"],
-)
-def test_what_cannot_be_read_follows_the_settings_of_the_data(tmp_path, sound_pictures, settings, message):
-    root, out = broken_rooms(tmp_path / "root"), tmp_path / "cache"
-    if sound_pictures:
-        for name in ("c5", "c6"):
-            shutil.copytree(root / "train/c1", root / f"train/{name}", dirs_exist_ok=True)
-    with pytest.raises(DataError, match=message):
-        encode_training_set(small_autoreconstructor(), rooms(root, **settings), out, progress=False)
-    assert list(out.iterdir()) == []
+def test_data_that_are_not_packed_are_refused(root, tmp_path):
+    raw = rooms(root.with_name("raw"))
+    with pytest.raises(DataError, match="run `completesplat data prepare` first"):
+        encode_training_set(small_autoreconstructor(), raw, tmp_path / "cache", progress=False)
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize("on_bad", ["skip", "raise"])
+def test_damaged_data_are_refused_and_nothing_is_left(root, tmp_path, on_bad):
+    store = Path(shutil.copytree(root, tmp_path / "store"))
+    (shard,) = store.glob("train-*.arrow")
+    content = shard.read_bytes()
+    picture = content.index(b"BM", len(content) // 2)
+    shard.write_bytes(content[: picture + 100] + bytes([content[picture + 100] ^ 1]) + content[picture + 101 :])
+    with pytest.raises(DataError, match="is no longer what was written") as caught:
+        encode_training_set(
+            small_autoreconstructor(), rooms(store, on_bad=on_bad), tmp_path / "cache", batch_size=2, progress=False
+        )
+    assert caught.value.file == str(shard)
+    assert list((tmp_path / "cache").iterdir()) == []
 
 
 def test_too_little_space_is_noticed_before_anything_is_written(root, tmp_path, monkeypatch):
     usage = type("usage", (), {"free": 1000})
-    monkeypatch.setattr(pictures.shutil, "disk_usage", lambda path: usage)
+    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: usage)
     with pytest.raises(DataError, match=r"not enough space: about .* for 20 frames of 4 sequences"):
         encode(root, tmp_path / "cache")
     assert list((tmp_path / "cache").iterdir()) == []
@@ -206,8 +208,10 @@ def test_too_little_space_is_noticed_before_anything_is_written(root, tmp_path, 
 def test_the_estimate_is_the_size_of_the_rows(root, tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         store = encode(root, tmp_path / "cache")
-    size = sum(array.nbytes for array in store.arrays.values())
-    assert f"about {size / 1000:.1f} kB for 20 frames" in caplog.text
+        few = encode(root, tmp_path / "few", frames=2)
+    for made, frames in ((store, 20), (few, 8)):
+        size = sum(array.nbytes for array in made.arrays.values())
+        assert f"about {size / 1000:.1f} kB for {frames} frames" in caplog.text
 
 
 @pytest.mark.parametrize("options", [{"precision": "float64"}, {"frames": 0}, {"batch_size": 0}])
@@ -279,11 +283,11 @@ def test_latents_of_another_shape_are_refused(root, cache, tmp_path, change):
     (copy / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match=r"latents of \(4, 2, 2\)"):
         check_cache(
-            EncodedStore(copy), wide if change == "channels" else small_autoreconstructor(), rooms(root).source("train")
+            LatentCache(copy), wide if change == "channels" else small_autoreconstructor(), rooms(root).source("train")
         )
 
 
 def test_a_manifest_is_read_as_it_was_written(cache):
-    again = EncodedStore(cache.folder).manifest
+    again = LatentCache(cache.folder).manifest
     assert again == cache.manifest
     assert again != replace(again, scale=2 * again.scale)

@@ -25,7 +25,7 @@ PLACES_OF_WEIGHTS = ("state_dict", "current_model_state", "averaging_state", "op
 
 @pytest.fixture(scope="module")
 def settings(pipeline, latent_cache):
-    """Arguments of `completesplat`, by stage; "encoded" is stage 2 from the latent cache."""
+    """Arguments of `completesplat`, by stage; "latent_cache" is stage 2 from the latent cache."""
     shared = [f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
     own = ["sampler.steps=2", "callbacks.samples.every_n_steps=2"]
@@ -33,7 +33,7 @@ def settings(pipeline, latent_cache):
     return {
         "var": ["fit", "experiment=toy_var", *shared],
         "diffusion": stage2,
-        "encoded": [*stage2, f"data.encoded={latent_cache}"],
+        "latent_cache": [*stage2, f"data.latent_cache={latent_cache}"],
     }
 
 
@@ -77,7 +77,7 @@ def rows(run) -> pandas.DataFrame:
         ("var", ReconstructionModule, 3),
         pytest.param("var", ReconstructionModule, 4, marks=pytest.mark.slow),
         pytest.param("diffusion", LatentDiffusion, 3, marks=pytest.mark.slow),
-        pytest.param("encoded", LatentDiffusion, 3, marks=pytest.mark.slow),
+        pytest.param("latent_cache", LatentDiffusion, 3, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeypatch, stage, module, saved):

@@ -11,7 +11,7 @@ from torch import nn
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.scene import EncodedScene, SceneBatch, Views
+from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.training.latent_diffusion import LatentDiffusion, losses_by_timestep
 
 BATCH, SIZE = 2, 32
@@ -88,11 +88,11 @@ class AsItIs(nn.Module):
     frozen, pretrained = True, None
 
 
-def encoded(count: int) -> EncodedScene:
+def encoded(count: int) -> CachedScene:
     generator = torch.Generator().manual_seed(0)
     mean, condition = (torch.randn(count, 4, 2, 2, generator=generator) for _ in range(2))
     names = tuple(map(str, range(count)))
-    return EncodedScene(mean, torch.full_like(mean, -2.0), condition, torch.zeros(count, dtype=torch.int64), names)
+    return CachedScene(mean, torch.full_like(mean, -2.0), condition, torch.zeros(count, dtype=torch.int64), names)
 
 
 def recording(monkeypatch, **settings) -> tuple[LatentDiffusion, dict[str, float]]:
@@ -163,7 +163,7 @@ def test_what_was_encoded_beforehand_trains_the_same(visible, monkeypatch):
             with torch.no_grad():
                 posterior, _ = parts.autoreconstructor.encoder(batch.reference.images)
             picture = batch.reference.images * batch.visible
-            inputs = EncodedScene(posterior.mean, posterior.log_variance, picture, batch.reference_frame, batch.names)
+            inputs = CachedScene(posterior.mean, posterior.log_variance, picture, batch.reference_frame, batch.names)
         torch.manual_seed(5)
         module.training_step(inputs, 0).backward()
         found.append((logged, gradients(module)))

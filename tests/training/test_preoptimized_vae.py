@@ -58,7 +58,7 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
 
 def test_encoded_pictures_are_refused(command, toy_root, latent_cache):
     refused = command(
-        "fit", *SETTINGS, f"data.root={toy_root}", f"data.encoded={latent_cache}", "data.color_jitter=null"
+        "fit", *SETTINGS, f"data.root={toy_root}", f"data.latent_cache={latent_cache}", "data.color_jitter=null"
     )
     assert refused.status == 2
     assert re.search(r"^error: data\.encoded is for latent diffusion", refused.err, re.MULTILINE)

@@ -87,7 +87,7 @@ class CO3DDataModule(SceneDataModule):
             return "of the set list, shared sequences allowed"
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
-    def prepared_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
         parts = vars(self.filters) | vars(self.framing)
         seeded = {"val_fraction": self.seeded.val_fraction, "test_fraction": self.seeded.test_fraction}

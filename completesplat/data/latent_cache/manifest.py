@@ -1,4 +1,4 @@
-"""What an encoded store says of itself: `manifest.json`, written last, so that only a finished store opens."""
+"""What a latent cache says of itself: `manifest.json`, written last, so that only a finished one opens."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.packed.manifest import MANIFEST, Refusal, Scalar, refusal_from_json, write_json
+from completesplat.data.packed.manifest import MANIFEST, Scalar, write_json
 from completesplat.data.validation import (
     BadAnnotation,
     UnreadableFile,
@@ -18,7 +18,7 @@ from completesplat.data.validation import (
     read_json,
 )
 
-FORMAT = 1
+FORMAT = 2
 ARRAYS = ("mean", "log_variance", "condition")
 DTYPES = ("float32", "float16", "uint8")
 
@@ -74,30 +74,29 @@ class Manifest:
     scale: float
     arrays: dict[str, Array]
     sequences: tuple[Sequence, ...]
-    refused: tuple[Refusal, ...]
 
 
-def is_encoded(root: Path) -> bool:
+def is_latent_cache(root: Path) -> bool:
     """Whether a folder holds a finished store."""
     return (root / MANIFEST).is_file()
 
 
 def write_manifest(root: Path, manifest: Manifest) -> None:
     """`manifest.json` in the store's folder, there as a whole or not at all."""
-    write_json(root / MANIFEST, {"format": FORMAT, "kind": "encoded", **asdict(manifest)})
+    write_json(root / MANIFEST, {"format": FORMAT, "kind": "latent_cache", **asdict(manifest)})
 
 
 def read_manifest(root: Path) -> Manifest:
     """The manifest of a store.
 
     Raises:
-        DataError: missing, damaged, of another version of the format, or not that of an encoded store.
+        DataError: missing, damaged, of another version of the format, or not that of a latent cache.
     """
     path = root / MANIFEST
     with at(file=path):
         content = read_json(path)
-        if field(content, "kind", str) != "encoded":
-            raise UnreadableFile("no store of encoded pictures: completesplat data latents makes one")
+        if field(content, "kind", str) != "latent_cache":
+            raise UnreadableFile("no latent cache: completesplat data latents makes one")
         if field(content, "format", int) != FORMAT:
             raise UnreadableFile(f"format {content['format']}, this version reads {FORMAT}: encode the pictures again")
         arrays = field(content, "arrays", dict)
@@ -107,7 +106,6 @@ def read_manifest(root: Path) -> Manifest:
             field(content, "scale", float),
             {name: _array(root, field(arrays, name, dict)) for name in ARRAYS},
             tuple(_sequence(entry) for entry in field(content, "sequences", list)),
-            tuple(refusal_from_json(entry) for entry in field(content, "refused", list)),
         )
         _check(manifest)
         return manifest
@@ -136,7 +134,7 @@ def _array(root: Path, entry: Mapping[str, Any]) -> Array:
 def _sequence(entry: object) -> Sequence:
     frames, stored = field(entry, "frames", int), list_field(entry, "stored", int)
     # Strictly increasing from 0 on and below `frames`.
-    if any(b <= a for a, b in pairwise((-1, *stored, frames))):
+    if not stored or any(b <= a for a, b in pairwise((-1, *stored, frames))):
         raise BadAnnotation("stored frames must be places in the sequence, in order")
     return Sequence(field(entry, "name", str), frames, field(entry, "first", int), stored)
 

@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from completesplat.data.latent_cache.manifest import Array, Sequence, is_encoded, read_manifest
+from completesplat.data.latent_cache.manifest import Array, Sequence, is_latent_cache, read_manifest
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import Scalar, differences
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.scene import EncodedScene
+from completesplat.scene import CachedScene
 
 
 class ArrayWriter:
@@ -87,8 +87,8 @@ def open_array(root: Path, array: Array) -> np.memmap:
         return found
 
 
-class EncodedStore:
-    """The encoded pictures of a training set.
+class LatentCache:
+    """The latent cache of a training set, opened.
 
     Attributes:
         scale: 1 / standard deviation of a latent drawn from the posteriors, over all elements of all stored frames.
@@ -99,10 +99,8 @@ class EncodedStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        if not is_encoded(folder):
-            raise MissingFile(
-                "no finished store of encoded pictures: completesplat data latents makes one", str(folder)
-            )
+        if not is_latent_cache(folder):
+            raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
         self.manifest = read_manifest(folder)
         self.origin = self.manifest.origin
@@ -120,7 +118,7 @@ class EncodedStore:
         """Whether the conditions are pictures rather than features."""
         return self.origin.conditioning is None
 
-    def scene(self, name: str, frame: int) -> EncodedScene:
+    def scene(self, name: str, frame: int) -> CachedScene:
         """One encoded frame, without batch axis; features as they were stored, in float32.
 
         Args:
@@ -137,7 +135,7 @@ class EncodedStore:
             condition = torch.from_numpy(np.asarray(share))
         else:
             condition = self._floats("condition", row)
-        return EncodedScene(mean, log_variance, condition, torch.tensor(frame), name)
+        return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
         """Refuse a store that was made from other pictures than `source` gives with these settings.
@@ -159,15 +157,10 @@ class EncodedStore:
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
-    def missing(self, name: str, frame: int | None = None) -> DataError:
-        """What to raise where a sequence, or a frame of it, is asked for and not there."""
-        what = "its pictures" if frame is None else f"its picture {frame + 1}"
-        return DataError(f"{what} could not be read when the training set was encoded", str(self.folder), name)
-
     def _row(self, sequence: Sequence, frame: int) -> int:
         place = int(np.searchsorted(sequence.stored, frame))
         if place == len(sequence.stored) or sequence.stored[place] != frame:
-            raise self.missing(sequence.name, frame)
+            raise DataError("was not encoded", str(self.folder), sequence.name, frame)
         return sequence.first + place
 
     def _floats(self, array: str, row: int) -> Float[Tensor, "_ _ _"]:
@@ -175,18 +168,17 @@ class EncodedStore:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Worker processes map the files themselves; a pickled array would hold all of it.
-        return EncodedStore, (self.folder,)
+        return LatentCache, (self.folder,)
 
 
-class EncodedTraining(TrainingScenes):
+class CachedTrainingScenes(TrainingScenes):
     """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
 
-    Where all frames were to be encoded, an item with a frame (target views included) that could not be read is
-    replaced by the very item that `TrainingScenes` puts in its place. Where only some frames of a sequence were, the
-    nearest of those that are there takes the reference's place (the earlier one of two).
+    Where only some frames of a sequence were encoded, the nearest of those that are there takes the reference's place
+    (the earlier one of two).
 
     Args:
-        encoded: where the items come from.
+        cache: where the items come from.
         store: the training set, whose names and groups tell the order; it is not read.
         choose: (number of a sequence's frames, random generator) -> views.
         box_masks: hide parts of the pictures, as `augment` does; None for none.
@@ -198,7 +190,7 @@ class EncodedTraining(TrainingScenes):
 
     def __init__(
         self,
-        encoded: EncodedStore,
+        cache: LatentCache,
         store: SceneStore,
         choose: Callable[[int, np.random.Generator], Choice],
         box_masks: BoxMasks | None,
@@ -206,29 +198,19 @@ class EncodedTraining(TrainingScenes):
         seed: int,
     ) -> None:
         super().__init__(store, choose, lambda scene, rng: scene, references, seed)
-        if box_masks is not None and not encoded.holds_pictures:
+        if box_masks is not None and not cache.holds_pictures:
             raise CompleteSplatError(
-                "data.box_masks cannot hide parts of encoded features: use data.encoded=null, or encode pictures"
+                "data.box_masks cannot hide parts of encoded features: use data.latent_cache=null, or encode pictures"
             )
-        self.encoded = encoded
+        self.cache = cache
         self.box_masks = box_masks
 
-    def draw(self, name: str, rng: np.random.Generator) -> EncodedScene:
-        """An encoded reference frame of the sequence of this name.
-
-        Raises:
-            DataError: it is not in the store.
-        """
-        sequence = self.encoded.sequences[name]
-        if not sequence.frames:
-            raise self.encoded.missing(name)
-        reference, targets = self.choose(sequence.frames, rng)
-        if self.encoded.origin.frames is not None and sequence.stored:
-            stored = np.array(sequence.stored)
-            reference = int(stored[np.abs(stored - reference).argmin()])
-        elif missing := {reference, *targets}.difference(sequence.stored):
-            raise self.encoded.missing(name, min(missing))
-        scene = self.encoded.scene(name, reference)
+    def draw(self, name: str, rng: np.random.Generator) -> CachedScene:
+        """An encoded reference frame of the sequence of this name."""
+        sequence = self.cache.sequences[name]
+        reference, _ = self.choose(sequence.frames, rng)
+        stored = np.array(sequence.stored)
+        scene = self.cache.scene(name, int(stored[np.abs(stored - reference).argmin()]))
         if self.box_masks is None:
             return scene
         boxes_rng = rng.spawn(3)[2]  # the third, as in `augment`

@@ -1,4 +1,4 @@
-"""Random changes to training scenes: one colour jitter for all views, mirroring, boxes over the reference picture."""
+"""Random changes to training scenes: one colour jitter for all views, flips, boxes over the reference picture."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror
 from completesplat.scene import SceneBatch, Views
 
-MIRRORING_PROBABILITY = 0.5
+FLIP_PROBABILITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -118,22 +118,22 @@ def augment(
     rng: np.random.Generator,
     color_jitter: ColorJitter | None,
     box_masks: BoxMasks | None,
-    mirroring: bool,
+    horizontal_flip: bool,
 ) -> SceneBatch:
     """One scene (without batch axis), changed at random.
 
-    Jitter, mirroring and boxes draw from three generators spawned from `rng` in this order, so that none of them
+    Jitter, flip and boxes draw from three generators spawned from `rng` in this order, so that none of them
     depends on whether the others are switched on, nor on what was drawn from `rng` before. `rng` itself draws nothing.
 
     Args:
         color_jitter: for the reference and all targets alike; None for none.
         box_masks: sets `visible`; None leaves it as it is.
-        mirroring: mirror the scene with probability 0.5.
+        horizontal_flip: mirror the scene with probability 0.5.
     """
-    jitter_rng, mirroring_rng, boxes_rng = rng.spawn(3)
+    jitter_rng, flip_rng, boxes_rng = rng.spawn(3)
     if color_jitter is not None:
         scene = _jittered(scene, color_jitter, jitter_rng)
-    if mirroring and mirroring_rng.random() < MIRRORING_PROBABILITY:
+    if horizontal_flip and flip_rng.random() < FLIP_PROBABILITY:
         scene = mirrored(scene)
     if box_masks is not None:
         height, width = scene.reference.cameras.image_size
@@ -152,7 +152,8 @@ def mirrored(scene: SceneBatch) -> SceneBatch:
 
 
 def _mirrored_views(views: Views) -> Views:
-    return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1))
+    depths = None if views.depths is None else views.depths.flip(-1)
+    return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1), depths)
 
 
 def _jittered(scene: SceneBatch, color_jitter: ColorJitter, rng: np.random.Generator) -> SceneBatch:

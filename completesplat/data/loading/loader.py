@@ -3,7 +3,6 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any
 
 import torch
@@ -11,7 +10,6 @@ from torch.utils.data import DataLoader, Sampler
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
-from completesplat.data.loading.streaming import StreamedScenes
 from completesplat.data.loading.view_selection import draws
 from completesplat.errors import CompleteSplatError, DataError
 
@@ -68,20 +66,20 @@ class SceneLoader:
     It is a loader of its own for Lightning, which restores `state_dict` in the middle of an epoch.
 
     Args:
-        sampler: the order (streamed scenes are their own); None: as they are.
+        sampler: the order of a training epoch; None: as they are.
         workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
-        most_bad: skipping more than this share of an epoch's items is an error.
+        max_bad_fraction: skipping more than this share of an epoch's items is an error.
     """
 
     def __init__(
         self,
-        scenes: TrainingScenes | EvaluationScenes | StreamedScenes,
+        scenes: TrainingScenes | EvaluationScenes,
         batch_size: int,
-        sampler: EpochSampler | StreamedScenes | None,
+        sampler: EpochSampler | None,
         workers: int,
         on_bad: str = "skip",
-        most_bad: float = 0.1,
+        max_bad_fraction: float = 0.1,
     ) -> None:
         check_policy(on_bad)
         self.dataset = scenes
@@ -89,18 +87,17 @@ class SceneLoader:
         self.sampler = sampler
         self.batch_sampler = None  # Lightning asks for it wherever there is a sampler
         self.on_bad = on_bad
-        self.most_bad = most_bad
+        self.max_bad_fraction = max_bad_fraction
         self.refused: list[DataError] = []
+        self.refused_depths: list[DataError] = []
         self._batches = 0
         self._resume: dict[str, int] = {}
         self._loader = DataLoader(
             scenes,
             batch_size,
-            sampler=None if isinstance(sampler, StreamedScenes) else sampler,
+            sampler=sampler,
             num_workers=workers,
-            # Workers hold what is cached, so they live on from one epoch to the next; those of a stream hold nothing,
-            # and learn from a new start which epoch it is.
-            persistent_workers=workers > 0 and not isinstance(sampler, StreamedScenes),
+            persistent_workers=workers > 0,  # They hold what is cached, so they live on from one epoch to the next.
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
             # Its own, so that the numbers which training draws do not depend on the number of workers.
@@ -111,29 +108,26 @@ class SceneLoader:
         return len(self._loader)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches of an epoch (`SceneBatch`, or `EncodedScene`), or the rest of it after `load_state_dict`.
+        """The batches of an epoch (`SceneBatch`, or `CachedScene`), or the rest of it after `load_state_dict`.
 
         Raises:
             DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.
         """
-        self.refused, resume, self._resume = [], self._resume, {}
+        resume, self._resume = self._resume, {}
+        self.refused, self.refused_depths = [], []
         self._batches = resume.get("batches", 0) if resume.get("epoch") == self._epoch else 0
-        surplus = 0
         if self.sampler is not None:
             self.sampler.start = self._batches * self.batch_size
-        if isinstance(self.sampler, StreamedScenes):
-            surplus = self.sampler.unfinished_round(self._loader.num_workers)
         try:
-            for scenes, refused in islice(self._loader, surplus, surplus + len(self) - self._batches):
+            for scenes, refused, refused_depths in self._loader:
                 self._batches += 1
                 self._account(refused, scenes is None)
+                self.refused_depths += refused_depths
                 if self._batches == len(self):
                     # Not behind the loop: whoever knows how many batches there are, as Lightning, asks for no more.
                     self._report()
                 if scenes is not None:
                     yield scenes
-            if self._batches < len(self):
-                raise DataError("no sequences for this process: there are more processes than sequences")
         except GeneratorExit:  # The rest of the epoch is not wanted.
             if self._batches < len(self):
                 self._report()
@@ -170,11 +164,12 @@ class SceneLoader:
         if refused and self.on_bad == "raise":
             raise refused[0]
         self.refused += refused
-        too_many = len(self.refused) > max(1, self.most_bad * self._items)
+        too_many = len(self.refused) > max(1, self.max_bad_fraction * self._items)
         # Evaluation has nothing in the place of what cannot be read.
         nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
         if too_many or nothing:
-            reason = f"more than data.most_bad={self.most_bad:g} allows" if too_many else "and nothing in their place"
+            limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"
+            reason = limit if too_many else "and nothing in their place"
             raise DataError(
                 f"{len(self.refused)} of {self._items} items cannot be read, {reason}; see `completesplat data check`; "
                 f"the last one: {self.refused[-1]}"

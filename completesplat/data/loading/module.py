@@ -12,26 +12,25 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
-from completesplat.data.latent_cache.store import EncodedStore, EncodedTraining
+from completesplat.data.latent_cache.store import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.loader import EpochSampler, SceneLoader, check_policy
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
-from completesplat.data.loading.streaming import StreamedScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
-from completesplat.data.packed.manifest import is_prepared, read_manifest, settings_must_match
-from completesplat.data.packed.source import PreparedSource
+from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
+from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import CompleteSplatError, DataError
 
 
-def check_settings(targets: int, mask_threshold: float | None, encoded: str | None, changed: bool) -> None:
+def check_settings(targets: int, mask_threshold: float | None, latent_cache: str | None, changed: bool) -> None:
     """Refuse them; see `SceneDataModule`.
 
     Args:
-        encoded: folder of encoded pictures; an empty name is one that is still to be given.
-        changed: whether training pictures are augmented or streamed.
+        latent_cache: its folder; an empty name is one that is still to be given.
+        changed: whether training pictures are augmented.
 
     Raises:
         CompleteSplatError: one of them is out of its range, or encoded pictures are to be changed.
@@ -40,11 +39,11 @@ def check_settings(targets: int, mask_threshold: float | None, encoded: str | No
         raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
     if mask_threshold is not None and not 0 < mask_threshold <= 1:
         raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
-    if encoded == "":
-        raise CompleteSplatError("data.encoded is needed: give data.encoded=DIR, which `data latents` wrote")
-    if encoded is not None and changed:
-        asked = "data.color_jitter=null data.mirroring=false data.streaming=false"
-        raise CompleteSplatError(f"data.encoded is of pictures as they are, item by item: set {asked}")
+    if latent_cache == "":
+        raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
+    if latent_cache is not None and changed:
+        asked = "data.color_jitter=null data.horizontal_flip=false"
+        raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {asked}")
 
 
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
@@ -68,14 +67,13 @@ class SceneDataModule(LightningDataModule):
         mask_threshold: masks are cut at this probability; None: they stay soft.
         color_jitter: settings of `ColorJitter`; None: no augmentation of colours.
         box_masks: settings of `BoxMasks`; None: the reference pictures are seen completely.
-        mirroring: mirror half of the training scenes horizontally.
+        horizontal_flip: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none.
         cache: keep decoded pictures in memory.
-        streaming: read a prepared training set as a stream, each training process its own part; see `StreamedScenes`.
-        encoded: train stage 2 from this folder of encoded pictures (`EncodedTraining`), which nothing may change then;
-            validation and test read pictures. An empty name is one that is still to be given.
+        latent_cache: train stage 2 from the latents in this folder (`CachedTrainingScenes`), without augmentation of
+            pictures; validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
-        most_bad: skipping more than this share of an epoch's items is an error.
+        max_bad_fraction: skipping more than this share of an epoch's items is an error.
     """
 
     def __init__(
@@ -89,18 +87,17 @@ class SceneDataModule(LightningDataModule):
         mask_threshold: float | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
-        mirroring: bool = False,
+        horizontal_flip: bool = False,
         workers: int = 0,
         cache: bool = False,
-        streaming: bool = False,
-        encoded: str | None = None,
+        latent_cache: str | None = None,
         on_bad: str = "skip",
-        most_bad: float = 0.1,
+        max_bad_fraction: float = 0.1,
         seed: int = 0,
     ) -> None:
         super().__init__()
         check_policy(on_bad)
-        check_settings(targets, mask_threshold, encoded, color_jitter is not None or mirroring or streaming)
+        check_settings(targets, mask_threshold, latent_cache, color_jitter is not None or horizontal_flip)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -110,10 +107,10 @@ class SceneDataModule(LightningDataModule):
         self.mask_threshold = mask_threshold
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
-        self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, mirroring=mirroring)
-        self.workers, self.cache, self.streaming = workers, cache, streaming
-        self.encoded = None if encoded is None else Path(encoded)
-        self.policy = on_bad, most_bad
+        self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, horizontal_flip=horizontal_flip)
+        self.workers, self.cache = workers, cache
+        self.latent_cache = None if latent_cache is None else Path(latent_cache)
+        self.policy = on_bad, max_bad_fraction
         self.seed = seed
         # The same data in the smaller pictures that a tested model sees.
         self.at_model_size: SceneDataModule | None = None
@@ -121,7 +118,7 @@ class SceneDataModule(LightningDataModule):
         self._stores: dict[str, SceneStore] = {}
 
     @abstractmethod
-    def prepared_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Any]:
         """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
 
     @abstractmethod
@@ -164,7 +161,7 @@ class SceneDataModule(LightningDataModule):
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
-        if stage == "fit" and self.encoded is not None:
+        if stage == "fit" and self.latent_cache is not None:
             self._training_scenes()  # what is wrong with the encodings is told before training starts
 
     def source(self, split: str) -> SequenceSource:
@@ -174,9 +171,9 @@ class SceneDataModule(LightningDataModule):
             DataError: missing or malformed files, prepared with other settings, or broken where that is to be raised.
         """
         if split not in self._sources:
-            if is_prepared(self.root):
-                settings_must_match(read_manifest(self.root), self.prepared_settings())
-                self._sources[split] = PreparedSource(self.root, split)
+            if is_packed(self.root):
+                settings_must_match(read_manifest(self.root), self.packed_settings())
+                self._sources[split] = PackedSource(self.root, split)
             else:
                 self._sources |= self.open(split)
         source = self._sources[split]
@@ -203,15 +200,15 @@ class SceneDataModule(LightningDataModule):
         return self._stores[split]
 
     @cached_property
-    def encoded_store(self) -> EncodedStore:
-        """The encoded pictures of `encoded`, which must be those of this training set.
+    def cached_latents(self) -> LatentCache:
+        """The cache in `latent_cache`, which must be those of this training set.
 
         Raises:
             DataError: there are none, or they are damaged, or of other data or made with other settings.
         """
-        assert self.encoded is not None
-        store = EncodedStore(self.encoded)
-        store.must_belong_to(self.source("train"), self.prepared_settings())
+        assert self.latent_cache is not None
+        store = LatentCache(self.latent_cache)
+        store.must_belong_to(self.source("train"), self.packed_settings())
         return store
 
     def train_dataloader(self) -> SceneLoader:
@@ -219,17 +216,13 @@ class SceneDataModule(LightningDataModule):
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
-        order: StreamedScenes | EpochSampler = EpochSampler(scenes.groups(), self.seed)
-        if self.streaming:
-            order = StreamedScenes(scenes, self.source("train"), batch_size)
-        items = order if isinstance(order, StreamedScenes) else scenes
-        return SceneLoader(items, batch_size, order, self.workers, *self.policy)
+        return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
     def _training_scenes(self) -> TrainingScenes:
         drawing = self.store("train"), self.training_views
         counting = self.references_per_sequence, self.seed
-        if self.encoded is not None:
-            return EncodedTraining(self.encoded_store, *drawing, self.box_masks, *counting)
+        if self.latent_cache is not None:
+            return CachedTrainingScenes(self.cached_latents, *drawing, self.box_masks, *counting)
         return TrainingScenes(*drawing, self.augment, *counting)
 
     def val_dataloader(self) -> SceneLoader:
@@ -242,7 +235,8 @@ class SceneDataModule(LightningDataModule):
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
         seen = None if self.at_model_size is None else self.at_model_size.store(split)
-        scenes = EvaluationScenes(self.store(split), partial(self.evaluation_views, split=split), seen=seen)
+        choose, depths = partial(self.evaluation_views, split=split), split == "test"
+        scenes = EvaluationScenes(self.store(split), choose, seen=seen, depths=depths)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)

@@ -15,7 +15,7 @@ from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import draws
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.errors import DataError
-from completesplat.scene import EncodedScene, SceneBatch, Views
+from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
 # So many other items are tried in the place of one that cannot be read.
@@ -25,10 +25,16 @@ Choice = tuple[int, list[int]]  # reference, targets
 
 
 class Loaded(NamedTuple):
-    """A scene, or a batch of them, and what could not be read on the way."""
+    """A scene, or a batch of them, and what could not be read on the way.
 
-    scenes: SceneBatch | EncodedScene | None
+    Attributes:
+        refused: why scenes could not be read.
+        refused_depths: why scenes are here without their true depth, although the data have it.
+    """
+
+    scenes: SceneBatch | CachedScene | None
     refused: tuple[DataError, ...]
+    refused_depths: tuple[DataError, ...] = ()
 
 
 class SceneStore:
@@ -131,20 +137,13 @@ class TrainingScenes(Dataset[Loaded]):
                 index = int(rng.integers(len(self)))
         return Loaded(None, tuple(refused))
 
-    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | EncodedScene:
+    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | CachedScene:
         """A scene of random views of the sequence of this name.
 
         Raises:
             DataError: the sequence or a picture cannot be read.
         """
-        return self.make(self.store.source.read(name), rng)
-
-    def make(self, sequence: PosedSequence, rng: np.random.Generator) -> SceneBatch:
-        """A scene of random views of a sequence.
-
-        Raises:
-            DataError: a picture that cannot be read.
-        """
+        sequence = self.store.source.read(name)
         scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
         return self.augment(scene, rng)
 
@@ -162,6 +161,7 @@ class EvaluationScenes(Dataset[Loaded]):
         choose: sequence -> views. Raises `DataError` where it has not got them.
         names: the sequences; None: all.
         seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
+        depths: read the true depth too, where the data have it.
     """
 
     def __init__(
@@ -170,11 +170,13 @@ class EvaluationScenes(Dataset[Loaded]):
         choose: Callable[[PosedSequence], Choice],
         names: Sequence[str] | None = None,
         seen: SceneStore | None = None,
+        depths: bool = False,
     ) -> None:
         self.store = store
         self.choose = choose
         self.names = store.names if names is None else names
         self.seen = seen
+        self.depths = depths
 
     def __len__(self) -> int:
         return len(self.names)
@@ -184,7 +186,7 @@ class EvaluationScenes(Dataset[Loaded]):
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
         own = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, own, self.seen)
+        return EvaluationScenes(self.store, self.choose, own, self.seen, self.depths)
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]
@@ -194,9 +196,13 @@ class EvaluationScenes(Dataset[Loaded]):
             scene = self.store.scene(sequence, *views)
             if self.seen is not None:
                 scene = replace(scene, seen=self.seen.scene(self.seen.source.read(name), *views))
-            return Loaded(scene, ())
         except DataError as error:
             return Loaded(None, (error,))
+        try:
+            depths = _depths(sequence, *views) if self.depths else None
+        except DataError as error:
+            return Loaded(scene, (), (error,))
+        return Loaded(scene if depths is None else with_depths(scene, depths), ())
 
     def stackable(self) -> bool:
         """Whether all scenes have the same number of targets, as far as they can be read."""
@@ -207,7 +213,40 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(counts) <= 1
 
 
+def _depths(
+    sequence: PosedSequence, reference: int, targets: Sequence[int]
+) -> Float[Tensor, "view 1 height width"] | None:
+    """True depth of these frames, the reference first; None where the data have none.
+
+    Raises:
+        DataError: a depth map cannot be read.
+    """
+    if sequence.read_depth is None:
+        return None
+    return torch.stack([sequence.read_depth(view) for view in (reference, *targets)])
+
+
+def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
+    """One scene (without batch axis) with the depths of its reference and its targets."""
+    reference, targets = replace(scene.reference, depths=depths[0]), replace(scene.targets, depths=depths[1:])
+    return replace(scene, reference=reference, targets=targets)
+
+
 def collate(items: Sequence[Loaded]) -> Loaded:
-    """A batch of the scenes that are there."""
+    """A batch of the scenes that are there; where only some of them have depths, those of the others are 0, unknown."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    return Loaded(stack(scenes) if scenes else None, tuple(error for item in items for error in item.refused))
+    if any(_has_depths(scene) for scene in scenes):
+        scenes = [scene if _has_depths(scene) else _with_unknown_depths(scene) for scene in scenes]
+    return Loaded(
+        stack(scenes) if scenes else None,
+        tuple(error for item in items for error in item.refused),
+        tuple(error for item in items for error in item.refused_depths),
+    )
+
+
+def _has_depths(scene: SceneBatch | CachedScene) -> bool:
+    return isinstance(scene, SceneBatch) and scene.reference.depths is not None
+
+
+def _with_unknown_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
+    return with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene

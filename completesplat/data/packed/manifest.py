@@ -1,4 +1,4 @@
-"""What a prepared store says of itself: `manifest.json`, written last."""
+"""What a packed store says of itself: `manifest.json`, written last."""
 
 import json
 import os
@@ -79,8 +79,8 @@ class Manifest:
     splits: dict[str, Split]
 
 
-def is_prepared(root: Path) -> bool:
-    """Whether a folder holds a complete prepared store."""
+def is_packed(root: Path) -> bool:
+    """Whether a folder holds a complete packed store."""
     return (root / MANIFEST).is_file()
 
 

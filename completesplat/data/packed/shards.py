@@ -1,4 +1,4 @@
-"""Making one shard of a prepared store, in whichever process."""
+"""Making one shard of a packed store, in whichever process."""
 
 import hashlib
 import os
@@ -64,7 +64,7 @@ class ShardWriter:
         unfinished = path.with_name(path.name + UNFINISHED)
         refused: list[Refusal] = []
         sequences, frames = [], 0
-        # One record batch for each sequence, so that streaming holds no more than one in memory.
+        # One record batch for each sequence, so that writing holds no more than one in memory.
         with (
             unfinished.open("wb") as stream,
             ArrowWriter(features=features(), stream=stream, writer_batch_size=1) as writer,

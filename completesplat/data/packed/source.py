@@ -1,4 +1,4 @@
-"""Reading a prepared store: opened by its manifest, memory-mapped shard by shard when a sequence is asked for."""
+"""Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is asked for."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from completesplat.data.validation import BadAnnotation, ChangedFile, Unreadable
 from completesplat.errors import DataError
 
 
-class PreparedSource:
-    """One split of a prepared store, as a `SequenceSource`. What was refused while it was made is in its manifest.
+class PackedSource:
+    """One split of a packed store, as a `SequenceSource`. What was refused while it was made is in its manifest.
 
     Raises:
         DataError: no such split, a malformed manifest, or a shard that is missing or of another size.
@@ -25,7 +25,7 @@ class PreparedSource:
         manifest = read_manifest(root)
         if split not in manifest.splits:
             there = ", ".join(manifest.splits) or "none"
-            raise DataError(f"no split {split} in this prepared store; there are: {there}", str(root))
+            raise DataError(f"no split {split} in this packed store; there are: {there}", str(root))
         entry = manifest.splits[split]
         self.manifest = manifest
         self.shards = entry.shards
@@ -108,7 +108,7 @@ def open_shard(path: Path, shard: Shard) -> Any:
         except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise UnreadableFile(f"not a readable Arrow file ({error})") from None
         if dataset.features != features() or dataset.data.schema.types != features().arrow_schema.types:
-            raise UnreadableFile("its columns are not those of a prepared store")
+            raise UnreadableFile("its columns are not those of a packed store")
         if len(dataset) != len(shard.sequences):
             raise BadAnnotation(f"{len(dataset)} sequences, the manifest says {len(shard.sequences)}")
         return dataset.with_format("arrow")

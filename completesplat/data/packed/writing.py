@@ -25,7 +25,7 @@ from completesplat.data.packed.manifest import (
     Scalar,
     Split,
     differences,
-    is_prepared,
+    is_packed,
     write_json,
     write_manifest,
 )
@@ -71,20 +71,30 @@ def check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
             frames.append(len(sequence.frames))
         except DataError:
             continue
-    free = shutil.disk_usage(writer.folder).free
     if not frames or not sizes:
-        logger.warning(
-            "no estimate of the size: none of the sequences looked at can be read; %s are free", decimal(free)
-        )
+        free = decimal(shutil.disk_usage(writer.folder).free)
+        logger.warning("no estimate of the size: none of the sequences looked at can be read; %s are free", free)
         return
     count = round(float(np.mean(frames)) * len(names))
     size = round(count * (float(np.mean(sizes)) + BYTES_PER_FRAME))
-    needed = (
-        f"about {decimal(size)} for {count:,} frames of {len(names):,} sequences in {len(plans):,} shards; "
-        f"{decimal(free)} are free"
-    )
+    contents = f"{count:,} frames of {len(names):,} sequences in {len(plans):,} shards"
+    require_space(size, contents, writer.folder)
+
+
+def require_space(size: int, contents: str, folder: Path, advice: str = "") -> None:
+    """Say how many bytes are going to be written.
+
+    Args:
+        contents: what they are for.
+        advice: how to need less, appended to the error.
+
+    Raises:
+        DataError: the disk has less space than that.
+    """
+    free = shutil.disk_usage(folder).free
+    needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
     if size > free:
-        raise DataError(f"not enough space: {needed}", str(writer.folder))
+        raise DataError(f"not enough space: {needed}{advice}", str(folder))
     logger.info(needed)
 
 
@@ -105,10 +115,10 @@ def prepare(
     sequences_per_shard: int = 32,
     workers: int | None = None,
     on_bad: OnBad = "skip",
-    most_bad: float = 0.1,
+    max_bad_fraction: float = 0.1,
     progress: bool = True,
 ) -> Path:
-    """Write sequences into a prepared store. The same input gives the same bytes, whatever the number of workers.
+    """Write sequences into a packed store. The same input gives the same bytes, whatever the number of workers.
 
     An interrupted run continues when it is started again; a complete store of the same data is left as it is. A shard
     that is missing or of another size is made again.
@@ -120,7 +130,7 @@ def prepare(
         sequences_per_shard: some hundred MB at 128 x 128 pixels and 200 frames.
         workers: processes; by default one for each core.
         on_bad: leave out frames and sequences that cannot be read, and record that; or raise.
-        most_bad: the largest share of frames, and of sequences, that may be left out so.
+        max_bad_fraction: the largest share of frames, and of sequences, that may be left out so.
 
     Returns:
         The folder.
@@ -135,7 +145,7 @@ def prepare(
     _claim(out, _plan(writer, settings, plans))
     records = {plan: kept_record(out, plan, on_bad) for plan in plans}
     missing = [plan for plan, record in records.items() if record is None]
-    if is_prepared(out) and not missing:
+    if is_packed(out) and not missing:
         logger.info("%s already holds these sequences", out)
         return out
     _remove_unfinished(out)
@@ -145,7 +155,7 @@ def prepare(
     if missing:
         check_space(writer, missing)
         records.update(zip(missing, _write_all(writer, missing, workers, progress), strict=True))
-    _finish(writer, settings, [record for record in records.values() if record is not None], most_bad)
+    _finish(writer, settings, [record for record in records.values() if record is not None], max_bad_fraction)
     return out
 
 
@@ -166,7 +176,7 @@ def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[S
 def _claim(out: Path, plan: dict[str, Any]) -> None:
     path = out / PLAN
     if not path.is_file():
-        if is_prepared(out) or any(out.glob("*.arrow")):
+        if is_packed(out) or any(out.glob("*.arrow")):
             raise DataError("already holds other prepared sequences: choose another folder", str(out))
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, plan)
@@ -211,19 +221,19 @@ def _write_all(
 
 
 def _finish(
-    writer: ShardWriter, settings: Mapping[str, Scalar], records: Sequence[ShardRecord], most_bad: float
+    writer: ShardWriter, settings: Mapping[str, Scalar], records: Sequence[ShardRecord], max_bad_fraction: float
 ) -> None:
     splits = {
         split: _split(source, [record for record in records if record.split == split])
         for split, source in writer.sources.items()
     }
     manifest = Manifest(writer.folder, writer.codec, dict(settings), splits)
-    _check_share(manifest, most_bad)
+    _check_share(manifest, max_bad_fraction)
     write_manifest(manifest)
     _report(manifest)
 
 
-def _check_share(manifest: Manifest, most_bad: float) -> None:
+def _check_share(manifest: Manifest, max_bad_fraction: float) -> None:
     splits, out = manifest.splits.values(), str(manifest.root)
     refused = [refusal for split in splits for refusal in split.refused]
     kept, kinds = sum(len(split.names) for split in splits), _by_kind(refused)
@@ -233,9 +243,12 @@ def _check_share(manifest: Manifest, most_bad: float) -> None:
     bad_sequences = len({refusal.sequence or refusal.file for refusal in refused if refusal.frame is None})
     frames = sum(shard.frames for split in splits for shard in split.shards)
     share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + kept))
-    if share > most_bad:
-        advice = "see the .json beside the shards, and put the data right (then remove this folder) or raise most_bad"
-        raise DataError(f"{share:.1%} of the data are bad, at most {most_bad:.1%} may be ({kinds}): {advice}", out)
+    if share > max_bad_fraction:
+        remedy = "put the data right (then remove this folder) or raise data.max_bad_fraction"
+        advice = f"see the .json beside the shards, and {remedy}"
+        raise DataError(
+            f"{share:.1%} of the data are bad, at most {max_bad_fraction:.1%} may be ({kinds}): {advice}", out
+        )
 
 
 def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:

@@ -195,7 +195,7 @@ class RE10KDataModule(SceneDataModule):
             "protocol_views": views + listed,
         }
 
-    def prepared_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
         return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.packed.manifest import is_prepared
+from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import CATEGORY, SUBSET, write_objects
@@ -47,7 +47,7 @@ class ToyObjectsDataModule(CO3DDataModule):
 
     def prepare_data(self) -> None:
         """Write the scenes unless a complete set is there (its description is written last)."""
-        if not is_prepared(self.root) and not (self.root / CATEGORY / "toy.json").is_file():
+        if not is_packed(self.root) and not (self.root / CATEGORY / "toy.json").is_file():
             write_objects(self.root, self.scenes, self.frames, self.image_size, self.data_seed)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
@@ -84,7 +84,7 @@ class ToyRoomsDataModule(RE10KDataModule):
         **reading: Any,
     ) -> None:
         home = Path(root)
-        super().__init__(str(home if is_prepared(home) else home / ROOMS / form), **reading)
+        super().__init__(str(home if is_packed(home) else home / ROOMS / form), **reading)
         self.home = home
         self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
 
@@ -94,5 +94,5 @@ class ToyRoomsDataModule(RE10KDataModule):
 
     def prepare_data(self) -> None:
         """Write the rooms unless a complete set is there (its description is written last)."""
-        if not is_prepared(self.home) and not (self.home / ROOMS / "toy.json").is_file():
+        if not is_packed(self.home) and not (self.home / ROOMS / "toy.json").is_file():
             write_rooms(self.home, **self.making)

@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from support import compose_config
 
 from completesplat.benchmarks.diffusion import Training, batches, cached_vs_on_the_fly
-from completesplat.scene import EncodedScene, SceneBatch
+from completesplat.scene import CachedScene, SceneBatch
 
 SMALL = [
     "bench_task=diffusion",
@@ -71,7 +71,7 @@ def test_both_ways_load_a_batch_for_each_step_and_pictures_only_once(toy_root, t
     for _ in range(5):
         comparison.a[1]()
         comparison.b[1]()
-    assert [type(batch) for batch in given] == [EncodedScene, SceneBatch] * 5
+    assert [type(batch) for batch in given] == [CachedScene, SceneBatch] * 5
     for cached, fly in zip(given[::2], given[1::2], strict=True):
         assert (cached.names, cached.reference_frame.tolist()) == (fly.names, fly.reference_frame.tolist())
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
-from prepared_sequences import ListedSource
+from packed_sequences import ListedSource
 
 from completesplat.benchmarks import data
 from completesplat.benchmarks.data import Epoch, read_epoch, rows

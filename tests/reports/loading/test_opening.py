@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from prepared_sequences import ListedSource
+from packed_sequences import ListedSource
 
 from completesplat.benchmarks import data
 from completesplat.benchmarks.data import RepeatedSource, resident_megabytes

@@ -1,4 +1,4 @@
-"""An encoded store that is not what was written does not open."""
+"""A latent cache that is not what was written does not open."""
 
 import json
 import pickle
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from encoded_stores import rooms, small_autoreconstructor, sound_rooms
+from latent_caches import rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.latent_cache.store import ArrayWriter, EncodedStore, open_array
+from completesplat.data.latent_cache.store import ArrayWriter, LatentCache, open_array
 from completesplat.errors import DataError
 from completesplat.training.encoding import encode_training_set
 
@@ -18,7 +18,7 @@ ARRAYS = ("mean", "log_variance", "condition")
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("encoded")
+    folder = tmp_path_factory.mktemp("cache")
     encode_training_set(
         small_autoreconstructor(), rooms(sound_rooms(folder / "root")), folder / "store", progress=False
     )
@@ -38,7 +38,7 @@ def test_a_damaged_array_is_refused_by_its_name(copy, name, damage):
     changed = {"cut": content[:-1], "header": content[:40], "longer": content + b"x", "empty": b""}
     path.unlink() if damage == "gone" else path.write_bytes(changed[damage])
     with pytest.raises(DataError) as caught:
-        EncodedStore(copy)
+        LatentCache(copy)
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
 
@@ -47,13 +47,13 @@ def test_a_damaged_array_is_refused_by_its_name(copy, name, damage):
 def test_another_array_of_the_same_name_is_refused(copy, name):
     np.save(copy / f"{name}.npy", np.zeros((3, 4), np.float32))
     with pytest.raises(DataError, match="not the array that the manifest describes"):
-        EncodedStore(copy)
+        LatentCache(copy)
 
 
 def test_arrays_of_objects_are_not_loaded(copy):
     np.save(copy / "mean.npy", np.array([{}, []], dtype=object), allow_pickle=True)
     with pytest.raises(DataError):
-        EncodedStore(copy)
+        LatentCache(copy)
 
 
 @pytest.mark.parametrize(
@@ -66,6 +66,7 @@ def test_arrays_of_objects_are_not_loaded(copy):
         (("sequences",), {}),
         (("sequences", 0, "stored"), [0, 0]),
         (("sequences", 0, "stored"), [1]),
+        (("sequences", 0, "stored"), []),
         (("sequences", 0, "frames"), 2),
         (("sequences", 0, "first"), 10**6),
         (("sequences", 0, "first"), -1),
@@ -89,21 +90,21 @@ def test_a_manifest_that_cannot_be_true_is_refused(copy, place, value):
     entry[place[-1]] = names[1] if value == "c1" and content["sequences"][0]["name"] != names[1] else value
     path.write_text(json.dumps(content))
     with pytest.raises(DataError):
-        EncodedStore(copy)
+        LatentCache(copy)
 
 
 def test_a_manifest_that_is_cut_short_is_refused(copy):
     path = copy / "manifest.json"
     path.write_text(path.read_text()[:-20])
     with pytest.raises(DataError, match="not a JSON file"):
-        EncodedStore(copy)
+        LatentCache(copy)
     path.unlink()
-    with pytest.raises(DataError, match="no finished store"):
-        EncodedStore(copy)
+    with pytest.raises(DataError, match="no finished latent cache"):
+        LatentCache(copy)
 
 
 def test_a_store_goes_to_other_processes_without_its_arrays(sound):
-    store = EncodedStore(sound)
+    store = LatentCache(sound)
     again = pickle.loads(pickle.dumps(store))
     assert len(pickle.dumps(store)) < 1000
     assert all(isinstance(array, np.memmap) for array in again.arrays.values())

@@ -31,7 +31,7 @@ def clips(root: Path, **settings) -> RE10KDataModule:
 
 def prepared(data: SceneDataModule, out: Path, **settings) -> Path:
     sources = {split: data.source(split) for split in SPLITS}
-    return prepare(sources, data.prepared_settings(), out, workers=1, progress=False, **settings)
+    return prepare(sources, data.packed_settings(), out, workers=1, progress=False, **settings)
 
 
 def equal(one: SceneBatch, other: SceneBatch) -> bool:
@@ -66,7 +66,7 @@ def tours(tmp_path_factory) -> Path:
 def test_objects_give_the_same_batches(toy_root, packed_objects):
     augmented = {
         "color_jitter": {"brightness": 0.2, "contrast": 0.2, "saturation": 0.2, "hue": 0.05},
-        "mirroring": True,
+        "horizontal_flip": True,
         "box_masks": {"probability": 0.5},
         "references_per_sequence": 3,
     }
@@ -91,7 +91,7 @@ def test_an_evaluation_index_means_frames_also_where_some_were_left_out(tours, t
     for split in ("train", "test"):
         FORMS["text"](root / split, [make_clip(f"{split}{number}", seed=number) for number in range(5)])
     sorted((root / "test/test0").glob("*.jpg"), key=lambda path: int(path.stem))[2].write_bytes(b"")
-    store = prepared(clips(root), tmp_path / "store", most_bad=0.5)
+    store = prepared(clips(root), tmp_path / "store", max_bad_fraction=0.5)
     (tmp_path / "index.json").write_text(json.dumps({"test0": {"context": [0, 5], "target": [1, 3, 4]}}))
     chosen = {"evaluation_index": str(tmp_path / "index.json")}
     (intact,), (packed,) = (list(clips(place, **chosen).test_dataloader()) for place in (tours, store))

@@ -6,11 +6,11 @@ from collections import namedtuple
 from pathlib import Path
 
 import pytest
-from prepared_sequences import ListedSource, contents
+from packed_sequences import ListedSource, contents
 
 from completesplat.data.packed import writing
 from completesplat.data.packed.manifest import read_manifest
-from completesplat.data.packed.source import PreparedSource
+from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import prepare
 from completesplat.data.validation import BadPicture, TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError
@@ -113,7 +113,7 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
     source = ListedSource(NAMES, bad_frames={"s1": [2], "s4": [0, 1, 3]}, bad_sequences=["s6"])
     source.left_out = {"too short": ["a", "b"]}
     source.refused = [DataError("no annotations", "x.json", "s9")]
-    split = read_manifest(make(source, tmp_path / "store", most_bad=0.5)).splits["train"]
+    split = read_manifest(make(source, tmp_path / "store", max_bad_fraction=0.5)).splits["train"]
     assert split.names == ("s0", "s1", "s2", "s3", "s5", "s7")
     assert split.left_out == {"too short": 2}
     found = [(entry.kind, entry.file, entry.sequence, entry.frame) for entry in split.refused]
@@ -124,7 +124,7 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
         (TooFewFrames.kind, None, "s4", None),
         (TooFewFrames.kind, "s6.txt", "s6", None),
     ]
-    assert PreparedSource(tmp_path / "store", "train").read("s1").frames == (10, 13, 19)
+    assert PackedSource(tmp_path / "store", "train").read("s1").frames == (10, 13, 19)
 
 
 def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for(tmp_path: Pat
 def test_what_was_skipped_before_is_raised_if_that_is_asked_for_now(tmp_path: Path) -> None:
     bad = {"s1": [2]}
     with pytest.raises(DataError, match="are bad"):
-        make(ListedSource(NAMES, bad_frames=bad), tmp_path / "store", most_bad=0)
+        make(ListedSource(NAMES, bad_frames=bad), tmp_path / "store", max_bad_fraction=0)
     with pytest.raises(BadPicture):
         make(ListedSource(NAMES, bad_frames=bad), tmp_path / "store", on_bad="raise")
 
@@ -150,15 +150,15 @@ def test_what_was_skipped_before_is_raised_if_that_is_asked_for_now(tmp_path: Pa
 def test_more_than_the_allowed_share_of_bad_input_is_an_error(bad: dict, tmp_path: Path) -> None:
     # 4 of 32 frames, or 1 of 8 sequences.
     with pytest.raises(DataError, match=r"12\.5% of the data are bad"):
-        make(ListedSource(NAMES, **bad), tmp_path / "store", most_bad=0.12)
+        make(ListedSource(NAMES, **bad), tmp_path / "store", max_bad_fraction=0.12)
     assert not (tmp_path / "store" / "manifest.json").exists()
-    make(ListedSource(NAMES, **bad), tmp_path / "store", most_bad=0.13)
+    make(ListedSource(NAMES, **bad), tmp_path / "store", max_bad_fraction=0.13)
     assert (tmp_path / "store" / "manifest.json").exists()
 
 
 def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="not one sequence"):
-        make(ListedSource(NAMES, bad_sequences=NAMES), tmp_path / "store", most_bad=1)
+        make(ListedSource(NAMES, bad_sequences=NAMES), tmp_path / "store", max_bad_fraction=1)
 
 
 def test_sequences_of_one_chunk_stay_together(tmp_path: Path) -> None:

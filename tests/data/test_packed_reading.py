@@ -11,12 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from prepared_sequences import SIZE, ListedSource, make_sequence, smooth_picture
+from packed_sequences import SIZE, ListedSource, make_sequence, smooth_picture
 
-from completesplat.data.packed.manifest import is_prepared, read_manifest, settings_must_match
+from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
 from completesplat.data.packed.rows import EncodedPicture, decode, encode, from_row, to_row
-from completesplat.data.packed.source import PreparedSource
-from completesplat.data.packed.streaming import stream
+from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import (
@@ -66,7 +65,7 @@ def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 
 @pytest.mark.parametrize("codec", ["png", "bmp"])
 @pytest.mark.parametrize("masked", [True, False])
 def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Path) -> None:
-    source: SequenceSource = PreparedSource(make(tmp_path / "store", masked, codec=codec), "train")
+    source: SequenceSource = PackedSource(make(tmp_path / "store", masked, codec=codec), "train")
     assert isinstance(source, SequenceSource)
     assert source.names == NAMES
     assert (source.refused, source.left_out, source.fingerprint()) == ([], {}, "a")
@@ -75,7 +74,7 @@ def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Pat
 
 
 def test_jpeg_keeps_cameras_and_masks_and_changes_colours_by_little(tmp_path: Path) -> None:
-    source = PreparedSource(make(tmp_path / "store", codec="jpeg"), "train")
+    source = PackedSource(make(tmp_path / "store", codec="jpeg"), "train")
     for name in NAMES:
         expected = make_sequence(name)
         assert_same(source.read(name), expected, tolerance=16)
@@ -100,7 +99,7 @@ def test_names_keep_the_order_of_the_source_though_chunks_lie_together(tmp_path:
             return [list(range(0, len(names), 2)), list(range(1, len(names), 2))]
 
     prepare({"val": Interleaved(NAMES)}, {}, tmp_path / "store", sequences_per_shard=4, workers=1, progress=False)
-    source = PreparedSource(tmp_path / "store", "val")
+    source = PackedSource(tmp_path / "store", "val")
     assert [shard.sequences for shard in source.shards] == [tuple(NAMES[::2]), tuple(NAMES[1::2])]
     assert source.names == NAMES
     for name in NAMES:
@@ -108,7 +107,7 @@ def test_names_keep_the_order_of_the_source_though_chunks_lie_together(tmp_path:
 
 
 def test_a_source_travels_to_other_processes_without_the_files_it_has_open(store: Path) -> None:
-    source = PreparedSource(store, "train")
+    source = PackedSource(store, "train")
     source.read("s0")
     small = pickle.dumps(source)
     assert b"datasets" not in small
@@ -117,12 +116,12 @@ def test_a_source_travels_to_other_processes_without_the_files_it_has_open(store
 
 def test_a_split_that_is_not_there_is_named_with_those_that_are(store: Path) -> None:
     with pytest.raises(DataError, match=r"no split test .* there are: train"):
-        PreparedSource(store, "test")
+        PackedSource(store, "test")
 
 
 def test_only_a_complete_store_is_one(store: Path, tmp_path: Path) -> None:
-    assert is_prepared(store)
-    assert not is_prepared(tmp_path)
+    assert is_packed(store)
+    assert not is_packed(tmp_path)
     with pytest.raises(MissingFile):
         read_manifest(tmp_path)
 
@@ -131,14 +130,14 @@ def test_opening_notices_shards_that_are_missing_or_of_another_size(store: Path)
     content = (store / SHARD).read_bytes()
     (store / SHARD).write_bytes(content + b"\0")
     with pytest.raises(ChangedFile, match=SHARD):
-        PreparedSource(store, "train")
+        PackedSource(store, "train")
     (store / SHARD).unlink()
     with pytest.raises(MissingFile, match=SHARD):
-        PreparedSource(store, "train")
+        PackedSource(store, "train")
 
 
 def test_verifying_finds_the_shard_with_a_changed_bit(store: Path) -> None:
-    source = PreparedSource(store, "train")
+    source = PackedSource(store, "train")
     assert source.verify() == []
     content = bytearray((store / SHARD).read_bytes())
     content[len(content) // 2] ^= 1
@@ -146,7 +145,7 @@ def test_verifying_finds_the_shard_with_a_changed_bit(store: Path) -> None:
     assert [error.file for error in source.verify()] == [str(store / SHARD)]
 
 
-def refused_or_same(source: PreparedSource, name: str) -> DataError | None:
+def refused_or_same(source: PackedSource, name: str) -> DataError | None:
     """The refusal, if there is one; fails on anything but the same sequence."""
     try:
         assert_same(source.read(name), make_sequence(name))
@@ -164,7 +163,7 @@ def test_wherever_a_byte_of_a_shard_changes_its_sequences_are_refused_or_the_sam
         # Never in place: pages of an earlier round may still be mapped.
         (store / "damaged").write_bytes(damaged)
         (store / "damaged").replace(store / SHARD)
-        refusals += [refused_or_same(PreparedSource(store, "train"), name) for name in NAMES[:3]]
+        refusals += [refused_or_same(PackedSource(store, "train"), name) for name in NAMES[:3]]
     places = {(error.file, error.sequence) for error in refusals if error}
     assert places == {(str(store / SHARD), name) for name in NAMES[:3]}
     assert None in refusals
@@ -172,7 +171,7 @@ def test_wherever_a_byte_of_a_shard_changes_its_sequences_are_refused_or_the_sam
 
 @pytest.mark.parametrize("content", [b"", b"no arrow file", b"\xff\xff\xff\xff\x10\0\0\0" + b"\7" * 90])
 def test_a_file_that_is_no_arrow_file_is_refused(content: bytes, store: Path) -> None:
-    source = PreparedSource(store, "train")
+    source = PackedSource(store, "train")
     (store / SHARD).write_bytes(content)
     with pytest.raises(UnreadableFile, match=SHARD) as caught:
         source.read("s3")
@@ -180,7 +179,7 @@ def test_a_file_that_is_no_arrow_file_is_refused(content: bytes, store: Path) ->
 
 
 def test_a_shard_with_other_columns_is_refused(store: Path) -> None:
-    source = PreparedSource(store, "train")
+    source = PackedSource(store, "train")
     table = pa.table({"name": ["s3", "s1", "s4"]})
     with pa.ipc.new_stream(str(store / SHARD), table.schema) as writer:
         writer.write_table(table)
@@ -189,7 +188,7 @@ def test_a_shard_with_other_columns_is_refused(store: Path) -> None:
 
 
 def test_a_shard_in_the_place_of_another_is_refused(store: Path) -> None:
-    source = PreparedSource(store, "train")
+    source = PackedSource(store, "train")
     full, last = [(store / shard.file).read_bytes() for shard in source.shards[1:]]
     for content, reason in [(full, "in its place"), (last, "1 sequences, the manifest says 3")]:
         (store / SHARD).unlink()
@@ -309,14 +308,14 @@ def test_a_manifest_that_does_not_fit_is_refused(
     edit(content)
     (store / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(kind, match=r"manifest\.json"):
-        PreparedSource(store, "train")
+        PackedSource(store, "train")
 
 
 def test_a_shard_that_is_a_link_out_of_the_folder_is_refused(store: Path, tmp_path: Path) -> None:
     (store / SHARD).rename(tmp_path / "elsewhere")
     (store / SHARD).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OutsidePath):
-        PreparedSource(store, "train")
+        PackedSource(store, "train")
 
 
 def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> None:
@@ -328,34 +327,13 @@ def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> 
         settings_must_match(manifest, {"image_size": SIZE, "crop": "central"})
 
 
-@pytest.mark.parametrize("seed", [None, 3])
-@pytest.mark.parametrize("world_size", [1, 2, 3])
-def test_ranks_share_the_stream_among_them(world_size: int, seed: int | None, store: Path) -> None:
-    ranks = [list(stream(store, "train", rank, world_size, seed)) for rank in range(world_size)]
-    assert sorted(sequence.name for rank in ranks for sequence in rank) == sorted(NAMES)
-    assert max(map(len, ranks)) - min(map(len, ranks)) <= 2
-    for sequence in ranks[-1]:
-        assert_same(sequence, make_sequence(sequence.name))
-
-
-def test_the_streams_order_follows_from_its_seed(store: Path) -> None:
-    orders = [[sequence.name for sequence in stream(store, "train", shuffle_seed=seed)] for seed in (None, 1, 1, 2)]
-    assert orders[0] == NAMES
-    assert orders[1] == orders[2]
-    assert len({tuple(order) for order in orders}) == 3
-
-
-def test_reading_and_streaming_need_no_network_and_write_nothing_into_the_home_folder(
-    store: Path, tmp_path: Path
-) -> None:
+def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store: Path, tmp_path: Path) -> None:
     code = (
         "import socket; socket.socket.connect = None\n"
         "from pathlib import Path\n"
-        "from completesplat.data.packed.source import PreparedSource\n"
-        "from completesplat.data.packed.streaming import stream\n"
+        "from completesplat.data.packed.source import PackedSource\n"
         f"root = Path({str(store)!r})\n"
-        "PreparedSource(root, 'train').read('s0').read(0)\n"
-        "print(*[sequence.name for sequence in stream(root, 'train', 1, 2, 5)])\n"
+        "print(*PackedSource(root, 'train').read('s0').read(0).image.shape)\n"
     )
     home = tmp_path / "home"
     home.mkdir()
@@ -364,5 +342,5 @@ def test_reading_and_streaming_need_no_network_and_write_nothing_into_the_home_f
         environment.pop(variable, None)
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stderr
-    assert set(result.stdout.split()) < set(NAMES)
+    assert result.stdout.split() == ["3", str(SIZE), str(SIZE)]
     assert list(home.rglob("*")) == []

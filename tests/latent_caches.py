@@ -1,4 +1,4 @@
-"""Encoded stores of tiny rooms, for tests: a small untrained autoreconstructor and clips that are partly broken."""
+"""Latent caches of tiny rooms, for tests: a small untrained autoreconstructor and packed clips."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from realestate10k_trees import make_clip, module, write_tree
 from support import compose_config
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.data.packed.writing import prepare
 from completesplat.data.realestate10k.module import RE10KDataModule
 
 FRAMES = 5
@@ -24,21 +25,29 @@ def small_autoreconstructor(seed: int = 0, latent_channels: int = 4) -> Variatio
     return instantiate(config.autoreconstructor, _convert_="all").eval()
 
 
-def sound_rooms(root: Path, clips: int = 5, form: str = "text") -> Path:
-    """Clips that can be read completely."""
+def sound_rooms(root: Path, clips: int = 5, **settings: object) -> Path:
+    """Packed clips that could be read completely; beside them, in "raw", the files that they were made from."""
     made = [make_clip(f"c{i}", FRAMES) for i in range(clips)]
-    return write_tree(root, form, made, made[:1])
+    return pack(write_tree(root / "raw", "text", made, made[:1]), **settings)
 
 
-def broken_rooms(root: Path, form: str = "text") -> Path:
-    """Nine clips: one picture of c5, all but one of c6 and the cameras of c7 cannot be used."""
+def broken_rooms(root: Path) -> Path:
+    """Nine packed clips without what could not be used: one picture of c5, nearly all of c6 and the cameras of c7."""
     clips = [make_clip(f"c{i}", FRAMES) for i in range(9)]
     clips[5].pictures[1] = b"<html>"
     clips[6].pictures[1:] = [b"<html>"] * (FRAMES - 1)
     clips[7].rows[:, 6:] *= 2
-    return write_tree(root, form, clips, clips[:1])
+    return pack(write_tree(root / "raw", "text", clips, clips[:1]))
+
+
+def pack(raw: Path, **settings: object) -> Path:
+    """The packed store of these clips, beside them."""
+    data = rooms(raw, **settings)
+    sources = {split: data.source(split) for split in ("train", "val", "test")}
+    out = raw.with_name("packed")
+    return prepare(sources, data.packed_settings(), out, workers=1, max_bad_fraction=1.0, progress=False)
 
 
 def rooms(root: Path, **settings: object) -> RE10KDataModule:
     """All clips but one for training, at 16 pixels; as many items as want may be replaced."""
-    return module(root, **{"val_fraction": 0.0, "most_bad": 10.0, "batch_size": 3, **settings})
+    return module(root, **{"val_fraction": 0.0, "max_bad_fraction": 10.0, "batch_size": 3, **settings})
