@@ -61,7 +61,7 @@ def test_encoded_pictures_are_refused(command, toy_root, latent_cache):
         "fit", *SETTINGS, f"data.root={toy_root}", f"data.latent_cache={latent_cache}", "data.color_jitter=null"
     )
     assert refused.status == 2
-    assert re.search(r"^error: data\.encoded is for latent diffusion", refused.err, re.MULTILINE)
+    assert re.search(r"^error: data\.latent_cache is for latent diffusion", refused.err, re.MULTILINE)
 
 
 @pytest.mark.parametrize(("ablation", "layers"), [("full", 2), ("skips_first_two", 2), ("m1", 1)])
