@@ -38,7 +38,7 @@ class HiddenModes(TensorDataclass):
 
 @runtime_checkable
 class HiddenModeScenes(Protocol):
-    """Scenes that are made when asked for."""
+    """Scenes that are made one by one, when they are indexed."""
 
     def __len__(self) -> int: ...
 
@@ -60,8 +60,8 @@ class KnowsHiddenModes(Protocol):
         """All test scenes.
 
         Args:
-            views: at most so many views that show the modes, those that show them best.
-            spread_views: so many targets besides, evenly spread over the sequence.
+            views: the largest number of views that show the modes; those that show them best are taken.
+            spread_views: number of further targets, evenly spread over the sequence.
         """
         ...
 

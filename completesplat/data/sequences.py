@@ -59,7 +59,7 @@ class SequenceSource(Protocol):
     listed: int
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence: its cameras now, its pictures when asked for.
+        """One sequence: its cameras now, its pictures when `PosedSequence.read` is called.
 
         Raises:
             DataError: it cannot be used as a whole.
@@ -73,6 +73,13 @@ class SequenceSource(Protocol):
     def fingerprint(self) -> str:
         """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
         ...
+
+
+def spread_places(count: int, most: int | None) -> list[int]:
+    """At most `most` of `count` places: the middles of equal parts; None: all."""
+    if most is None or most >= count:
+        return list(range(count))
+    return [(2 * part + 1) * count // (2 * most) for part in range(most)]
 
 
 def split_by_hash(names: Sequence[str], fraction: float, seed: int) -> tuple[list[str], list[str]]:

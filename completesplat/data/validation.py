@@ -1,4 +1,4 @@
-"""Refusals of bad input: one class of `DataError` for each kind, and what tells good from bad."""
+"""Refusals of bad input: one class of `DataError` for each kind, and the checks that they come from."""
 
 import json
 import os
@@ -14,7 +14,7 @@ import numpy as np
 from completesplat.errors import DataError
 
 MOST_BYTES = 2**32
-# Beyond this size a gzipped file may be no more than so many times smaller than its content. Deflate gets up to 1032,
+# Beyond this size a gzipped file may be smaller than its content by no more than this factor. Deflate gets up to 1032,
 # annotations stay far below.
 BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**26, 200
 CHUNK = 2**20
@@ -61,7 +61,7 @@ class BadPicture(DataError):
 
 
 class BadPlacement(DataError):
-    """Nothing tells where a sequence's object is and how large."""
+    """Nothing shows where a sequence's object is and how large."""
 
     kind = "object without a place"
 

@@ -21,9 +21,9 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.latent_cache.manifest import (
     Array,
-    Manifest,
+    CachedSequence,
+    LatentCacheManifest,
     Origin,
-    Sequence,
     is_latent_cache,
     write_manifest,
 )
@@ -31,7 +31,7 @@ from completesplat.data.latent_cache.store import ArrayWriter, LatentCache
 from completesplat.data.loading.module import SceneDataModule
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
-from completesplat.data.sequences import SequenceSource
+from completesplat.data.sequences import SequenceSource, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
 
@@ -151,7 +151,7 @@ def encode_training_set(
 
     Args:
         out: folder of the store.
-        frames: at most so many evenly spaced frames of a sequence; None: all.
+        frames: the largest number of frames of a sequence, evenly spaced; None: all.
         precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
             first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
         conditioning: frozen, images -> features, which are stored; None: the pictures are.
@@ -176,10 +176,10 @@ def encode_training_set(
     encode = PictureEncoder(encoder, features, PRECISIONS[precision], torch.device(device))
     blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
-    sequences: list[Sequence] = []
+    sequences: list[CachedSequence] = []
     pictures = _pictures(source, frames, sequences, progress)
     arrays, scale = _write_arrays(out, encode, blank, pictures, batch_size)
-    write_manifest(out, Manifest(__version__, origin, scale, arrays, tuple(sequences)))
+    write_manifest(out, LatentCacheManifest(__version__, origin, scale, arrays, tuple(sequences)))
     return LatentCache(out)
 
 
@@ -191,15 +191,8 @@ class FrameToEncode(NamedTuple):
     number: int
 
 
-def evenly_spaced(count: int, most: int | None) -> list[int]:
-    """At most `most` of `count` places: the middles of equal parts; None: all."""
-    if most is None or most >= count:
-        return list(range(count))
-    return [(2 * part + 1) * count // (2 * most) for part in range(most)]
-
-
 def _pictures(
-    source: PackedSource, frames: int | None, sequences: list[Sequence], progress: bool
+    source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[FrameToEncode]:
     """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of.
 
@@ -209,8 +202,8 @@ def _pictures(
     rows = 0
     for name in track(source.names, "encoding sequences", disable=not progress):
         sequence = source.read(name)
-        places = evenly_spaced(len(sequence.frames), frames)
-        sequences.append(Sequence(name, len(sequence.frames), rows, tuple(places)))
+        places = spread_places(len(sequence.frames), frames)
+        sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))
         rows += len(places)
         for place in places:
             yield FrameToEncode(sequence.read(place).image, name, sequence.frames[place])

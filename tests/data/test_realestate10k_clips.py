@@ -16,7 +16,7 @@ from realestate10k_trees import (
 from completesplat.data.pictures.crop import Square
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import TextClips
-from completesplat.data.realestate10k.module import Framing, RE10KSource, open_clips
+from completesplat.data.realestate10k.module import ClipFraming, RE10KSource, open_clips
 from completesplat.data.validation import BadAnnotation, BadCamera, BadPicture, MissingFile, TooFewFrames
 from completesplat.errors import DataError
 
@@ -143,7 +143,7 @@ def test_pictures_that_are_broken_or_of_another_size_are_refused(tmp_path, form,
     clip.pictures[3] = fault(clip.pictures[3])
     FORMS[form](tmp_path, [clip])
     name = f"clip7/{clip.timestamps[3]}.jpg" if form == "text" else FILE[form]
-    framing = Framing(8, "center", 1.0, 0.7, 10.0)
+    framing = ClipFraming(8, "center", 1.0, 0.7, 10.0)
     sequence = RE10KSource(open_clips(tmp_path), ["clip7"], framing).read("clip7")
     assert sequence.read(2).image.shape == (3, 8, 8)
     with pytest.raises(DataError) as caught:

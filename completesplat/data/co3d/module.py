@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
-from completesplat.data.co3d.source import CO3DSource, Framing
+from completesplat.data.co3d.source import CO3DSource, ObjectFraming
 from completesplat.data.loading.module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, training_views
@@ -63,7 +63,7 @@ class CO3DDataModule(SceneDataModule):
         self.allow_shared_sequences = allow_shared_sequences
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
         self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
-        self.framing = Framing(self.image_size, depth_before, depth_after)
+        self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
         self.evaluation_targets = evaluation_targets
         self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 

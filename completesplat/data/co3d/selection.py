@@ -142,7 +142,7 @@ class Filters:
 
     Attributes:
         min_frames: with fewer in a split, a sequence is left out of it.
-        min_viewpoint_quality, min_point_cloud_quality: CO3D's scores; None: any. Where one is asked for, a sequence
+        min_viewpoint_quality, min_point_cloud_quality: CO3D's scores; None: any. Where one is set, a sequence
             without the score is left out.
         most_training_sequences: those with the best viewpoint quality (DFM takes 500); None: all.
     """

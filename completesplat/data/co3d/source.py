@@ -30,6 +30,18 @@ from completesplat.geometry.cameras import (
 )
 from completesplat.tensors import stack
 
+DEPTH_MAPS = 8
+DEPTH_QUANTILE = 0.99
+FOREGROUND = 128  # of 255
+# Smaller eigenvalues than this (of at most 1) mean that the optical axes are parallel.
+PARALLEL = 1e-4
+UP = 1
+# The object's half size (see `Placement`) after scaling (Splatter Image: 1.2 * 0.95 / 2).
+OBJECT_HALF_SIZE = 0.57
+SMALLEST_NEAR = 0.1
+# Cameras that stay within this share of their distance to the object show nothing but one view of it.
+SMALLEST_BASELINE = 0.01
+
 
 def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> Float[Tensor, "1 size size"]:
     """Depth along the optical axis at the centre of each pixel of the square picture; 0 where it is unknown.
@@ -55,13 +67,6 @@ def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> 
     rows, columns = places
     return factor * depth[rows[:, None], columns][None]
 
-
-DEPTH_MAPS = 8
-DEPTH_QUANTILE = 0.99
-FOREGROUND = 128  # of 255
-# Smaller eigenvalues than this (of at most 1) mean that the optical axes are parallel.
-PARALLEL = 1e-4
-UP = 1
 
 Axes = Float[np.ndarray, "3 3"]
 
@@ -193,15 +198,8 @@ def _placement(points: np.ndarray, axes: Axes, quantile: float, what: str) -> Pl
     return Placement(torch.from_numpy(mean + middle * axes[:, UP]), half_size)
 
 
-# The object's half size (see `Placement`) after scaling (Splatter Image: 1.2 * 0.95 / 2).
-OBJECT_HALF_SIZE = 0.57
-SMALLEST_NEAR = 0.1
-# Cameras that stay within this share of their distance to the object show nothing but one view of it.
-SMALLEST_BASELINE = 0.01
-
-
 @dataclass(frozen=True)
-class Framing:
+class ObjectFraming:
     """How pictures and cameras are made from files.
 
     Attributes:
@@ -218,7 +216,7 @@ class CO3DSource:
     """The sequences of one split; see `SequenceSource`."""
 
     def __init__(
-        self, members: SplitMembers, framing: Framing, files: Sequence[Path], refused: list[DataError]
+        self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]
     ) -> None:
         self.names = sorted(members.frames)
         self.left_out = members.left_out
@@ -246,7 +244,7 @@ class CO3DSource:
         """One sequence; its cameras are made on first use.
 
         Raises:
-            DataError: nothing tells where the object is, or the cameras do not move.
+            DataError: nothing shows where the object is, or the cameras do not move.
         """
         if name not in self._sequences:
             with at(sequence=name):

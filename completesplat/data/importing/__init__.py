@@ -34,8 +34,8 @@ def import_capture(
         transforms: a `transforms.json`; or
         colmap: the folder of a COLMAP model, with `images`, and `masks` if there are any.
         sequence: its name; by default that of the folder the capture lies in.
-        hold_out: of so many frames one goes to validation and test, the others to training. Small captures hold out
-            more often, so that there are two.
+        hold_out: one of every `hold_out` frames goes to validation and test, the others to training. Small captures
+            hold out more often, so that there are two.
         quality: of JPEG files that are written anew.
         most_missing: largest share of the frames of a `transforms.json` that may have no picture; they are left out.
 

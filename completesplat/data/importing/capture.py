@@ -23,6 +23,7 @@ from completesplat.data.validation import BadAnnotation, BadCamera, BadPicture, 
 from completesplat.errors import ImageError
 
 FEWEST_FRAMES = 6
+PNG_BIT_DEPTH = 24  # byte of the file
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,6 @@ def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
 def _natural(name: str) -> list[tuple[int, str]]:
     """Sorts `r_2` before `r_10`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
-
-
-PNG_BIT_DEPTH = 24  # byte of the file
 
 
 class CapturedPicture(NamedTuple):

@@ -27,6 +27,13 @@ ROWS_AT_ONCE = 64
 SMALLEST_SHARE = 0.5
 
 Box = tuple[int, int, int, int]
+SUBSET = "imported"
+# From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
+TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
+# Points further from the median point than this multiple of their median distance are taken for stray: the farthest
+# point gives the scale of the scene.
+FARTHEST = 5.0
+FEWEST_HELD_OUT = 2
 
 
 class Undistortion:
@@ -115,15 +122,6 @@ def _largest_box(seen: Bool[np.ndarray, "height width"]) -> Box:
         left, top = left + (worst == 0), top + (worst == 1)
         right, bottom = right - (worst == 2), bottom - (worst == 3)
     return left, top, right, bottom
-
-
-SUBSET = "imported"
-# From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
-TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
-# Points further from the median point than so many times their median distance are taken for stray: the farthest point
-# gives the scale of the scene.
-FARTHEST = 5.0
-FEWEST_HELD_OUT = 2
 
 
 class Written(NamedTuple):

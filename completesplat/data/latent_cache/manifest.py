@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from completesplat.data.packed.manifest import MANIFEST, Scalar, write_json
+from completesplat.data.packed.manifest import MANIFEST, Scalar, check_format, write_json
 from completesplat.data.validation import (
     BadAnnotation,
     UnreadableFile,
@@ -33,7 +33,7 @@ class Array:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class CachedSequence:
     """The rows of one sequence: from `first` on, one for each of the frames `stored` (places in the sequence)."""
 
     name: str
@@ -52,7 +52,7 @@ class Origin:
         data: fingerprint of the training set.
         settings: of the data module: what pictures and splits depend on.
         image_size: side of the pictures that were encoded.
-        frames: at most so many frames of a sequence, evenly spaced; None: all.
+        frames: the largest number of frames of a sequence, evenly spaced; None: all.
         precision: in which means, log-variances and features are stored.
     """
 
@@ -66,14 +66,14 @@ class Origin:
 
 
 @dataclass(frozen=True)
-class Manifest:
+class LatentCacheManifest:
     """A whole store; `sequences` are those of the training set, in its order; `scale` is 1 / std of a latent."""
 
     version: str
     origin: Origin
     scale: float
     arrays: dict[str, Array]
-    sequences: tuple[Sequence, ...]
+    sequences: tuple[CachedSequence, ...]
 
 
 def is_latent_cache(root: Path) -> bool:
@@ -81,12 +81,12 @@ def is_latent_cache(root: Path) -> bool:
     return (root / MANIFEST).is_file()
 
 
-def write_manifest(root: Path, manifest: Manifest) -> None:
+def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
     """`manifest.json` in the store's folder, there as a whole or not at all."""
     write_json(root / MANIFEST, {"format": FORMAT, "kind": "latent_cache", **asdict(manifest)})
 
 
-def read_manifest(root: Path) -> Manifest:
+def read_manifest(root: Path) -> LatentCacheManifest:
     """The manifest of a store.
 
     Raises:
@@ -97,10 +97,9 @@ def read_manifest(root: Path) -> Manifest:
         content = read_json(path)
         if field(content, "kind", str) != "latent_cache":
             raise UnreadableFile("no latent cache: completesplat data latents makes one")
-        if field(content, "format", int) != FORMAT:
-            raise UnreadableFile(f"format {content['format']}, this version reads {FORMAT}: encode the pictures again")
+        check_format(content, FORMAT, "encode the pictures again")
         arrays = field(content, "arrays", dict)
-        manifest = Manifest(
+        manifest = LatentCacheManifest(
             field(content, "version", str),
             _origin(field(content, "origin", dict)),
             field(content, "scale", float),
@@ -131,15 +130,15 @@ def _array(root: Path, entry: Mapping[str, Any]) -> Array:
     return Array(file, dtype, list_field(entry, "shape", int))
 
 
-def _sequence(entry: object) -> Sequence:
+def _sequence(entry: object) -> CachedSequence:
     frames, stored = field(entry, "frames", int), list_field(entry, "stored", int)
     # Strictly increasing from 0 on and below `frames`.
     if not stored or any(b <= a for a, b in pairwise((-1, *stored, frames))):
         raise BadAnnotation("stored frames must be places in the sequence, in order")
-    return Sequence(field(entry, "name", str), frames, field(entry, "first", int), stored)
+    return CachedSequence(field(entry, "name", str), frames, field(entry, "first", int), stored)
 
 
-def _check(manifest: Manifest) -> None:
+def _check(manifest: LatentCacheManifest) -> None:
     """Refuse what cannot be true of a store, whatever its arrays hold."""
     rows = sum(len(sequence.stored) for sequence in manifest.sequences)
     if any(len(array.shape) != 4 or array.shape[0] != rows for array in manifest.arrays.values()):

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from completesplat.data.latent_cache.manifest import Array, Sequence, is_latent_cache, read_manifest
+from completesplat.data.latent_cache.manifest import Array, CachedSequence, is_latent_cache, read_manifest
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import Scalar, differences
@@ -157,7 +157,7 @@ class LatentCache:
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
-    def _row(self, sequence: Sequence, frame: int) -> int:
+    def _row(self, sequence: CachedSequence, frame: int) -> int:
         place = int(np.searchsorted(sequence.stored, frame))
         if place == len(sequence.stored) or sequence.stored[place] != frame:
             raise DataError("was not encoded", str(self.folder), sequence.name, frame)

@@ -157,7 +157,7 @@ class SceneLoader:
         return {"epoch": self._epoch, "batches": self._batches}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Start the next iteration after so many batches, if it is still that epoch."""
+        """Start the next iteration after the batches of `state`, if it is still that epoch."""
         self._resume = dict(state)
 
     def _account(self, refused: Sequence[DataError], empty: bool) -> None:

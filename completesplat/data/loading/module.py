@@ -24,6 +24,10 @@ from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import CompleteSplatError, DataError
 
+SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
+
+logger = logging.getLogger(__name__)
+
 
 def check_settings(targets: int, mask_threshold: float | None, latent_cache: str | None, changed: bool) -> None:
     """Refuse them; see `SceneDataModule`.
@@ -42,13 +46,8 @@ def check_settings(targets: int, mask_threshold: float | None, latent_cache: str
     if latent_cache == "":
         raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
     if latent_cache is not None and changed:
-        asked = "data.color_jitter=null data.horizontal_flip=false"
-        raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {asked}")
-
-
-SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
-
-logger = logging.getLogger(__name__)
+        unchanged = "data.color_jitter=null data.horizontal_flip=false"
+        raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
 
 class SceneDataModule(LightningDataModule):
@@ -142,7 +141,7 @@ class SceneDataModule(LightningDataModule):
         """Reference and targets of a scene of "val" or "test".
 
         Raises:
-            DataError: the sequence has not got the frames that are asked for.
+            DataError: the sequence lacks one of the frames.
         """
 
     def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
@@ -157,12 +156,12 @@ class SceneDataModule(LightningDataModule):
         """List the sequences (pictures are read later).
 
         Raises:
-            DataError: missing or malformed files, no sequences for this stage, or encodings of other data.
+            DataError: missing or malformed files, no sequences for this stage, or a latent cache of other data.
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
         if stage == "fit" and self.latent_cache is not None:
-            self._training_scenes()  # what is wrong with the encodings is told before training starts
+            self._training_scenes()  # what is wrong with the cache is an error before training starts
 
     def source(self, split: str) -> SequenceSource:
         """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.

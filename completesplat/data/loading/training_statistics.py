@@ -13,6 +13,9 @@ from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
+# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
+SEQUENCES, PICTURES = 400, 8192
+
 
 class TypicalCamera(NamedTuple):
     """Means over the training pictures.
@@ -47,10 +50,6 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
     horizontal, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
     up = torch.linalg.svd(horizontal).Vh[-1]
     return torch.where(down.mean(dim=0) @ up > 0, -up, up)
-
-
-# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
-SEQUENCES, PICTURES = 400, 8192
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:

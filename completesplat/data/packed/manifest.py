@@ -70,7 +70,7 @@ class Split:
 
 
 @dataclass(frozen=True)
-class Manifest:
+class PackedManifest:
     """A whole store; `settings` are what was baked into its pictures and cameras."""
 
     root: Path
@@ -84,7 +84,7 @@ def is_packed(root: Path) -> bool:
     return (root / MANIFEST).is_file()
 
 
-def read_manifest(root: Path) -> Manifest:
+def read_manifest(root: Path) -> PackedManifest:
     """The manifest of a store.
 
     Raises:
@@ -93,13 +93,12 @@ def read_manifest(root: Path) -> Manifest:
     path = root / MANIFEST
     with at(file=path):
         content = read_json(path)
-        if field(content, "format", int) != FORMAT:
-            raise UnreadableFile(f"format {content['format']}, this version reads {FORMAT}: prepare the data again")
+        check_format(content, FORMAT, "prepare the data again")
         splits = field(content, "splits", dict)
         settings = field(content, "settings", dict)
         if not all(value is None or isinstance(value, str | int | float) for value in settings.values()):
             raise BadAnnotation("settings must be plain values")
-        return Manifest(
+        return PackedManifest(
             root,
             field(content, "codec", str),
             settings,
@@ -107,11 +106,23 @@ def read_manifest(root: Path) -> Manifest:
         )
 
 
-def write_manifest(manifest: Manifest) -> None:
+def write_manifest(manifest: PackedManifest) -> None:
     """`manifest.json` in the store's folder, there as a whole or not at all."""
     content = asdict(manifest)
     del content["root"]
     write_json(manifest.root / MANIFEST, {"format": FORMAT, **content})
+
+
+def check_format(content: object, readable: int, remedy: str) -> None:
+    """Refuse a manifest of another version of its format.
+
+    Raises:
+        UnreadableFile: of another version.
+        BadAnnotation: it does not say of which.
+    """
+    found = field(content, "format", int)
+    if found != readable:
+        raise UnreadableFile(f"format {found}, this version reads {readable}: {remedy}")
 
 
 def write_json(path: Path, content: object) -> None:
@@ -124,8 +135,8 @@ def write_json(path: Path, content: object) -> None:
     unfinished.rename(path)
 
 
-def settings_must_match(manifest: Manifest, settings: Mapping[str, Scalar]) -> None:
-    """Refuse a store that was made with other settings than asked for.
+def settings_must_match(manifest: PackedManifest, settings: Mapping[str, Scalar]) -> None:
+    """Refuse a store that was made with other settings than these.
 
     Raises:
         DataError: names every setting that differs.
@@ -138,11 +149,11 @@ def settings_must_match(manifest: Manifest, settings: Mapping[str, Scalar]) -> N
         )
 
 
-def differences(found: Mapping[str, Scalar], asked: Mapping[str, Scalar]) -> str:
+def differences(found: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> str:
     """`image_size=128 (asked for: 64), ...` for all settings that differ."""
     # JSON makes no difference between 1 and 1.0, nor does anything that the settings are used for.
-    keys = [key for key in sorted({*found, *asked}) if found.get(key) != asked.get(key)]
-    return ", ".join(f"{key}={found.get(key)} (asked for: {asked.get(key)})" for key in keys)
+    keys = [key for key in sorted({*found, *wanted}) if found.get(key) != wanted.get(key)]
+    return ", ".join(f"{key}={found.get(key)} (asked for: {wanted.get(key)})" for key in keys)
 
 
 def shard_from_json(root: Path, entry: object) -> Shard:

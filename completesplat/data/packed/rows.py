@@ -18,13 +18,14 @@ from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
 from completesplat.geometry.cameras import Cameras
 
-# What Pillow is told for each codec. BMP is not compressed: more than twice the bytes of PNG, decoded in a ninth of the
+# Arguments of Pillow for each codec. BMP is not compressed: more than twice the bytes of PNG, decoded in a ninth of the
 # time.
 CODECS: dict[str, dict[str, Any]] = {
     "png": {"format": "PNG"},
     "jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
     "bmp": {"format": "BMP"},
 }
+MATRIX, INTRINSICS, RANGE = 16, 9, 2
 
 
 def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
@@ -54,9 +55,6 @@ def decode(content: bytes, channels: int, size: int) -> UInt8[Tensor, "channel s
     if pixels is None or pixels.dtype != np.uint8:
         raise BadPicture(f"is no picture of {size} x {size} pixels with {channels} channels of 8 bits")
     return torch.from_numpy(np.ascontiguousarray(pixels.reshape(size, size, channels).transpose(2, 0, 1)))
-
-
-MATRIX, INTRINSICS, RANGE = 16, 9, 2
 
 
 @cache
@@ -139,7 +137,7 @@ def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[Enco
 
 
 def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
-    """The sequence of a table with one row; pictures are decoded when they are asked for.
+    """The sequence of a table with one row; pictures are decoded when they are read.
 
     Args:
         file: where the row lies, for messages.

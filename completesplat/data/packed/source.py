@@ -1,4 +1,4 @@
-"""Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is asked for."""
+"""Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is read."""
 
 import hashlib
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class PackedSource:
             check_size(root, shard)
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence: its cameras as they were prepared, its pictures decoded when asked for.
+        """One sequence: its cameras as they were prepared, its pictures decoded one by one when they are read.
 
         Raises:
             DataError: its shard is damaged or does not hold it.

@@ -20,7 +20,7 @@ from rich.progress import Progress
 from completesplat.data.packed.manifest import (
     FORMAT,
     MANIFEST,
-    Manifest,
+    PackedManifest,
     Refusal,
     Scalar,
     Split,
@@ -41,13 +41,14 @@ from completesplat.data.packed.shards import (
     start_worker,
     write_in_worker,
 )
-from completesplat.data.sequences import SPLITS, SequenceSource
+from completesplat.data.sequences import SPLITS, SequenceSource, spread_places
 from completesplat.data.validation import field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 
 SEQUENCES, FRAMES = 3, 2
 # Cameras, depth range, number, checksum and two offsets of a frame.
 BYTES_PER_FRAME = 8 * (16 + 9 + 1 + 1 + 1 + 2)
+PLAN = "plan.json"
 
 logger = logging.getLogger(__name__)
 
@@ -60,12 +61,12 @@ def check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
     """
     names = [(plan.split, name) for plan in plans for name in plan.names]
     frames, sizes = [], []
-    for place in _spread(len(names), SEQUENCES):
+    for place in spread_places(len(names), SEQUENCES):
         split, name = names[place]
         # What is bad is refused and counted when the shards are made.
         try:
             sequence = writer.sources[split].read(name)
-            for index in _spread(len(sequence.frames), FRAMES):
+            for index in spread_places(len(sequence.frames), FRAMES):
                 encoded = encode_picture(sequence, index, writer.codec)
                 sizes.append(len(encoded.image) + len(encoded.mask or b""))
             frames.append(len(sequence.frames))
@@ -96,15 +97,6 @@ def require_space(size: int, contents: str, folder: Path, advice: str = "") -> N
     if size > free:
         raise DataError(f"not enough space: {needed}{advice}", str(folder))
     logger.info(needed)
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most so many of `count` numbers, evenly spread: the middles of equal parts."""
-    parts = min(most, count)
-    return [int((part + 0.5) * count / parts) for part in range(parts)]
-
-
-PLAN = "plan.json"
 
 
 def prepare(
@@ -181,8 +173,8 @@ def _claim(out: Path, plan: dict[str, Any]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         write_json(path, plan)
     found = read_json(path)
-    for part, asked in plan.items():
-        differing = differences(field(found, part, dict), asked)
+    for part, wanted in plan.items():
+        differing = differences(field(found, part, dict), wanted)
         if differing:
             raise DataError(f"was made with {differing}: choose another folder, or remove this one", str(out))
 
@@ -227,13 +219,13 @@ def _finish(
         split: _split(source, [record for record in records if record.split == split])
         for split, source in writer.sources.items()
     }
-    manifest = Manifest(writer.folder, writer.codec, dict(settings), splits)
+    manifest = PackedManifest(writer.folder, writer.codec, dict(settings), splits)
     _check_share(manifest, max_bad_fraction)
     write_manifest(manifest)
     _report(manifest)
 
 
-def _check_share(manifest: Manifest, max_bad_fraction: float) -> None:
+def _check_share(manifest: PackedManifest, max_bad_fraction: float) -> None:
     splits, out = manifest.splits.values(), str(manifest.root)
     refused = [refusal for split in splits for refusal in split.refused]
     kept, kinds = sum(len(split.names) for split in splits), _by_kind(refused)
@@ -269,7 +261,7 @@ def _by_kind(refused: Sequence[Refusal]) -> str:
     return ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
 
 
-def _report(manifest: Manifest) -> None:
+def _report(manifest: PackedManifest) -> None:
     splits = manifest.splits.values()
     shards = [shard for split in splits for shard in split.shards]
     sequences, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)

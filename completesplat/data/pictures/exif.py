@@ -1,4 +1,4 @@
-"""What the EXIF record of a photograph tells: which way is up, and the field of view."""
+"""What the EXIF record of a photograph says: which way is up, and the field of view."""
 
 import math
 from collections.abc import Mapping

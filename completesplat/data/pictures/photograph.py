@@ -29,6 +29,7 @@ from completesplat.tensors import TensorDataclass
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
+LANCZOS_REACH = 3
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,6 @@ def _to_srgb(square: Image.Image) -> Image.Image:
     return square.convert("RGB")
 
 
-LANCZOS_REACH = 3
 """Of Lanczos' filter, in pixels of the coarser picture."""
 
 

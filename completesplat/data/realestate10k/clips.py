@@ -33,6 +33,8 @@ from completesplat.geometry.cameras import Cameras
 
 CAMERA_NUMBERS = 18
 FORMATS = ("JPEG", "PNG")
+PICTURES = (".png", ".jpg")
+MOST_BYTES = 2**26  # a frame needs some 300
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,6 @@ def picture_size(source: Path | bytes, file: str) -> tuple[int, int]:
             return image.height, image.width
     except ImageError as error:
         raise BadPicture(str(error), file) from None
-
-
-PICTURES = (".png", ".jpg")
-MOST_BYTES = 2**26  # a frame needs some 300
 
 
 class TextClips:

@@ -36,7 +36,7 @@ Clips = TextClips | ChunkedClips
 
 
 @dataclass(frozen=True)
-class Framing:
+class ClipFraming:
     """How pictures and cameras are made from files.
 
     Attributes:
@@ -69,7 +69,7 @@ def open_clips(folder: Path) -> Clips:
 class RE10KSource:
     """Some clips of one folder; see `SequenceSource`. The clips may be shared by several sources."""
 
-    def __init__(self, clips: Clips, names: list[str], framing: Framing) -> None:
+    def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
         self.names = names
         self.refused: list[DataError] = clips.refused
         self.left_out = {"frames are missing": clips.missing} if clips.missing else {}
@@ -86,7 +86,7 @@ class RE10KSource:
         return self._clips.fingerprint()
 
     def read(self, name: str) -> PosedSequence:
-        """One clip: its cameras now, its pictures when asked for.
+        """One clip: its cameras now, its pictures when `PosedSequence.read` is called.
 
         Raises:
             DataError: it is missing, unreadable or malformed.
@@ -128,8 +128,8 @@ class RE10KDataModule(SceneDataModule):
 
     Args:
         min_gap, max_gap: frames between the reference and a training target, either way (Flash3D: at most 30).
-        evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and so many
-            evenly spaced targets among the next `evaluation_gap` frames.
+        evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and
+            `evaluation_targets` evenly spaced targets among the next `evaluation_gap` frames.
         evaluation_index: a file of test views, instead of that rule: in the format of pixelSplat, MVSplat360,
             latentSplat or Flash3D (`read_index`).
         scene_list: a file with the keys of the clips to test, one a line.
@@ -168,7 +168,7 @@ class RE10KDataModule(SceneDataModule):
         self.evaluation = evaluation_targets, evaluation_gap
         self.evaluation_index = Path(evaluation_index) if evaluation_index else None
         self.scene_list = Path(scene_list) if scene_list else None
-        self.framing = Framing(self.image_size, crop, scale, near, far)
+        self.framing = ClipFraming(self.image_size, crop, scale, near, far)
         self.val_fraction = val_fraction
         self.val_seed = val_seed
         self._test_views: dict[str, Choice] | None = None

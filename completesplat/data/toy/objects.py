@@ -115,7 +115,7 @@ def write_objects(
 
     The bytes depend on `scenes`, `frames`, `size` and `seed` only, not on `workers` (processes; by default one a
     core). The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json`
-    tells the family and the colour of the patch on the back. A folder that holds the same set already is kept.
+    reveals the family and the colour of the patch on the back. A folder that holds the same set already is kept.
 
     Returns:
         The category's folder, `out`/toy_objects.

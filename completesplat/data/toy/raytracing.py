@@ -34,7 +34,7 @@ class Surroundings(NamedTuple):
     """Ground plane at height `ground` (two colours, pattern), dome (palette) and light.
 
     The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase: a law shared by all scenes,
-    so that what lies behind a camera can partly be told from what lies in front of it.
+    so that what lies behind a camera can partly be inferred from what lies in front of it.
     """
 
     ground: float

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from completesplat.data.toy.raytracing import Array, inlined, kernel
+from completesplat.data.toy.raytracing import SELF_INTERSECTION, Array, inlined, kernel
 
 BOX, BALL = 0, 1
 # What the first number of a texture says; the others are its frequency (radians per unit of length) and phase.
 PLAIN, STRIPES, TILES, RIPPLES = 0, 1, 2, 3
 FLOOR, CEILING = 2, 3
 WALLS = (0, 1, 4, 5)
+SHADOW = 0.45
 
 
 class Room(NamedTuple):
@@ -39,10 +40,6 @@ class Room(NamedTuple):
     solid_textures: Array
     light: Array
     ambient: float
-
-
-SELF_INTERSECTION = 1e-6
-SHADOW = 0.45
 
 
 @inlined
