@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
-from completesplat.baselines.projection import project_to_splatter_image
+from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.data.loading.distributed import gathered
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
