@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.baselines.projection import occupied
+from completesplat.baselines.preoptimized import occupied
 from completesplat.errors import CompleteSplatError
 from completesplat.splatter_image import CHANNELS, SplatterImage
 

@@ -6,11 +6,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
 from torch import nn
 
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.results.tables import table
+from completesplat.results.tables import Table, table
 
 COLUMNS = [("part", "part", ""), ("parameters, millions", "millions", ".2f"), ("of these trained", "trained", ".2f")]
 

@@ -210,7 +210,7 @@ def write(config: Any, out: Path) -> None:
             raise CompleteSplatError(f"most.{name}={value}: must be at least 1")
 
     from completesplat.atomic import atomic_path
-    from completesplat.results.page import Limits, page
+    from completesplat.results.html_page import Limits, page
     from completesplat.results.runs import origin
 
     text, warnings = page(Path(config.runs), out, Limits(**limits), origin(out, levels=0))
@@ -224,10 +224,12 @@ def write(config: Any, out: Path) -> None:
 def tables(config: Any, out: Path) -> None:
     """Write `tables.md`, `tables.csv` and `tables.tex`, and print the tables."""
     from completesplat.results.published import tables as made_of
-    from completesplat.results.tables import show_tables, write_tables
+    from completesplat.results.runs import find
+    from completesplat.results.tables import show, write_tables
 
-    made, warnings = made_of(None if config.runs is None else Path(config.runs))
+    tree = None if config.runs is None else find(Path(config.runs))
+    made = made_of(tree)
     write_tables(made, out)
-    show_tables(made)
-    for warning in warnings:
+    show(*made, width=240)
+    for warning in tree.warnings if tree else []:
         logger.warning(warning)

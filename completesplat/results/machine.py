@@ -7,11 +7,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import torch
-
 
 def machine() -> dict[str, Any]:
-    """What a figure is worth nothing without."""
+    """Processor, GPU, versions and date, as JSON can hold them."""
+    import torch
+
     described = {
         "processor": _processor(),
         "cores": os.cpu_count(),

@@ -2,42 +2,29 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-from completesplat.results.rows import Entry, described
-from completesplat.results.runs import Run
+from completesplat.results.runs import Result
+from completesplat.results.scores import MODEL, Entry, described
 from completesplat.results.tables import (
-    GROUPS,
     LEGEND,
     METRICS,
     SSIM_NOTE,
     Cell,
     Heading,
     Notes,
-    Row,
     Table,
+    TableRow,
     marks,
-    metric,
+    score_heading,
 )
 
-ALIKE = (
-    "data_set",
-    "subset",
-    "split",
-    "name",
-    "resolution",
-    "scenes",
-    "skipped",
-    "views",
-    "protocol_views",
-    "crop",
-    "precision",
-    "data_fingerprint",
-    "metrics",
-)
+ALIKE = ["data_set", "subset", "split", "name", "resolution", "scenes", "skipped", "views", "protocol_views", "crop"]
+ALIKE += ["precision", "data_fingerprint", "metrics"]
 """What the protocols of a table's rows have in common."""
-WHICH = ("subset", "split", "resolution", "scenes", "scenes_listed", "skipped")
-SAID = (*WHICH, "views", "protocol_views", "crop", "precision")
+SAID = ["subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "crop"]
+SAID += ["precision"]
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
 IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]
@@ -69,20 +56,18 @@ def _table(name: str, entries: Sequence[Entry]) -> Table:
     protocol, notes = entries[0].run.protocol, Notes()
     kept = _distinct(entries)
     shown = [column for column in COLUMNS if any(_known(entry, column) for entry in kept)]
-    marked = {column: marks([_ranked(entry, column) for entry in kept], column) for column in shown}
+    competing = [entry.own and not entry.upper_bound for entry in kept]
+    marked = {name: marks([entry.value(name) for entry in kept], competing, name) for name in shown}
     rows = []
     for index, entry in enumerate(kept):
-        label = f"{entry.label()} [{notes.number(described(entry.run))}]"
         size = [Cell(str(protocol[key])) for key in ("scenes", "resolution")]
-        cells = [Cell(label), entry.time("inference"), entry.time("rendering"), *size]
-        for column in shown:
-            cell = entry.cell(*_parts(column), notes)
-            cells.append(Cell(cell.text, marked[column][index], cell.value))
-        rows.append(Row("ours" if entry.own else "naive", cells))
-    headings = [*IDENTITY, *(Heading(metric(column), GROUPS[column.rpartition("_")[0]]) for column in shown)]
+        cells = [entry.method(notes), entry.time("inference"), entry.time("rendering"), *size]
+        cells += [replace(entry.cell(name, notes), mark=marked[name][index]) for name in shown]
+        rows.append(TableRow("ours" if entry.own else "naive", cells))
     title = f"{protocol['data_set']}, {protocol.get('name', 'scores')}, {protocol['resolution']} pixels"
     remarks = ["Ours, best in bold and second best underlined; not by the protocol of any published table."]
-    return Table(name, title, headings, rows, [*remarks, protocol_said(protocol), LEGEND], notes)
+    remarks += [protocol_said(protocol), LEGEND]
+    return Table(name, title, [*IDENTITY, *map(score_heading, shown)], rows, remarks, notes)
 
 
 def _distinct(entries: Sequence[Entry]) -> list[Entry]:
@@ -97,22 +82,11 @@ def _distinct(entries: Sequence[Entry]) -> list[Entry]:
     return [*(entry for entry in entries if entry.own), *naive]
 
 
-def _parts(column: str) -> tuple[str, str, str]:
-    region, view, name = column.split("_")
-    return region, view, name
-
-
 def _known(entry: Entry, column: str) -> bool:
     """Whether a column has something to say: a figure, or why there is none."""
-    region, view, name = _parts(column)
+    region, _, name = column.split("_")
     stated = name in (entry.run.protocol.get("missing") or {}) and region in entry.scores
-    return stated or entry.value(region, view, name) is not None
-
-
-def _ranked(entry: Entry, column: str) -> dict[str, Any]:
-    """As the rows of a sweep are ranked: naive predictors and upper bounds do not compete."""
-    seeds = 1 if entry.own else None
-    return {"seeds": seeds, "upper_bound": entry.upper_bound, f"{column}_mean": entry.value(*_parts(column))}
+    return stated or entry.value(column) is not None
 
 
 SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
@@ -120,26 +94,31 @@ SCORES |= {"rejected": "rejected ↓"}
 COUNTS = ("scenes", "samples")
 
 
-def mode_tables(runs: Sequence[Run]) -> list[Table]:
+def mode_tables(runs: Sequence[Result]) -> list[Table]:
     """One for each protocol and number of samples."""
-    groups: dict[str, list[Run]] = {}
+    groups: dict[str, list[Result]] = {}
     for run in runs:
         groups.setdefault(f"{alike(run.protocol)} {run.protocol.get('samples')}", []).append(run)
     return [_modes_table(f"hidden_modes_{index}", groups[key]) for index, key in enumerate(sorted(groups), 1)]
 
 
-def _modes_table(name: str, runs: Sequence[Run]) -> Table:
+def _modes_table(name: str, runs: Sequence[Result]) -> Table:
     notes = Notes()
-    rows, seen = [], []
+    ours: list[TableRow] = []
+    known: list[TableRow] = []
+    seen = []
     for run in runs:
         for method, scores in run.entries.items():
-            label = f"{run.protocol.get('method', 'model')}" if method == "model" else method.replace("_", " ")
-            cells = [_cell(scores, key, notes) for key in SCORES]
-            cells += [Cell(str(scores[key])) if key in scores else _cell(scores, key, notes) for key in COUNTS]
-            if method == "model" or (label, cells) not in seen:  # what is no model is the same in all runs
-                seen.append((label, cells))
-                rows.append(Row("ours" if method == "model" else "known", _noted(label, run, notes) + cells))
-    rows.sort(key=lambda row: row.source != "ours")
+            label = f"{run.protocol.get('method', 'model')}" if method == MODEL else method.replace("_", " ")
+            cells = [_cell(scores, key, ".3f", notes) for key in SCORES] + [
+                _cell(scores, key, "", notes) for key in COUNTS
+            ]
+            if method != MODEL and (label, cells) in seen:  # what is no model is the same in all runs
+                continue
+            seen.append((label, cells))
+            first = Cell(f"{label} [{notes.number(described(run))}]")
+            rows, source = (ours, "ours") if method == MODEL else (known, "known")
+            rows.append(TableRow(source, [first, *cells]))
     headings = [Heading("method", figures=False), *map(Heading, SCORES.values()), *map(Heading, COUNTS)]
     remarks = [
         "Coverage: share of the modes that samples hit. Total variation: of the samples' distribution from the true "
@@ -147,15 +126,11 @@ def _modes_table(name: str, runs: Sequence[Run]) -> Table:
     ]
     protocol = runs[0].protocol
     data = protocol.get("data_set") or f"data {str(protocol.get('data_fingerprint', 'unknown'))[:12]}"
-    return Table(name, f"Hidden modes, {data}", headings, rows, remarks, notes)
+    return Table(name, f"Hidden modes, {data}", headings, [*ours, *known], remarks, notes)
 
 
-def _noted(label: str, run: Run, notes: Notes) -> list[Cell]:
-    return [Cell(f"{label} [{notes.number(described(run))}]")]
-
-
-def _cell(scores: dict, key: str, notes: Notes) -> Cell:
+def _cell(scores: dict[str, Any], key: str, form: str, notes: Notes) -> Cell:
     value = scores.get(key)
     if not isinstance(value, int | float):
         return notes.missing(f"{key.replace('_', ' ')}: the file of results holds none")
-    return Cell(format(value, ".3f"), value=float(value))
+    return Cell(format(value, form), value=float(value) if form else None)

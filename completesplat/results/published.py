@@ -1,16 +1,17 @@
 """The paper's tables, and our runs beside them where they were measured alike."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
+from completesplat.errors import CompleteSplatError
 from completesplat.results.own import alike, mode_tables, own_tables, protocol_said
-from completesplat.results.rows import BEST_OF_K, MODEL, Entry, described, duration, entries, labels, rows
-from completesplat.results.runs import Job, collect, find
+from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
+from completesplat.results.scores import BEST_OF_K, MODEL, Entry, entries, figures, rows, time_cell
 from completesplat.results.tables import (
     ABSENT,
     BEST,
@@ -21,10 +22,8 @@ from completesplat.results.tables import (
     Cell,
     Heading,
     Notes,
-    Row,
     Table,
-    figure,
-    marks,
+    TableRow,
     metric,
 )
 
@@ -34,7 +33,7 @@ METRICS = ("psnr", "lpips", "fid", "kid")
 
 
 @dataclass(frozen=True)
-class Figure:
+class PrintedCell:
     """A cell as printed, with its marks, which are among `MARKS`."""
 
     text: str
@@ -42,8 +41,8 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column: all levels of its heading joined, and what stands in it."""
+class PrintedColumn:
+    """A column as printed: all levels of its heading joined, and what stands in it."""
 
     heading: str
     key: str
@@ -64,26 +63,26 @@ class PublishedTable:
     view: str
     evaluations: list[str]
     """The protocols (`conf/evaluation/`) by which a run of ours is measured as these figures are."""
-    resolution: str
-    """Of all rows; empty where each row states its own."""
-    subset: str
-    """The list of sequences that the figures are taken to be of; empty where there is one list only."""
-    oracle_samples: int | None
-    """Of the row "k-best oracle"; None where there is no such row."""
+    says: list[str]
+    columns: list[PrintedColumn]
+    rows: list[list[PrintedCell]]
     legend: Mapping[str, str]
     """What the marks dagger and star mean here."""
-    says: list[str]
-    columns: list[Column]
-    rows: list[list[Figure]]
-    complete: Mapping[str, str]
+    resolution: str = ""
+    """The resolution of all rows; empty where each row states its own."""
+    subset: str = ""
+    """The list of sequences that the figures are taken to be of; empty where there is one list only."""
+    oracle_samples: int | None = None
+    """The samples of the row "k-best oracle"; None where there is no such row."""
+    complete: Mapping[str, str] = field(default_factory=dict)
     """How many scenes a complete run has, by the number that the paper prints, where they differ."""
-    remarks: list[str]
+    remarks: list[str] = field(default_factory=list)
     """What must be known to compare with it."""
-    options: Mapping[str, str]
+    options: Mapping[str, str] = field(default_factory=dict)
     """Names of our configurations, and the methods that they stand for."""
 
     def data_sets(self) -> list[str]:
-        """Those whose figures the table holds."""
+        """The data sets whose figures the table holds."""
         return list(dict.fromkeys(column.data_set for column in self.columns if column.key in METRICS))
 
 
@@ -97,13 +96,13 @@ def source() -> str:
     return _content()["source"]
 
 
-def parse(cell: str) -> Figure:
+def parse(cell: str) -> PrintedCell:
     """`17.93 best` is the text `17.93` with the mark `best`."""
     words = cell.split()
     marks = set()
     while words and words[-1] in MARKS:
         marks.add(words.pop())
-    return Figure(" ".join(words), frozenset(marks))
+    return PrintedCell(" ".join(words), frozenset(marks))
 
 
 @cache
@@ -113,22 +112,13 @@ def _content() -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _table(entry: dict[str, Any]) -> PublishedTable:
-    given = {key: entry[key] for key in ("name", "place", "label", "title", "region", "view", "evaluations", "says")}
-    columns = [Column(c["heading"], c["key"], c.get("data_set", entry.get("data_set", ""))) for c in entry["columns"]]
-    rows = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
-    return PublishedTable(
-        **given,
-        resolution=entry.get("resolution", ""),
-        subset=entry.get("subset", ""),
-        oracle_samples=entry.get("oracle_samples"),
-        legend={mark: entry[mark] for mark in ("dagger", "star") if mark in entry},
-        columns=columns,
-        rows=rows,
-        complete=entry.get("complete", {}),
-        remarks=entry.get("remarks", []),
-        options=entry.get("options", {}),
-    )
+def _table(entry: Mapping[str, Any]) -> PublishedTable:
+    given = {key: value for key, value in entry.items() if key not in ("data_set", *MARKS)}
+    given["columns"] = [
+        PrintedColumn(**{"data_set": entry.get("data_set", "")} | column) for column in entry["columns"]
+    ]
+    given["rows"] = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
+    return PublishedTable(**given, legend={mark: entry[mark] for mark in MARKS if mark in entry})
 
 
 SIGNS = {"dagger": "†", "star": "★"}
@@ -149,21 +139,24 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     notes = Notes()
     has_speed = any(column.key == "speed" for column in table.columns)
     keys = [key for key in LEADING if key != "speed" or has_speed]
-    figures = [column for column in table.columns if column.key in METRICS]
-    headings = [Heading(LEADING[key], _group(key), key not in IDENTITY) for key in keys]
-    headings += [Heading(column.heading) for column in figures]
-    rows = [Row("paper", _published(table, row, keys)) for row in table.rows]
+    scored = [column for column in table.columns if column.key in METRICS]
+    headings = [Heading(LEADING[key], "time per sequence" if key in COST else "", key not in IDENTITY) for key in keys]
+    headings += [Heading(column.heading) for column in scored]
+    rows = [TableRow("paper", _published(table, row, keys)) for row in table.rows]
     for entry in entries:
         if belongs(table, entry):
             cells = [_own(entry, key, notes) for key in keys]
-            for column in figures:
+            for column in scored:
                 fits = column.data_set == entry.run.protocol["data_set"]
-                cells.append(entry.cell(table.region, table.view, column.key, notes) if fits else Cell(ABSENT))
-            rows.append(Row("ours", cells))
-    marks = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
-    remarks = [f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."]
-    remarks += [*marks, LEGEND, VIEWS, *table.remarks]
+                cells.append(entry.cell(f"{table.region}_{table.view}_{column.key}", notes) if fits else Cell(ABSENT))
+            rows.append(TableRow("ours", cells))
+    signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
+    remarks = [_source(table), *signs, LEGEND, VIEWS, *table.remarks]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
+
+
+def _source(table: PublishedTable) -> str:
+    return f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."
 
 
 def belongs(table: PublishedTable, entry: Entry) -> bool:
@@ -193,38 +186,32 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     )
 
 
-def _size(table: PublishedTable, row: Sequence[Figure]) -> dict[str, str]:
+def _size(table: PublishedTable, row: Sequence[PrintedCell]) -> dict[str, str]:
     """What the paper states of a row's scenes and resolution; empty where it does not."""
     printed = {column.key: cell.text for column, cell in zip(table.columns, row, strict=True)}
     return {"scenes": printed.get("scenes", ""), "resolution": printed.get("resolution", table.resolution)}
 
 
-def _published(table: PublishedTable, row: Sequence[Figure], keys: Sequence[str]) -> list[Cell]:
-    printed: dict[str, Any] = {column.key: cell for column, cell in zip(table.columns, row, strict=True)}
-    sizes = {key: Figure(text or ABSENT, frozenset()) for key, text in _size(table, row).items()}
-    nothing = Figure(ABSENT, frozenset())
-    first = [shown(sizes.get(key) or printed.get(key, nothing)) for key in keys]
-    figures = [cell for column, cell in zip(table.columns, row, strict=True) if column.key in METRICS]
-    return [*first, *map(shown, figures)]
+def _published(table: PublishedTable, row: Sequence[PrintedCell], keys: Sequence[str]) -> list[Cell]:
+    printed = {column.key: shown(cell) for column, cell in zip(table.columns, row, strict=True)}
+    printed |= {key: Cell(text or ABSENT) for key, text in _size(table, row).items()}
+    scored = [shown(cell) for column, cell in zip(table.columns, row, strict=True) if column.key in METRICS]
+    return [*(printed.get(key, Cell(ABSENT)) for key in keys), *scored]
 
 
-def shown(figure: Figure) -> Cell:
-    """A published figure, its marks as signs and as best or second."""
-    signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in figure.marks)
-    mark = next((mark for mark in (BEST, SECOND) if mark in figure.marks), UNMARKED)
-    return Cell((figure.text or BLANK) + signs, mark)
+def shown(printed: PrintedCell) -> Cell:
+    """A published cell, its marks as signs and as best or second."""
+    signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in printed.marks)
+    mark = next((mark for mark in (BEST, SECOND) if mark in printed.marks), UNMARKED)
+    return Cell((printed.text or BLANK) + signs, mark)
 
 
 def _own(entry: Entry, key: str, notes: Notes) -> Cell:
     if key == "method":
-        return Cell(f"{entry.label()} [{notes.number(described(entry.run))}]")
+        return entry.method(notes)
     if key in COST:
         return entry.time(key)
     return Cell(ABSENT if key == "speed" else str(entry.run.protocol[key]))
-
-
-def _group(key: str) -> str:
-    return "time per sequence" if key in COST else ""
 
 
 COLUMNS = [f"full_novel_{name}" for name in ("psnr", "ssim", "lpips", "fid", "kid")]
@@ -237,57 +224,61 @@ APART = (
 def published_ablations(table: PublishedTable) -> Table:
     """The paper's figures alone."""
     headings = [Heading("setting", figures=False), *_headings(table)]
-    body = [Row("paper", [shown(cell) for cell in row]) for row in table.rows]
-    return Table(table.name, f"{table.place}: {table.title}", headings, body, [_said(table), LEGEND])
+    body = [TableRow("paper", [shown(cell) for cell in row]) for row in table.rows]
+    return Table(table.name, f"{table.place}: {table.title}", headings, body, [_source(table), LEGEND])
 
 
-def is_ablation(folder: Path, table: PublishedTable) -> bool:
-    """Whether a sweep's folder holds tested jobs that are rows of the paper's table."""
-    jobs = collect(folder)
-    label = labels(jobs)
-    return any(_option(label(job), table) for job in jobs if job.protocol)
+def sweep_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> list[Table]:
+    """For each protocol by which jobs of a sweep were tested: mean and deviation over seeds beside the paper's rows.
 
-
-def sweep_beside(table: PublishedTable, folder: Path, name: str) -> list[Table]:
-    """For each protocol by which jobs of a sweep were tested: mean and deviation over seeds beside the paper's rows."""
-    jobs = collect(folder)
-    label = labels(jobs)
+    Empty where no tested job is a row of the paper's table.
+    """
+    tested = [job for job in jobs if job.protocol]
+    if not any(_option(job.label, table) for job in tested):
+        return []
     groups: dict[str, list[Job]] = {}
-    for job in jobs:
-        if job.protocol:
-            groups.setdefault(alike(job.protocol), []).append(job)
-    return [_beside(table, rows(group, label), [(label(job), job) for job in group], name) for group in groups.values()]
+    for job in tested:
+        groups.setdefault(alike(job.protocol), []).append(job)
+    return [_ablations_beside(table, group, name) for group in groups.values()]
 
 
-def _beside(
-    table: PublishedTable, found: Sequence[dict[str, Any]], jobs: Sequence[tuple[str, Job]], name: str
-) -> Table:
-    protocol, notes = jobs[0][1].protocol, Notes()
-    printed = {row[0].text: row for row in table.rows}
+def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> Table:
+    protocol, notes = jobs[0].protocol, Notes()
+    printed = {row[0].text: [shown(cell) for cell in row] for row in table.rows}
     order = [*printed, ""]
-    own = sorted(found, key=lambda row: order.index(_option(row["ablation"], table)))
-    marked = {column: marks(own, column) for column in COLUMNS}
-    reasons = protocol.get("missing") or {}
-    body = []
-    for index, row in enumerate(own):
-        published = printed.get(_option(row["ablation"], table), [Figure(ABSENT, frozenset())] * len(table.columns))
-        same = [job for label, job in jobs if label == row["ablation"]]
-        cells = [Cell(row["ablation"]), *map(shown, published), *_identity(row), *_times(same)]
-        for column in COLUMNS:
-            text, metric_key = figure(row, column), column.rpartition("_")[2]
-            reason = f"{metric_key}: {reasons.get(metric_key, 'not measured in all jobs of this row')}"
-            mean = row.get(f"{column}_mean")
-            cells.append(Cell(text, marked[column][index], mean) if text else notes.missing(reason))
-        body.append(Row("naive" if row["seeds"] is None else "ours", cells))
-    body += [_only_published(row, table) for row in table.rows if not _ours(row, own, table)]
-    headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False)]
-    headings += _headings(table)
+    own = sorted(rows(jobs), key=lambda row: order.index(_option(row["ablation"], table)))
+    body = [
+        TableRow("naive" if row["seeds"] is None else "ours", _ablation(row, cells, table, printed, jobs, notes))
+        for row, cells in zip(own, figures(own, COLUMNS), strict=True)
+    ]
+    ours = {_option(row["ablation"], table) for row in own}
+    absent = [Cell(ABSENT)] * (4 + len(COLUMNS))
+    body += [TableRow("paper", [Cell(ABSENT), *row, *absent]) for method, row in printed.items() if method not in ours]
+    headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False), *_headings(table)]
     group = f"ours: {protocol['data_set']}, {protocol['resolution']} pixels"
-    headings += [Heading(text, group) for text in ("seeds", "scenes", "inference", "rendering")]
-    headings += [Heading(metric(column), group) for column in COLUMNS]
-    remarks = [_said(table), f"Ours: {name}, mean ± sample deviation over seeds. {protocol_said(protocol)}"]
+    headings += [Heading(text, group) for text in ("seeds", "scenes", *COST, *map(metric, COLUMNS))]
+    remarks = [_source(table), f"Ours: {name}, mean ± sample deviation over seeds. {protocol_said(protocol)}"]
     title = f"{table.place}: ablations beside ours on {protocol['data_set']}"
     return Table(f"ablations_{name}", title, headings, body, [*remarks, APART, LEGEND], notes)
+
+
+def _ablation(
+    row: dict[str, Any],
+    scores: Sequence[Cell],
+    table: PublishedTable,
+    printed: Mapping[str, list[Cell]],
+    jobs: Sequence[Job],
+    notes: Notes,
+) -> list[Cell]:
+    label, reasons = row["ablation"], jobs[0].protocol.get("missing") or {}
+    published = printed.get(_option(label, table), [Cell(ABSENT)] * len(table.columns))
+    counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
+    cells = [Cell(label), *published, *counts, *_times([job for job in jobs if job.label == label])]
+    for column, cell in zip(COLUMNS, scores, strict=True):
+        name = column.rpartition("_")[2]
+        reason = f"{name}: {reasons.get(name, 'not measured in all jobs of this row')}"
+        cells.append(cell if cell.text else notes.missing(reason))
+    return cells
 
 
 def _option(label: str, table: PublishedTable) -> str:
@@ -295,62 +286,43 @@ def _option(label: str, table: PublishedTable) -> str:
     return next((table.options[part] for part in label.split(", ") if part in table.options), "")
 
 
-def _ours(row: Sequence[Figure], own: Iterable[dict[str, Any]], table: PublishedTable) -> bool:
-    return any(_option(other["ablation"], table) == row[0].text for other in own)
-
-
-def _only_published(row: Sequence[Figure], table: PublishedTable) -> Row:
-    empty = [Cell(ABSENT)] * (4 + len(COLUMNS))
-    return Row("paper", [Cell(ABSENT), *map(shown, row), *empty])
-
-
 def _headings(table: PublishedTable) -> list[Heading]:
-    """Of the published figures."""
+    """The headings of the published figures."""
     return [Heading(column.heading, "published") for column in table.columns[1:]]
 
 
-def _said(table: PublishedTable) -> str:
-    return f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."
-
-
-def _identity(row: dict[str, Any]) -> list[Cell]:
-    return [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
-
-
 def _times(jobs: Sequence[Job]) -> list[Cell]:
-    """Of one sequence, mean over jobs."""
+    """The times of one sequence, mean over jobs."""
     found = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs]
-    cells = []
-    for part in ("inference", "rendering"):
-        seconds = [entry[part] for entry in found if entry.get(part) is not None]
-        mean = sum(seconds) / len(seconds) if seconds else None
-        cells.append(Cell(ABSENT) if mean is None else Cell(duration(mean), value=mean))
-    return cells
+    measured = [[entry[part] for entry in found if entry.get(part) is not None] for part in COST]
+    return [time_cell(sum(seconds) / len(seconds) if seconds else None) for seconds in measured]
 
 
-def tables(folder: Path | None) -> tuple[list[Table], list[str]]:
-    """The published tables with the runs below a folder, and warnings about files that were left out.
+def tables(tree: RunTree | None) -> list[Table]:
+    """The published tables with the runs that were found below a folder; the published figures alone for None.
 
     A run stands below published rows only if it was measured like them, else in a table of its own protocol. The jobs
-    of a sweep over ablations stand in the ablation tables alone. Without a folder: the published figures.
+    of a sweep over ablations stand in the ablation tables alone.
 
     Raises:
-        CompleteSplatError: there is no such folder, or no results in it.
+        CompleteSplatError: there are no results.
     """
-    if folder is None:
-        return [beside(table, []) if not table.options else published_ablations(table) for table in published()], []
-    found = find(folder)
-    (ablations,) = (table for table in published() if table.options)
-    sweeps = [sweep for sweep in found.sweeps if is_ablation(sweep, ablations)]
-    inside = {str(sweep.relative_to(folder)) for sweep in sweeps}
-    single = entries([run for run in found.scores if str(Path(run.name).parent) not in inside])
+    if tree is None:
+        return [published_ablations(table) if table.options else beside(table, []) for table in published()]
+    if not (tree.scores or tree.modes or tree.warnings):
+        raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
+    sweeps = {folder: collect(folder) for folder in tree.sweeps}
     made: list[Table] = []
+    (ablations,) = (table for table in published() if table.options)
+    compared = {
+        folder: sweep_beside(ablations, jobs, str(folder.relative_to(tree.folder))) for folder, jobs in sweeps.items()
+    }
+    single = entries([run for run in tree.scores if not compared.get(run.folder.parent)])
     for table in published():
         if table.options:
-            compared = [t for sweep in sweeps for t in sweep_beside(table, sweep, str(sweep.relative_to(folder)))]
-            made += compared or [published_ablations(table)]
+            made += [one for found in compared.values() for one in found] or [published_ablations(table)]
         else:
             made.append(beside(table, single))
-    placed = [entry for entry in single if any(belongs(table, entry) for table in published() if not table.options)]
-    elsewhere = [entry for entry in single if not any(entry is other for other in placed)]
-    return [*made, *own_tables(elsewhere), *mode_tables(found.modes)], found.warnings
+    placed = [table for table in published() if not table.options]
+    elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
+    return [*made, *own_tables(elsewhere), *mode_tables(tree.modes)]

@@ -1,11 +1,11 @@
-"""What lies in the folders of runs: their results, the jobs of sweeps, predictions."""
+"""What lies in the folders of runs: results of tests, the jobs of sweeps, predictions."""
 
 import json
 import os
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -16,47 +16,155 @@ from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
 
-
-def planned(folder: Path) -> list[list[str]]:
-    """The overrides of all jobs by number, of which hydra's sweeper makes the product.
-
-    They come from the `multirun.yaml` that hydra leaves in the folder when a sweep starts. Empty where there is none,
-    or where it takes more than that file to know the jobs: `glob(...)` depends on the files of the configuration.
-    """
-    path = folder / "multirun.yaml"
-    if not path.is_file():
-        return []
-    given = OmegaConf.to_container(OmegaConf.load(path).hydra.overrides.task)
-    assert isinstance(given, list)
-    overrides = OverridesParser.create().parse_overrides(given)
-    if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
-        return []
-    choices = {override.get_key_element(): _choices(override) for override in overrides}
-    return [list(job) for job in product(*choices.values())]
-
-
-def _choices(override: Override) -> list[str]:
-    key = override.get_key_element()
-    if override.is_discrete_sweep():
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
-    return [f"{key}={override.get_value_element_as_str()}"]
-
-
+SCORES, MODES = "metrics.json", "hidden_modes.json"
+RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
+ROWS = ("samplers.json", "controls.json", "depth.json")
+"""What `completesplat report NAME` leaves beside its figure: settings and rows."""
 PROTOCOL = "protocol"
 """Where results say how they were measured, beside the entries of the predictors."""
+NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
+"""What a protocol must say, by the name of the file of results."""
+REGIONS = ("full", "object")
+HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file.
+
+    Raises:
+        ValueError: there is no such file, it is not JSON, or it holds something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ValueError(f"{path.name} is missing beside it") from None
+    except (OSError, ValueError) as error:
+        raise ValueError(f"it cannot be read as JSON ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise ValueError("it holds no mapping")
+    return content
+
+
+def mapping_or_empty(path: Path) -> dict[str, Any]:
+    """The mapping in a JSON file; an empty one where it cannot be read, as when its writer was killed."""
+    try:
+        return read_mapping(path)
+    except ValueError:
+        return {}
+
+
+@dataclass(frozen=True)
+class Result:
+    """One file of results: its folder, the folder's name, how it was measured, and its entries by predictor."""
+
+    folder: Path
+    name: str
+    protocol: dict[str, Any]
+    entries: dict[str, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class RunTree:
+    """What one walk finds below a folder, in the order of names, and a line for each file that cannot be used."""
+
+    folder: Path
+    runs: list[Path] = field(default_factory=list)
+    predictions: list[Path] = field(default_factory=list)
+    sweeps: list[Path] = field(default_factory=list)
+    scores: list[Result] = field(default_factory=list)
+    modes: list[Result] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def find(folder: Path) -> RunTree:
+    """Search a folder and all below it, hidden folders apart.
+
+    Raises:
+        CompleteSplatError: there is no such folder.
+    """
+    if not folder.is_dir():
+        raise CompleteSplatError(f"runs={folder}: no such folder")
+    found, results = RunTree(folder), []
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        path, files = Path(place), set(names)
+        if SCENE in files:
+            found.predictions.append(path)
+        elif files & {RECORD, PLAN, SCORES, MODES, *ROWS}:
+            found.runs.append(path)
+        if PLAN in files:
+            found.sweeps.append(path)
+        results += [path / name for name in (SCORES, MODES) if name in files]
+    for path in sorted(results):
+        try:
+            (found.scores if path.name == SCORES else found.modes).append(_result(path, folder))
+        except ValueError as error:
+            found.warnings.append(f"{path}: left out, {error}")
+    return found
+
+
+def _result(path: Path, root: Path) -> Result:
+    """Raises ValueError with the reason if the file is not what it should be."""
+    content = read_mapping(path)
+    if path.name == MODES:
+        protocol, entries = read_mapping(path.with_name("protocol.json")), content
+    else:
+        test = content if PROTOCOL in content else content.get("test")
+        if not isinstance(test, dict) or PROTOCOL not in test:
+            raise ValueError(f"it does not say how it was measured; {HOW}")
+        protocol, entries = test[PROTOCOL], test
+        if content.get("upper_bound") and isinstance(test.get("model"), dict):  # which a fit says of its model
+            entries = test | {"model": test["model"] | {"upper_bound": True}}
+    if not isinstance(protocol, dict):
+        raise ValueError("its protocol is no mapping")
+    if lacking := [key for key in NEEDED[path.name] if key not in protocol]:
+        raise ValueError(f"its protocol does not say {', '.join(lacking)}")
+    scored = {key: entry for key, entry in entries.items() if key != PROTOCOL and isinstance(entry, dict)}
+    if not scored or not all(map(_is_entry, scored.values())):
+        raise ValueError("it holds no scores by predictor")
+    return Result(path.parent, str(path.parent.relative_to(root)), protocol, scored)
+
+
+def _is_entry(entry: dict[str, Any]) -> bool:
+    """Whether regions hold views, and views hold metrics, as far as there are any."""
+    views = [entry.get(region, {}) for region in REGIONS]
+    parts = [part for view in views if isinstance(view, dict) for part in view.values()]
+    return all(isinstance(part, dict) for part in [*views, *parts, entry.get("seconds") or {}])
+
+
+def origin(path: Path, levels: int = 1) -> dict[str, str]:
+    """Command, date and commit of what lies in a folder, as its `run.json` or that of one of `levels` parents says."""
+    for place in [path, *path.parents[:levels]]:
+        record = mapping_or_empty(place / RECORD)
+        if record:
+            command = record.get("command")
+            return {
+                "command": typed(command) if isinstance(command, list) else "",
+                "started": str(record.get("started") or ""),
+                "commit": str(record.get("commit") or ""),
+            }
+    return {"command": "", "started": "", "commit": ""}
+
+
+def typed(command: Sequence[Any]) -> str:
+    """A command as it could be typed; its first part is the program and its verb."""
+    program, *arguments = map(str, command) if command else [""]
+    return " ".join([program, *map(shlex.quote, arguments)])
 
 
 @dataclass(frozen=True)
 class Job:
-    """One job, named after its folder, without a name if it has not started; `metrics` is None until it is done."""
+    """A job of a sweep. One that has not started has no name, one that is not done has no `metrics`."""
 
     name: str
+    """That of the job's folder."""
     overrides: dict[str, str] = field(default_factory=dict)
-    """Those of `pairs`."""
     config: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
     """The job's `run.json`."""
     metrics: dict[str, Any] | None = None
+    label: str = ""
+    """What the job is called among those of its sweep."""
 
     @property
     def test(self) -> dict[str, Any]:
@@ -73,22 +181,49 @@ class Job:
         return (self.metrics or {}).get("test", {})
 
 
+SEED = "seed"
+
+
 def collect(folder: Path) -> list[Job]:
-    """All jobs of a sweep's folder, those without a folder of their own, which have not started, at the end."""
+    """All jobs of a sweep's folder; those without a folder of their own, which have not started, at the end."""
     folders = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    found = [_read_job(path) for path in sorted(folders, key=_natural)]
-    told = [job for job in found if job.record]
-    known = [job.overrides for job in told]
-    waiting = [Job("", overrides) for overrides in map(pairs, planned(folder)) if overrides not in known]
-    # A job that ended before it could say what it was is one of those that the plan misses.
+    found = [_job(path) for path in sorted(folders, key=_natural)]
+    recorded = [job for job in found if job.record]
+    known = [job.overrides for job in recorded]
+    waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
+    # A job that ended before it could write its record is one of those that the plan misses.
     silent = [job for job in found if not job.record][len(waiting) :]
-    return [*told, *silent, *waiting]
+    return _labelled([*recorded, *silent, *waiting])
 
 
-def pairs(overrides: Sequence[str]) -> dict[str, str]:
+def planned(folder: Path) -> list[list[str]]:
+    """The overrides of all jobs by number, of which hydra's sweeper makes the product.
+
+    They come from the `multirun.yaml` that hydra leaves in the folder when a sweep starts. Empty where there is none,
+    or where it takes more than that file to know the jobs: `glob(...)` depends on the files of the configuration.
+    """
+    if not (folder / PLAN).is_file():
+        return []
+    given = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
+    assert isinstance(given, list)
+    overrides = OverridesParser.create().parse_overrides(given)
+    if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
+        return []
+    choices = {override.get_key_element(): _choices(override) for override in overrides}
+    return [list(job) for job in product(*choices.values())]
+
+
+def _choices(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if override.is_discrete_sweep():
+        return [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return [f"{key}={override.get_value_element_as_str()}"]
+
+
+def _pairs(overrides: Sequence[str]) -> dict[str, str]:
     """`["ablation=full", "+a.b=1"]` as `{"ablation": "full", "a.b": "1"}`.
 
-    Without what says only where a job goes and that it may go on from there: `out=DIR` and `ckpt_path=last`.
+    Without those that only say where a job goes and that it may go on from there: `out=DIR` and `ckpt_path=last`.
     """
     split = (override.lstrip("+").partition("=") for override in overrides)
     return {key: value for key, _, value in split if key != "out" and (key, value) != ("ckpt_path", "last")}
@@ -99,191 +234,32 @@ def _natural(path: Path) -> list[str | int]:
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
 
-def _read_job(folder: Path) -> Job:
-    record = _read_json(folder / "run.json")
-    if record is None:
+def _job(folder: Path) -> Job:
+    record = mapping_or_empty(folder / RECORD)
+    if not record:
         return Job(folder.name)
-    config = OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
     assert isinstance(config, dict)
     named = {str(key): value for key, value in config.items()}
-    return Job(folder.name, pairs(record["overrides"]), named, record, _read_json(folder / "metrics.json"))
+    return Job(folder.name, _pairs(record["overrides"]), named, record, mapping_or_empty(folder / SCORES) or None)
 
 
-def _read_json(path: Path) -> dict[str, Any] | None:
-    """None where there is no such file or only part of one: a job that was killed may leave the latter."""
-    try:
-        return json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
-        return None
+def _labelled(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs, named by the overrides that are not equal in all of them, the seed apart.
 
-
-SCORES, MODES = "metrics.json", "hidden_modes.json"
-NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
-"""Of a protocol, by name of the file."""
-REGIONS = ("full", "object")
-HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
-
-
-@dataclass(frozen=True)
-class Run:
-    """One file of results: where it lies below the folder, how it was measured, and its entries by predictor."""
-
-    name: str
-    protocol: dict[str, Any]
-    entries: dict[str, dict[str, Any]]
-
-
-@dataclass(frozen=True)
-class Found:
-    """All results below a folder, and a line for each file that could not be used."""
-
-    scores: list[Run] = field(default_factory=list)
-    modes: list[Run] = field(default_factory=list)
-    sweeps: list[Path] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-
-
-def find(folder: Path) -> Found:
-    """Search a folder and all below it.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or no results in it.
+    The choice of a config group is named by its value alone (`no_skips`), any other setting as `key=value`. A job that
+    differs in nothing bears the name of its experiment, or `all`.
     """
-    if not folder.is_dir():
-        raise CompleteSplatError(f"runs={folder}: no such folder")
-    found = Found(sweeps=sorted(path.parent for path in folder.rglob("multirun.yaml")))
-    paths = sorted([*folder.rglob(SCORES), *folder.rglob(MODES)])
-    if not paths:
-        raise CompleteSplatError(f"runs={folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    for path in paths:
-        try:
-            name = str(path.parent.relative_to(folder))
-            (found.scores if path.name == SCORES else found.modes).append(_read(path, name))
-        except ValueError as error:
-            found.warnings.append(f"{path}: left out, {error}")
-    return found
-
-
-def _read(path: Path, name: str) -> Run:
-    """Raises ValueError with the reason if the file is not what it should be."""
-    content = _object(path)
-    if path.name == MODES:
-        protocol, entries = _object(path.with_name("protocol.json")), content
-    else:
-        test = content if PROTOCOL in content else content.get("test")
-        if not isinstance(test, dict) or PROTOCOL not in test:
-            raise ValueError(f"it does not say how it was measured; {HOW}")
-        protocol, entries = test[PROTOCOL], test
-        if content.get("upper_bound") and isinstance(test.get("model"), dict):  # which a fit says of its model
-            entries = test | {"model": test["model"] | {"upper_bound": True}}
-    if not isinstance(protocol, dict):
-        raise ValueError("its protocol is no mapping")
-    if lacking := [key for key in NEEDED[path.name] if key not in protocol]:
-        raise ValueError(f"its protocol does not say {', '.join(lacking)}")
-    scored = {key: entry for key, entry in entries.items() if key != PROTOCOL and isinstance(entry, dict)}
-    if not scored or not all(map(_is_entry, scored.values())):
-        raise ValueError("it holds no scores by predictor")
-    return Run(name, protocol, scored)
-
-
-def _is_entry(entry: dict[str, Any]) -> bool:
-    """Whether regions hold views, and views hold metrics, as far as there are any."""
-    views = [entry.get(region, {}) for region in REGIONS]
-    parts = [part for view in views if isinstance(view, dict) for part in view.values()]
-    return all(isinstance(part, dict) for part in [*views, *parts, entry.get("seconds") or {}])
-
-
-def _object(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path.name} is missing beside it") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"it cannot be read as JSON ({' '.join(str(error).split())})") from None
-    if not isinstance(content, dict):
-        raise ValueError("it holds no mapping")
-    return content
-
-
-SCENE, RECORD, CONFIG = "scene.json", "run.json", "config.yaml"
-ROWS = ("samplers.json", "controls.json", "depth.json")
-"""What `completesplat report NAME` leaves beside its figure: settings and rows."""
-FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}
-"""Subfolders of a run, and the pictures in each."""
-SKIPPED = {"checkpoints", "weights", "images", "masks", "depths"}
-"""Folders without anything to show that may hold very much."""
-
-
-@dataclass(frozen=True)
-class Folder:
-    """One run: its name below the searched folder, and the figures that lie in it, by subfolder."""
-
-    path: Path
-    name: str
-    figures: dict[str, list[Path]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Folders:
-    """All that a page shows, in the order of the folders' names."""
-
-    runs: list[Folder]
-    predictions: list[Folder]
-
-
-def find_folders(folder: Path, out: Path) -> Folders:
-    """Search a folder and all below it, except where the page goes.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or nothing to show in it.
-    """
-    if not folder.is_dir():
-        raise CompleteSplatError(f"runs={folder}: no such folder")
-    found = Folders([], [])
-    for place, folders, files in os.walk(folder):
-        folders[:] = sorted(name for name in folders if name not in SKIPPED and not name.startswith("."))
-        path = Path(place)
-        if path.resolve() == out.resolve():
-            continue
-        name = folder.resolve().name if path == folder else path.relative_to(folder).as_posix()
-        if SCENE in files:
-            found.predictions.append(Folder(path, name))
-        elif RECORD in files or "multirun.yaml" in files or {*ROWS, "metrics.json", "hidden_modes.json"} & {*files}:
-            figures = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
-            run = Folder(path, name, {part: paths for part, paths in figures.items() if paths})
-            if run.figures or {*ROWS, "metrics.json", "hidden_modes.json"} & {*files}:
-                found.runs.append(run)
-    if not found.runs and not found.predictions:
-        raise CompleteSplatError(
-            f"runs={folder}: nothing to show in it or below it; `completesplat fit`, `test`, `predict` and `report` "
-            "write what a page is made of"
-        )
-    return found
-
-
-def origin(path: Path, levels: int = 1) -> dict[str, str]:
-    """Command, date and commit of what lies in a folder, as far as it or its parents (`levels` of them) say."""
-    for place in [path, *path.parents[:levels]]:
-        record = read_object(place / RECORD)
-        if record:
-            command = record.get("command")
-            return {
-                "command": _command(command) if isinstance(command, list) else "",
-                "started": str(record.get("started") or ""),
-                "commit": str(record.get("commit") or ""),
-            }
-    return {"command": "", "started": "", "commit": ""}
-
-
-def read_object(path: Path) -> dict[str, Any]:
-    """A file of JSON with an object in it; an empty one where there is none."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}
-
-
-def _command(parts: Sequence[Any]) -> str:
-    """As it could be typed: the first part is the program and its verb."""
-    return " ".join([str(part) for part in parts[:1]] + [shlex.quote(str(part)) for part in parts[1:]])
+    described = [job.overrides for job in jobs if job.overrides]
+    keys = dict.fromkeys(key for overrides in described for key in overrides if key != SEED)
+    differing = [key for key in keys if len({overrides.get(key) for overrides in described}) > 1]
+    # A group fills a mapping of the configuration, or acts on all of it and leaves nothing under its own name.
+    settings = {key for job in jobs for key, value in job.config.items() if not isinstance(value, dict)}
+    named = []
+    for job in jobs:
+        parts = []
+        for key in (key for key in differing if key in job.overrides):
+            bare = "." not in key and "@" not in key and key not in settings
+            parts.append(job.overrides[key] if bare else f"{key}={job.overrides[key]}")
+        named.append(replace(job, label=", ".join(parts) or job.overrides.get("experiment", "all")))
+    return named

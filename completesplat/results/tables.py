@@ -1,107 +1,70 @@
-"""Tables of figures from several sources, and how they are written: Markdown, LaTeX, CSV, on the terminal."""
+"""The one type of table, and its writers: Markdown, LaTeX, CSV and the terminal."""
 
 import csv
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from itertools import groupby, pairwise
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table as TerminalTable
-from rich.text import Text
-
 from completesplat.atomic import atomic_path
 
-Column = tuple[str, str, str]  # heading, key of the row, format
-
-
-def table(title: str, columns: Sequence[Column], rows: Iterable[dict[str, Any]]) -> TerminalTable:
-    """One line for each row; what a row lacks stays empty."""
-    shown = TerminalTable(title=title, title_justify="left")
-    for heading, _, form in columns:
-        shown.add_column(heading, justify="right" if form else "left", no_wrap=True)
-    for row in rows:
-        values = [(row.get(key), form) for _, key, form in columns]
-        shown.add_row(*("" if value is None else format(value, form) for value, form in values))
-    return shown
-
-
-ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
-WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
+FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
+LOWER_IS_BETTER = {"lpips", "fid", "kid", "swd"}
 GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
     "full_reference": "reference view",
 }
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
-FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
-LOWER_IS_BETTER = {"lpips", "fid", "kid", "swd"}
 SSIM_NOTE = (
     "SSIM: mean over all pixels, the picture mirrored at its border (skimage leaves 5 pixels out on every side)."
 )
 """For tables with SSIM: the border is 37 % of the pixels of a picture of 48 x 48, 15 % of one of 128 x 128."""
+
 BEST, SECOND, UNMARKED = "best", "second", ""
-
-
-def columns(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """The metrics to show."""
-    return [*ALWAYS, *(name for name in WHERE_MEASURED if any(row.get(f"{name}_mean") is not None for row in rows))]
-
-
-def group(column: str) -> str:
-    """Which pixels of which views."""
-    return GROUPS[column.rpartition("_")[0]]
-
-
-def metric(column: str) -> str:
-    """The metric's name with the direction that is better."""
-    name = column.rpartition("_")[2]
-    return f"{METRICS[name]} {'↓' if name in LOWER_IS_BETTER else '↑'}"
-
-
-def figure(row: dict[str, Any], column: str) -> str:
-    """`21.34 ± 0.12`; without a deviation where there is one seed only, empty where nothing was measured."""
-    mean, deviation = row.get(f"{column}_mean"), row.get(f"{column}_deviation")
-    form = FORMATS[column.rpartition("_")[2]]
-    if mean is None:
-        return ""
-    return format(mean, form) if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
-
-
-def marks(rows: Sequence[dict[str, Any]], column: str) -> list[str]:
-    """For each row, whether its mean is the best, the second best, or unmarked.
-
-    Means are compared as they are written, so that rows which look equal share a mark. Rows without seeds, the naive
-    predictors, and upper bounds do not compete.
-    """
-    name = column.rpartition("_")[2]
-    sign = 1 if name in LOWER_IS_BETTER else -1
-    competing = [row["seeds"] is not None and not row["upper_bound"] for row in rows]
-    means = [row.get(f"{column}_mean") if competes else None for row, competes in zip(rows, competing, strict=True)]
-    written = [None if mean is None else sign * float(format(mean, FORMATS[name])) for mean in means]
-    ranked = sorted({value for value in written if value is not None and value == value})  # not-a-number is no rank
-    given = dict(zip(ranked, (BEST, SECOND), strict=False))
-    return [UNMARKED if value is None else given.get(value, UNMARKED) for value in written]
-
-
+MARKED_MARKDOWN = {BEST: "**{}**", SECOND: "<ins>{}</ins>", UNMARKED: "{}"}
 MARKED_LATEX = {BEST: r"\textbf{%s}", SECOND: r"\underline{%s}", UNMARKED: "%s"}
+MARKED_TERMINAL = {BEST: "bold", SECOND: "underline", UNMARKED: ""}
 ESCAPES = str.maketrans(
     {character: f"\\{character}" for character in "&%$#_{}"}
     | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
-    | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
+    | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$", "★": r"$\star$"}
 )
-MARKED_MARKDOWN = {BEST: "**{}**", SECOND: "<ins>{}</ins>", UNMARKED: "{}"}
-
-
-def escape(text: str) -> str:
-    """Text as LaTeX prints it literally."""
-    return text.translate(ESCAPES)
-
-
-ABSENT = "-"
-BLANK = "(blank)"
+ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
+
+
+def metric(name: str) -> str:
+    """A heading for `psnr` or `full_novel_psnr`: the metric with the direction that is better."""
+    name = name.rpartition("_")[2]
+    return f"{METRICS[name]} {'↓' if name in LOWER_IS_BETTER else '↑'}"
+
+
+def score_heading(name: str) -> "Heading":
+    """For a score named `REGION_VIEW_METRIC`, below the heading of its region and view."""
+    return Heading(metric(name), GROUPS[name.rpartition("_")[0]])
+
+
+def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
+    """For each score whether it is the best, the second best, or unmarked.
+
+    Scores are compared as they are written, so that those which look equal share a mark.
+
+    Args:
+        values: the scores; None for one that was not measured.
+        competing: whether each may be marked. Naive predictors and upper bounds may not.
+        name: of the metric, or `REGION_VIEW_METRIC`.
+    """
+    name = name.rpartition("_")[2]
+    sign = 1 if name in LOWER_IS_BETTER else -1
+    written = [
+        sign * float(format(value, FORMATS[name])) if competes and value is not None else None
+        for value, competes in zip(values, competing, strict=True)
+    ]
+    ranked = sorted({value for value in written if value is not None and value == value})  # not-a-number is no rank
+    given = dict(zip(ranked, (BEST, SECOND), strict=False))
+    return [UNMARKED if value is None else given.get(value, UNMARKED) for value in written]
 
 
 @dataclass(frozen=True)
@@ -114,7 +77,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """Rows of different sources, such as the paper and a run, are kept apart by a rule."""
 
     source: str
@@ -123,12 +86,16 @@ class Row:
 
 @dataclass(frozen=True)
 class Heading:
-    """Of a column; the columns of a group share the heading above."""
+    """The heading of a column; the columns of a group share the heading above."""
 
     text: str
     group: str = ""
     figures: bool = True
     """Whether the column is aligned to the right."""
+
+    def joined(self, separator: str = ": ") -> str:
+        """Group and text in one."""
+        return separator.join(part for part in (self.group, self.text) if part)
 
 
 class Notes:
@@ -138,7 +105,7 @@ class Notes:
         self.texts: list[str] = []
 
     def number(self, text: str) -> int:
-        """The same for the same text."""
+        """The number of a text, equal for equal texts."""
         if text not in self.texts:
             self.texts.append(text)
         return self.texts.index(text) + 1
@@ -150,29 +117,148 @@ class Notes:
 
 @dataclass(frozen=True)
 class Table:
-    """All that is shown of one table; no cell is empty."""
+    """All that is shown of one table. Rich prints it as it is."""
 
     name: str
     title: str
     headings: list[Heading]
-    rows: list[Row]
-    remarks: list[str]
+    rows: list[TableRow]
+    remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
+    gaps: bool = False
+    """Whether cells may be empty."""
 
     def __post_init__(self) -> None:
-        """Refuse a row that does not fit the headings, and an empty cell."""
+        """Refuse a row that does not fit the headings, and an empty cell unless there may be gaps."""
         for row in self.rows:
-            if len(row.cells) != len(self.headings) or not all(cell.text for cell in row.cells):
+            complete = self.gaps or all(cell.text for cell in row.cells)
+            if len(row.cells) != len(self.headings) or not complete:
                 raise ValueError(f"{self.name}: {[cell.text for cell in row.cells]} in {len(self.headings)} columns")
+
+    def groups(self) -> list[tuple[str, int]]:
+        """The headings above those of the columns, and how many columns each spans; empty where there are none."""
+        spans = [(name, len(list(members))) for name, members in groupby(heading.group for heading in self.headings)]
+        return spans if any(name for name, _ in spans) else []
+
+    def ruled_rows(self) -> list[tuple[TableRow, bool]]:
+        """The rows, each with whether a rule keeps it apart from the next one."""
+        apart = [row.source != following.source for row, following in pairwise(self.rows)]
+        return list(zip(self.rows, [*apart, False], strict=False))
 
     def below(self) -> list[str]:
         """Remarks, and the notes with their numbers."""
         return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
 
+    def __rich__(self) -> Any:
+        from rich.table import Table as Shown
+        from rich.text import Text
 
-def texts(cells: Sequence[str]) -> list[Cell]:
-    """Cells without marks."""
-    return [Cell(text) for text in cells]
+        shown = Shown(title=self.title, title_justify="left")
+        for heading in self.headings:
+            shown.add_column(heading.joined("\n"), justify="right" if heading.figures else "left", overflow="fold")
+        for row, ruled in self.ruled_rows():
+            shown.add_row(*(Text(cell.text, MARKED_TERMINAL[cell.mark]) for cell in row.cells), end_section=ruled)
+        return shown
+
+
+Column = tuple[str, str, str]  # heading, key of the record, format
+
+
+def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any]]) -> Table:
+    """One row for each record; what a record lacks stays empty."""
+    rows = []
+    for record in records:
+        values = [(record.get(key), form) for _, key, form in columns]
+        rows.append(TableRow("", [Cell("" if value is None else format(value, form)) for value, form in values]))
+    return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows, gaps=True)
+
+
+def by_name(entry: dict[str, Any]) -> dict[str, float]:
+    """The scores of a predictor's entry in `Evaluation.results`, by `REGION_VIEW_METRIC`."""
+    views = {
+        f"{region}_{view}": x for region, part in entry.items() if isinstance(part, dict) for view, x in part.items()
+    }
+    # The seconds of a sequence hold figures, not metrics by view.
+    return {
+        f"{name}_{metric}": value
+        for name, metrics in views.items()
+        if isinstance(metrics, dict)
+        for metric, value in metrics.items()
+    }
+
+
+LABELS = {"full": "all\npixels", "object": "object\npixels"}
+ALWAYS = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
+WHERE_MEASURED = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
+
+
+def evaluation_table(results: dict[str, Any]) -> Table:
+    """One row for each predictor of `Evaluation.results`, PSNR in dB."""
+    records = [{"predictor": predictor} | by_name(entry) for predictor, entry in results.items()]
+    columns = [("predictor", "predictor", "")]
+    for name in [*ALWAYS, *(name for name in WHERE_MEASURED if name in records[0])]:
+        region, view, kind = name.split("_")
+        columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
+    first = next(iter(results.values()))
+    shown = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
+    return replace(shown, remarks=[SSIM_NOTE])
+
+
+def show(*tables: Table, width: int = 120) -> None:
+    """Print tables with what stands below them, `width` characters wide where the output is no terminal."""
+    from rich.console import Console
+
+    console = Console(width=None if Console().is_terminal else width, markup=False, highlight=False)
+    for index, shown in enumerate(tables):
+        if index:
+            console.print()
+        console.print(shown)
+        for line in shown.below():
+            console.print(line)
+
+
+def escape(text: str) -> str:
+    """Text as LaTeX prints it literally."""
+    return text.translate(ESCAPES)
+
+
+def markdown_lines(table: Table) -> list[str]:
+    """The table alone."""
+    cells = [
+        [MARKED_MARKDOWN[cell.mark].format(cell.text.replace("|", r"\|")) for cell in row.cells] for row in table.rows
+    ]
+    rule = ["---:" if heading.figures else "---" for heading in table.headings]
+    return [f"| {' | '.join(line)} |" for line in [[heading.joined() for heading in table.headings], rule, *cells]]
+
+
+def as_markdown(table: Table) -> str:
+    """A heading, the table, and a list of remarks and notes."""
+    below = [f"- {line}" for line in table.below()]
+    return "\n".join([f"## {table.title}", "", *markdown_lines(table), "", *below, ""])
+
+
+def latex_lines(table: Table) -> list[str]:
+    """The `tabular` alone, with booktabs' rules."""
+    columns = "".join("r" if heading.figures else "l" for heading in table.headings)
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    if groups := table.groups():
+        above = (rf"\multicolumn{{{count}}}{{c}}{{{escape(name)}}}" for name, count in groups)
+        lines.append(rf"{' & '.join(above)} \\")
+    lines += [rf"{' & '.join(escape(heading.text) for heading in table.headings)} \\", r"\midrule"]
+    for row, ruled in table.ruled_rows():
+        lines.append(" & ".join(MARKED_LATEX[cell.mark] % escape(cell.text) for cell in row.cells) + r" \\")
+        if ruled:
+            lines.append(r"\midrule")
+    return [*lines, r"\bottomrule", r"\end{tabular}"]
+
+
+def as_latex(table: Table) -> str:
+    """A `table*`, shrunk to the text's width (`graphicx`), with remarks and notes below."""
+    top = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering", rf"\caption{{{escape(table.title)}}}"]
+    *lines, end = latex_lines(table)
+    below = [rf"{escape(line)}\par" for line in table.below()]
+    shrunk = [r"\resizebox{\textwidth}{!}{%", *lines, f"{end}}}", r"\par\smallskip\footnotesize\raggedright"]
+    return "\n".join([*top, *shrunk, *below, r"\end{table*}", ""])
 
 
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
@@ -180,121 +266,27 @@ CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "ma
 
 def write_tables(tables: Sequence[Table], out: Path) -> None:
     """Write `tables.md`, `tables.tex` and `tables.csv`, the last with a line for each cell."""
-    texts = {"md": "\n".join(map(as_markdown, tables)), "tex": "\n".join(map(as_latex, tables))}
-    for suffix, text in texts.items():
-        with atomic_path(out / f"tables.{suffix}") as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    with atomic_path(out / "tables.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(CSV_COLUMNS)
-        for table in tables:
-            writer.writerows(_csv_lines(table))
+    write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
+    write_text(out / "tables.tex", "\n".join(map(as_latex, tables)))
+    write_csv(out / "tables.csv", CSV_COLUMNS, (line for table in tables for line in _csv_lines(table)))
 
 
-def show_tables(tables: Sequence[Table]) -> None:
-    """Print all tables with what stands below them."""
-    from rich.console import Console
-    from rich.table import Table as Shown
-
-    # No markup: a label may hold brackets. Without a terminal, wide enough for all columns.
-    console = Console(width=None if Console().is_terminal else 240, markup=False, highlight=False)
-    styles = {"best": "bold", "second": "underline"}
-    for table in tables:
-        shown = Shown(title=table.title, title_justify="left")
-        for heading in table.headings:
-            text = "\n".join(part for part in (heading.group, heading.text) if part)
-            shown.add_column(text, justify="right" if heading.figures else "left", overflow="fold")
-        for row, following in zip(table.rows, [*table.rows[1:], None], strict=True):
-            ends = following is not None and following.source != row.source
-            shown.add_row(*(_styled(cell, styles.get(cell.mark, "")) for cell in row.cells), end_section=ends)
-        console.print(shown)
-        for line in table.below():
-            console.print(line)
-        console.print()
-
-
-def as_markdown(table: Table) -> str:
-    """A heading, the table, and a list of remarks and notes."""
-    names = [": ".join(part for part in (heading.group, heading.text) if part) for heading in table.headings]
-    lines = [_line(names), _line(["---:" if heading.figures else "---" for heading in table.headings])]
-    lines += [_line([MARKED_MARKDOWN[cell.mark].format(_piped(cell)) for cell in row.cells]) for row in table.rows]
-    below = [f"- {line}" for line in table.below()]
-    return "\n".join([f"## {table.title}", "", *lines, "", *below, ""])
-
-
-def as_latex(table: Table) -> str:
-    """A `table*` with booktabs' rules, shrunk to the text's width (`graphicx`), and remarks and notes below."""
-    columns = "".join("r" if heading.figures else "l" for heading in table.headings)
-    lines = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering", rf"\caption{{{_tex(table.title)}}}"]
-    lines += [r"\resizebox{\textwidth}{!}{%", rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
-    if any(heading.group for heading in table.headings):
-        groups = [(name, len(list(members))) for name, members in groupby(h.group for h in table.headings)]
-        lines.append(" & ".join(rf"\multicolumn{{{count}}}{{c}}{{{_tex(name)}}}" for name, count in groups) + r" \\")
-    lines += [" & ".join(_tex(heading.text) for heading in table.headings) + r" \\", r"\midrule"]
-    for row, following in pairwise([*table.rows, None]):
-        assert row is not None
-        lines.append(" & ".join(MARKED_LATEX[cell.mark] % _tex(cell.text) for cell in row.cells) + r" \\")
-        if following is not None and following.source != row.source:
-            lines.append(r"\midrule")
-    below = [rf"{_tex(line)}\par" for line in table.below()]
-    ends = [r"\bottomrule", r"\end{tabular}}", r"\par\smallskip\footnotesize\raggedright"]
-    return "\n".join([*lines, *ends, *below, r"\end{table*}", ""])
-
-
-def _tex(text: str) -> str:
-    return escape(text).replace("†", r"$\dagger$").replace("★", r"$\star$")
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _piped(cell: Cell) -> str:
-    return cell.text.replace("|", r"\|")
-
-
-def _styled(cell: Cell, style: str) -> Text:
-    return Text(cell.text, style=style)
-
-
-def _csv_lines(table: Table) -> list[list[str]]:
-    lines = []
+def _csv_lines(table: Table) -> Iterator[list[Any]]:
     for row in table.rows:
         for heading, cell in zip(table.headings, row.cells, strict=True):
-            value = "" if cell.value is None else repr(cell.value)
             place = [table.name, table.title, row.source, row.cells[0].text, heading.group, heading.text]
-            lines.append([*place, cell.text, cell.mark, value])
-    return lines
+            yield [*place, cell.text, cell.mark, cell.value]
 
 
-COLUMNS = [
-    (region, view, metric)
-    for region in ("full", "object")
-    for view in ("novel", "reference")
-    for metric in ("psnr", "ssim")
-]
-MEASURED_IF_POSSIBLE = ("lpips", "fid", "kid", "swd")
-SHORT_FORMATS = {"psnr": ".2f", "fid": ".1f", "kid": ".4f", "swd": ".1f"}
-LABELS = {"full": "all\npixels", "object": "object\npixels", "psnr": "PSNR", "ssim": "SSIM"}
+def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV file; None is an empty field, a number has all its digits."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(lines)
 
 
-def evaluation_table(results: dict[str, Any]) -> TerminalTable:
-    """One row for each predictor of `Evaluation.results`, PSNR in dB."""
-    first = next(iter(results.values()))
-    table = TerminalTable(title=f"{first['scenes']} scenes, {first['views']} novel views", caption=SSIM_NOTE)
-    table.add_column("predictor", no_wrap=True)
-    more = [("full", "novel", metric) for metric in MEASURED_IF_POSSIBLE if metric in first["full"]["novel"]]
-    for region, view, metric in [*COLUMNS, *more]:
-        label = LABELS.get(metric, metric.upper())
-        table.add_column(f"{LABELS[region]}\n{view}\n{label}", justify="right", no_wrap=True)
-    for predictor, scores in results.items():
-        cells = [(metric, scores[region][view].get(metric)) for region, view, metric in [*COLUMNS, *more]]
-        table.add_row(
-            predictor, *("" if x is None else format(x, SHORT_FORMATS.get(metric, ".3f")) for metric, x in cells)
-        )
-    return table
-
-
-def show(table: TerminalTable) -> None:
-    """Print a table, in full width where the output is no terminal."""
-    Console(width=None if Console().is_terminal else 120).print(table)
+def write_text(path: Path, text: str) -> None:
+    """Write a file of text whole or not at all."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

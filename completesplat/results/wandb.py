@@ -15,9 +15,10 @@ from torch import Tensor
 from completesplat.export.pictures import color_depth, enlarge, surface_depth, to_bytes
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
-from completesplat.metrics.evaluation import BEST, MODEL, REGIONS, Evaluation, Scores
+from completesplat.metrics.evaluation import BEST, MODEL, Evaluation, Scores
 from completesplat.results.published import tables
-from completesplat.results.tables import Table
+from completesplat.results.runs import find
+from completesplat.results.tables import Table, by_name
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.sample_pictures import evenly_spaced
@@ -28,7 +29,7 @@ READABLE_SIDE = 128
 
 
 class SceneTable:
-    """Rows of the first scenes that a test scores in this process, of which the module must tell it (`add`).
+    """Rows of the first scenes that a test scores in this process, each given to `add`.
 
     Pictures are rows of views: the reference's, then targets, evenly spread. Depth and turntable are of the first
     sample; the turntables are also `folder/00.mp4` and so on.
@@ -139,7 +140,8 @@ def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Traine
         return
     media = {} if scenes is None else scenes.media()
     media |= {"test/predictors": predictor_table(flat)}
-    media |= {f"report/{table.name}": as_wandb(table) for table in tables(out)[0] if holds_ours(table)}
+    ours = [table for table in tables(find(out)) if any(row.source == "ours" for row in table.rows)]
+    media |= {f"report/{table.name}": as_wandb(table) for table in ours}
     for run in runs:
         run.log_metrics(media, step=trainer.global_step)
 
@@ -157,16 +159,6 @@ def log_modes(results: Mapping[str, Mapping[str, float]], figure: Path, config: 
         run.log_metrics({"hidden_modes": wandb.Image(str(figure))}, step=0)
 
 
-def by_name(scores: dict[str, Any]) -> dict[str, float]:
-    """A predictor's results by `region_view_metric`."""
-    return {
-        f"{region}_{view}_{metric}": value
-        for region in REGIONS
-        for view, metrics in scores[region].items()
-        for metric, value in metrics.items()
-    }
-
-
 def predictor_table(flat: dict[str, dict[str, float]]) -> Any:
     """A row for each predictor; what was not measured for one stays empty."""
     import wandb
@@ -176,17 +168,10 @@ def predictor_table(flat: dict[str, dict[str, float]]) -> Any:
     return wandb.Table(columns=["predictor", *columns], data=rows)
 
 
-def holds_ours(table: Table) -> bool:
-    """Whether there is more in it than what is published."""
-    return any(row.source == "ours" for row in table.rows)
-
-
 def as_wandb(table: Table) -> Any:
     """A table of a report with its texts, and in its last rows what stands below it."""
     import wandb
 
-    columns: list[str | int] = [
-        ": ".join(part for part in (heading.group, heading.text) if part) for heading in table.headings
-    ]
+    columns: list[str | int] = [heading.joined() for heading in table.headings]
     rows = [[cell.text for cell in row.cells] for row in table.rows]
     return wandb.Table(columns, [*rows, *([line] + [""] * (len(columns) - 1) for line in table.below())])

@@ -68,7 +68,9 @@ class PreoptimizedVAE(Preoptimized):
         trainer: Any = self.trainer
         data = trainer.datamodule
         if data.latent_cache is not None:
-            raise CompleteSplatError("data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null")
+            raise CompleteSplatError(
+                "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
+            )
         terms = {name: term.weight for name, term in self.loss.terms.items()}
         settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
         stores = [data.store("val"), data.store("train")]

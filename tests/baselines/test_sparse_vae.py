@@ -7,7 +7,7 @@ import torch
 
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.baselines.projection import occupied, project_to_splatter_image
+from completesplat.baselines.preoptimized import occupied, project_to_splatter_image
 from completesplat.baselines.sparse_vae import SparseVAE
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians

@@ -1,12 +1,14 @@
-"""Which run stands in which table, and what its cells say."""
+"""Which run stands in which of the paper's tables or in one of our own, and what its cells say."""
 
 import json
+from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.results.published import tables
-from completesplat.results.rows import duration
+from completesplat.results.runs import find
 from completesplat.results.tables import SSIM_NOTE, Table
 
 HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
@@ -16,14 +18,18 @@ PAPERS = ["full_images", "realestate10k", "ablations", "objects_only"]
 
 
 def made(runs) -> dict[str, Table]:
-    return {table.name: table for table in tables(runs)[0]}
+    return {table.name: table for table in tables(find(runs))}
+
+
+def texts(table: Table) -> list[dict[str, str]]:
+    """The rows by heading."""
+    names = [heading.joined(" ") for heading in table.headings]
+    return [dict(zip(names, (cell.text for cell in row.cells), strict=True)) for row in table.rows]
 
 
 def ours(table: Table) -> list[dict[str, str]]:
     """The rows that are not the paper's, by heading."""
-    names = [f"{heading.group} {heading.text}".strip() for heading in table.headings]
-    rows = [row for row in table.rows if row.source != "paper"]
-    return [dict(zip(names, (cell.text for cell in row.cells), strict=True)) for row in rows]
+    return [row for row, found in zip(texts(table), table.rows, strict=True) if found.source != "paper"]
 
 
 def entry(psnr: float) -> dict:
@@ -31,8 +37,8 @@ def entry(psnr: float) -> dict:
 
 
 def test_without_runs_there_are_the_published_tables_alone() -> None:
-    found, warnings = tables(None)
-    assert ([table.name for table in found], warnings) == (PAPERS, [])
+    found = tables(None)
+    assert [table.name for table in found] == PAPERS
     assert not any(ours(table) for table in found)
 
 
@@ -181,18 +187,19 @@ def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, sa
     run("good", 20.0)
     (runs / "bad").mkdir()
     (runs / "bad/metrics.json").write_text(content)
-    found, (warning,) = tables(runs)
+    tree = find(runs)
+    (warning,) = tree.warnings
     assert warning.startswith(f"{runs / 'bad/metrics.json'}: left out, ")
     assert said in warning
     assert "\n" not in warning
-    assert len(found) == len(PAPERS) + 1
+    assert len(tables(tree)) == len(PAPERS) + 1
 
 
 def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
     with pytest.raises(CompleteSplatError, match="completesplat test"):
-        tables(runs)
+        tables(find(runs))
     with pytest.raises(CompleteSplatError, match="no such folder"):
-        tables(runs / "nowhere")
+        find(runs / "nowhere")
 
 
 def test_hidden_modes_have_a_table_of_their_own(runs) -> None:
@@ -215,11 +222,64 @@ def test_hidden_modes_have_a_table_of_their_own(runs) -> None:
 def test_hidden_modes_without_a_protocol_are_left_out(runs, run) -> None:
     run("good", 20.0)
     (runs / "good/hidden_modes.json").write_text('{"model": {"coverage": 1}}')
-    assert "protocol.json is missing beside it" in tables(runs)[1][0]
+    assert "protocol.json is missing beside it" in find(runs).warnings[0]
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.0157, "15.7 ms"), (2.7, "2.7 sec"), (54, "54.0 sec"), (246, "4.1 min")]
-)
-def test_times_are_written_as_in_the_paper(seconds, text) -> None:
-    assert duration(seconds) == text
+SWEPT = {"data_set": "toy_objects", "resolution": 32, "scenes": 9, "missing": {"lpips": "missing: no weights"}}
+
+
+@pytest.fixture
+def job(runs: Path):
+    """Writes a finished job of the sweep `runs/sweep`."""
+
+    def write(ablation: str, seed: int, psnr: float, **protocol) -> None:
+        folder = runs / f"sweep/ablation={ablation},seed={seed}"
+        folder.mkdir(parents=True)
+        OmegaConf.save(OmegaConf.create({"seed": seed}), folder / "config.yaml")
+        record = {
+            "command": ["completesplat fit"],
+            "commit": "c",
+            "overrides": [f"ablation={ablation}", f"seed={seed}"],
+        }
+        (folder / "run.json").write_text(json.dumps(record))
+        seconds = {"inference": 2.0 + seed, "rendering": 0.5}
+        model = {"scenes": 9, "views": 9, "seconds": seconds, "full": {"novel": {"psnr": psnr, "ssim": 0.5}}}
+        mean_image = {"scenes": 9, "views": 9, "full": {"novel": {"psnr": 10.0}}}
+        test = {"protocol": SWEPT | protocol, "model": model, "mean_image": mean_image}
+        (folder / "metrics.json").write_text(json.dumps({"steps": 5, "test": test}))
+        OmegaConf.save(OmegaConf.create({"hydra": {"overrides": {"task": []}}}), runs / "sweep/multirun.yaml")
+
+    return write
+
+
+def test_a_sweep_stands_beside_the_papers_rows_in_columns_of_its_own(runs, job) -> None:
+    for seed in (0, 1):
+        job("full", seed, 20.0 + seed)
+        job("no_skips", seed, 15.0)
+    found = made(runs)
+    assert list(found) == ["full_images", "realestate10k", "ablations_sweep", "objects_only"]  # and no table of jobs
+    table = found["ablations_sweep"]
+    lines = {row["published row of the paper"]: row for row in texts(table) if row["setting"] != "mean_image"}
+    assert len(lines) == 9
+    full = lines["Our AutoReconstructor"]
+    assert (full["published PSNR ↑"], full["published LPIPS ↓"]) == ("17.59", "0.471")
+    own = "ours: toy_objects, 32 pixels"
+    assert (full[f"{own} PSNR ↑"], full[f"{own} seeds"], full[f"{own} scenes"]) == ("20.50 ± 0.71", "2", "9")
+    assert (full[f"{own} inference"], full[f"{own} rendering"]) == ("2.5 sec", "500.0 ms")
+    assert lines["No skip connections"][f"{own} PSNR ↑"] == "15.00 ± 0.00"
+    assert lines["No SSIM"][f"{own} PSNR ↑"] == "-"
+    number = full[f"{own} LPIPS ↓"].removeprefix("missing: note ")
+    assert f"[{number}] lpips: missing: no weights" in table.below()
+
+
+def test_jobs_tested_by_different_protocols_do_not_share_a_table(runs, job) -> None:
+    job("full", 0, 20.0)
+    job("no_skips", 0, 15.0, resolution=64)
+    assert [table.name for table in tables(find(runs))].count("ablations_sweep") == 2
+
+
+def test_a_sweep_without_ablations_is_a_number_of_runs(runs, job) -> None:
+    job("nothing_of_the_paper", 0, 20.0)
+    job("nothing_of_the_paper", 1, 21.0)
+    names = [table.name for table in tables(find(runs))]
+    assert names == ["full_images", "realestate10k", "ablations", "objects_only", "own_1"]

@@ -58,6 +58,11 @@ def described(pairs: dict[str, str]) -> Html:
     return element("dl", *parts)
 
 
+def left_out(text: str) -> Html:
+    """A line on what is not shown."""
+    return element("p", text, class_="left-out")
+
+
 WIDEST = 1600
 """Pixels; wider pictures are made smaller."""
 MOST_PIXELS = 50_000_000
@@ -66,8 +71,8 @@ AS_THEY_ARE = 300_000
 QUALITY = 85
 
 
-class Room:
-    """Room for pictures in one page.
+class ByteBudget:
+    """The bytes that pictures may take in one page.
 
     Args:
         megabytes: how much it holds; data URIs take four characters for three bytes.
@@ -85,15 +90,15 @@ class Room:
         return uri
 
 
-def picture(path: Path, caption: str, room: Room) -> Html:
+def picture(path: Path, caption: str, budget: ByteBudget) -> Html:
     """A figure with its caption, which is also what is read out; or why it is not shown."""
     try:
         data, kind, width, height = _encoded(path)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
-        return element("p", f"{caption}: cannot be shown ({' '.join(str(error).split())})", class_="left-out")
-    uri = room.uri(data, kind)
+        return left_out(f"{caption}: cannot be shown ({' '.join(str(error).split())})")
+    uri = budget.uri(data, kind)
     if uri is None:
-        return element("p", f"{caption}: left out, the page is full", class_="left-out")
+        return left_out(f"{caption}: left out, the page is full")
     image = element("img", src=uri, alt=caption, width=width, height=height, loading="lazy")
     return element("figure", scrollable(caption, image), element("figcaption", caption), class_="picture")
 
@@ -160,7 +165,7 @@ def strip(video: Path, count: int) -> tuple[Image.Image, int]:
     return joined, len(frames)
 
 
-def turntable(video: Path, image: str, sample: str, count: int, room: Room) -> Html:
+def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudget) -> Html:
     """A figure of one sample; without scripts the strip can be scrolled. Or why it is not shown.
 
     Args:
@@ -168,16 +173,15 @@ def turntable(video: Path, image: str, sample: str, count: int, room: Room) -> H
         image: the photograph's name.
         sample: the sample's.
         count: of the frames.
-        room: that is left in the page.
+        budget: bytes that are left in the page.
     """
     try:
         joined, frames = strip(video, count)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
-        said = " ".join(str(error).split())[:200]
-        return element("p", f"{video.name}: cannot be shown ({said})", class_="left-out")
-    uri, name = room.uri(as_jpeg(joined), "jpeg"), f"{image}, {sample}"
+        return left_out(f"{video.name}: cannot be shown ({' '.join(str(error).split())[:200]})")
+    uri, name = budget.uri(as_jpeg(joined), "jpeg"), f"{image}, {sample}"
     if uri is None:
-        return element("p", f"{video.name}: left out, the page is full", class_="left-out")
+        return left_out(f"{video.name}: left out, the page is full")
     drawn = element("img", src=uri, alt=f"{name}, seen from {frames} directions", style=f"width:{100 * frames}%")
     box = element(
         "div",

@@ -4,9 +4,9 @@ import os
 from pathlib import Path
 
 import pytest
+from paper_latex import check, differences, environment, figure, grid
 
-from completesplat.results.paper_check import check, differences, environment, figure, grid
-from completesplat.results.published import Column, PublishedTable, parse, published
+from completesplat.results.published import PrintedColumn, PublishedTable, parse, published
 
 PAPER = os.environ.get("COMPLETESPLAT_PAPER")
 SMALL = r"""
@@ -39,11 +39,9 @@ HEADINGS = {"Rendering Speed": "speed", "Methods": "method", "Apples PSNR ↑": 
 
 
 def table(rows: str = ROWS, label: str = "small", says: str = r"$\dagger$: cited from \cite{one}") -> PublishedTable:
-    columns = [Column(heading, key, "") for heading, key in HEADINGS.items()]
+    columns = [PrintedColumn(heading, key, "") for heading, key in HEADINGS.items()]
     cells = [[parse(cell) for cell in line.split("|")] for line in rows.splitlines()]
-    ours = {"complete": {}, "remarks": [], "options": {}}
-    given = "small", "Table 1", label, "", "full", "novel", [], "", "", None, {}, [says]
-    return PublishedTable(*given, columns, cells, **ours)
+    return PublishedTable("small", "Table 1", label, "", "full", "novel", [], [says], columns, cells, {})
 
 
 @pytest.mark.skipif(PAPER is None, reason="COMPLETESPLAT_PAPER does not name the LaTeX of the paper")

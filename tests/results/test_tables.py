@@ -1,4 +1,4 @@
-"""The tables as files."""
+"""The one type of table, as files and on the terminal."""
 
 import csv
 import re
@@ -6,7 +6,22 @@ import re
 import pytest
 
 from completesplat.results.published import published, tables
-from completesplat.results.tables import Cell, Heading, Row, Table, as_latex, as_markdown, show_tables, write_tables
+from completesplat.results.runs import find
+from completesplat.results.tables import (
+    SSIM_NOTE,
+    Cell,
+    Heading,
+    Table,
+    TableRow,
+    as_latex,
+    as_markdown,
+    escape,
+    evaluation_table,
+    metric,
+    show,
+    table,
+    write_tables,
+)
 
 ENVIRONMENT = re.compile(r"\\(begin|end)\{(\w+\*?)\}")
 
@@ -16,7 +31,7 @@ def written(runs, run, tmp_path):
     whole = {"subset": "fewview_dev", "scenes_listed": 20}
     run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%", 20.0)
-    found = tables(runs)[0]
+    found = tables(find(runs))
     write_tables(found, tmp_path / "out")
     return found, tmp_path / "out"
 
@@ -45,10 +60,10 @@ def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written)
             assert opened.pop() == name
     assert opened == []
     assert len(re.findall(r"(?<!\\)\{", text)) == len(re.findall(r"(?<!\\)\}", text))
-    for table in found:
-        latex = as_latex(table)
+    for one in found:
+        latex = as_latex(one)
         (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
-        assert {width(row) for row in rows_of_latex(latex)} == {len(columns)} == {len(table.headings)}
+        assert {width(row) for row in rows_of_latex(latex)} == {len(columns)} == {len(one.headings)}
     uncommented = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     assert re.findall(r"(?<!\\)[%#](?!$)", uncommented, re.MULTILINE) == []
     assert not set(re.sub(r"[\x00-\x7f]", "", text))  # no character that needs more than plain LaTeX
@@ -59,9 +74,9 @@ def test_the_published_figures_are_in_all_files_as_printed(written) -> None:
     markdown, latex = (out / "tables.md").read_text(), (out / "tables.tex").read_text()
     with (out / "tables.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
-    for table in published():
-        texts = {line["text"] for line in lines if line["table"] == table.name and line["source"] == "paper"}
-        for cell in (cell for row in table.rows for cell in row if cell.text):
+    for one in published():
+        texts = {line["text"] for line in lines if line["table"] == one.name and line["source"] == "paper"}
+        for cell in (cell for row in one.rows for cell in row if cell.text):
             assert cell.text in markdown
             assert cell.text in latex
             assert any(text.startswith(cell.text) for text in texts)
@@ -75,26 +90,67 @@ def test_the_csv_holds_all_digits_of_ours_and_a_line_for_each_cell(written) -> N
     found, out = written
     with (out / "tables.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
-    assert len(lines) == sum(len(table.rows) * len(table.headings) for table in found)
+    assert len(lines) == sum(len(one.rows) * len(one.headings) for one in found)
     assert all(line["text"] for line in lines)
     (line,) = (line for line in lines if line["text"] == "17.12")
     assert (float(line["value"]), line["table"], line["column"]) == (17.123456, "full_images", "Hydrants PSNR ↑")
 
 
 def test_markdown_has_as_many_cells_in_each_line(written) -> None:
-    for table in written[0]:
-        lines = [line for line in as_markdown(table).splitlines() if line.startswith("|")]
-        assert {len(re.split(r"(?<!\\)\|", line)) - 2 for line in lines} == {len(table.headings)}
+    for one in written[0]:
+        lines = [line for line in as_markdown(one).splitlines() if line.startswith("|")]
+        assert {len(re.split(r"(?<!\\)\|", line)) - 2 for line in lines} == {len(one.headings)}
 
 
 def test_everything_is_printed(written, capsys) -> None:
-    show_tables(written[0])
+    show(*written[0], width=240)
     printed = capsys.readouterr().out
-    for table in written[0]:
-        assert table.title in printed
-        assert all(line[:40] in printed for line in table.below())
+    for one in written[0]:
+        assert one.title in printed
+        assert all(line[:40] in printed for line in one.below())
 
 
 def test_an_empty_cell_is_refused() -> None:
     with pytest.raises(ValueError, match="in 1 columns"):
-        Table("x", "X", [Heading("a")], [Row("ours", [Cell("")])], [])
+        Table("x", "X", [Heading("a")], [TableRow("ours", [Cell("")])], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "printed"),
+    [
+        ("no_skips", r"no\_skips"),
+        ("50% & #1", r"50\% \& \#1"),
+        ("a={b: $c}", r"a=\{b: \$c\}"),
+        ("x^2~y", r"x\textasciicircum{}2\textasciitilde{}y"),
+        (r"a\b", r"a\textbackslash{}b"),
+        ("1 ± 2", r"1 $\pm$ 2"),
+    ],
+)
+def test_latex_prints_special_characters_literally(text, printed) -> None:
+    assert escape(text) == printed
+
+
+@pytest.mark.parametrize(
+    ("name", "arrow"),
+    [("psnr", "PSNR ↑"), ("ssim", "SSIM ↑"), ("lpips", "LPIPS ↓"), ("fid", "FID ↓"), ("kid", "KID ↓")],
+)
+def test_the_heading_says_which_direction_is_better(name, arrow) -> None:
+    assert metric(f"full_novel_{name}") == arrow
+
+
+def test_what_a_record_lacks_stays_empty_and_may_only_there(capsys) -> None:
+    shown = table("Title", [("name", "name", ""), ("figure", "figure", ".1f")], [{"name": "[red]"}, {"figure": 1.25}])
+    assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
+    show(shown)
+    assert "[red]" in capsys.readouterr().out
+
+
+def test_an_evaluation_shows_every_predictor_with_all_digits_in_any_width(capsys) -> None:
+    views = {"psnr": 20.0, "ssim": 0.5, "lpips": 0.125, "fid": 101.25, "kid": 0.0123, "swd": 33.0}
+    entry = {"scenes": 2, "views": 4, "full": {"novel": views, "reference": views}, "seconds": {"inference": 7.0}}
+    entry["object"] = entry["full"]
+    show(evaluation_table({"model": entry, "mean_image": entry}))
+    printed = capsys.readouterr().out
+    assert "2 scenes, 4 novel views" in printed
+    assert all(text in printed for text in ("20.00", "0.500", "0.125", "101.2", "0.0123", "33.00", SSIM_NOTE))
+    assert "…" not in printed

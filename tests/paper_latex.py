@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from completesplat.results.published import Figure, PublishedTable, published
+from completesplat.results.published import PrintedCell, PublishedTable, published
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")
@@ -25,7 +25,7 @@ class Grid:
     """Headings, all levels of one joined, and the cells below them."""
 
     headings: list[str]
-    rows: list[list[Figure]]
+    rows: list[list[PrintedCell]]
 
 
 def environment(text: str, label: str) -> str | None:
@@ -52,12 +52,12 @@ def grid(table: str, last_heading: str) -> Grid:
     raise ValueError(f"no heading with {last_heading}")
 
 
-def figure(cell: str) -> Figure:
+def figure(cell: str) -> PrintedCell:
     """Text and marks of a cell: bold is the best, underlined the second."""
     marks = frozenset(mark for mark, pattern in MARKED.items() if pattern.search(cell))
     for pattern in (CITATION, *MARKED.values()):
         cell = pattern.sub("", cell)
-    return Figure(" ".join(re.sub(r"[{}]", "", cell).replace(r"\#", "#").split()), marks)
+    return PrintedCell(" ".join(re.sub(r"[{}]", "", cell).replace(r"\#", "#").split()), marks)
 
 
 def _body(table: str) -> str:
@@ -75,7 +75,7 @@ def _cells(line: str) -> list[str]:
     return re.split(r"(?<!\\)&", DECORATION.sub("", line))
 
 
-def _span(cell: str) -> tuple[Figure, int, int]:
+def _span(cell: str) -> tuple[PrintedCell, int, int]:
     """The cell, and how many rows (upwards if negative) and columns it spans."""
     match = SPAN.fullmatch(cell.strip())
     if match is None:
@@ -84,7 +84,7 @@ def _span(cell: str) -> tuple[Figure, int, int]:
     return figure(content), int(count) if direction == "row" else 1, int(count) if direction == "column" else 1
 
 
-def _spread(lines: list[list[tuple[Figure, int, int]]]) -> list[list[Figure]]:
+def _spread(lines: list[list[tuple[PrintedCell, int, int]]]) -> list[list[PrintedCell]]:
     rows = [[cell for cell, _, columns in line for _ in range(columns)] for line in lines]
     for index, line in enumerate(lines):
         place = 0
@@ -123,7 +123,7 @@ def differences(table: PublishedTable, paper_text: str) -> list[str]:
     return wrong
 
 
-def _row(typed: list[Figure], printed: list[Figure], headings: list[str]) -> list[str]:
+def _row(typed: list[PrintedCell], printed: list[PrintedCell], headings: list[str]) -> list[str]:
     name = " / ".join(cell.text for cell in typed[:2])
     if len(typed) != len(printed):
         return [f"{name}: {len(typed)} cells, the paper has {len(printed)}"]
@@ -134,5 +134,5 @@ def _row(typed: list[Figure], printed: list[Figure], headings: list[str]) -> lis
     ]
 
 
-def _said(cell: Figure) -> str:
+def _said(cell: PrintedCell) -> str:
     return " ".join([repr(cell.text), *sorted(cell.marks)])

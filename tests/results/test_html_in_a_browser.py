@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 from report_pages import FRAMES, grey, write_results
 
-from completesplat.results.page import Limits, page
+from completesplat.results.html_page import Limits, page
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None

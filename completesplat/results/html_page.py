@@ -1,0 +1,280 @@
+"""One page of HTML that needs nothing else: tables, figures, and samples that turn under the mouse."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from completesplat import __version__
+from completesplat.errors import CompleteSplatError
+from completesplat.results.html_elements import (
+    ByteBudget,
+    Html,
+    described,
+    element,
+    folded,
+    joined,
+    left_out,
+    picture,
+    scrollable,
+    turntable,
+)
+from completesplat.results.own import mode_tables, own_tables
+from completesplat.results.published import tables as compared
+from completesplat.results.runs import CONFIG, MODES, ROWS, SCENE, SCORES, RunTree, find, mapping_or_empty, origin
+from completesplat.results.scores import entries
+from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table
+
+MARKED = {BEST: "strong", SECOND: "u"}
+PUBLISHED = "paper"
+"""The source of rows that are no results of ours."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much a page holds: frames of a turn, samples of a photograph, photographs, runs, pictures of a run's folder,
+    and all pictures together."""
+
+    frames: int
+    samples: int
+    predictions: int
+    runs: int
+    pictures: int
+    megabytes: float
+
+
+def comparison(table: Table) -> Html:
+    """A table with what stands below it; without a result of ours it is folded."""
+    if is_published(table):
+        return folded(f"{table.title}: the published figures, none of ours", _whole(table))
+    return _whole(table)
+
+
+def is_published(table: Table) -> bool:
+    """Whether it has the paper's figures only."""
+    return all(row.source == PUBLISHED for row in table.rows)
+
+
+def rows_of(title: str, rows: Sequence[Any]) -> Html:
+    """Records with the same keys, such as `completesplat report samplers` writes."""
+    records = [row for row in rows if isinstance(row, Mapping)]
+    keys = list(dict.fromkeys(str(key) for row in records for key, value in row.items() if _is_plain(value)))
+    head = element("tr", *(element("th", key.replace("_", " "), scope="col") for key in keys))
+    body = [element("tr", *(element("td", _said(row.get(key))) for key in keys)) for row in records]
+    shown = element("table", element("caption", title), element("thead", head), element("tbody", *body))
+    return scrollable(title, shown)
+
+
+def _whole(table: Table) -> Html:
+    body, above = [], False
+    for row, ruled in table.ruled_rows():
+        body.append(element("tr", *map(_cell, table.headings, row.cells), class_="rule" if above else False))
+        above = ruled
+    shown = element("table", element("caption", table.title), element("thead", *_head(table)), element("tbody", *body))
+    below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
+    said = folded("What this table says, and how it was measured", below)
+    return element("div", scrollable(table.title, shown), said)
+
+
+def _head(table: Table) -> list[Html]:
+    spans = table.groups()
+    above = [element("th", name, scope="colgroup", colspan=count, class_="group") for name, count in spans]
+    names = [element("th", heading.text, scope="col", class_=_kind(heading)) for heading in table.headings]
+    return [element("tr", *above), element("tr", *names)] if above else [element("tr", *names)]
+
+
+def _cell(heading: Heading, cell: Cell) -> Html:
+    text = element(MARKED[cell.mark], cell.text) if cell.mark in MARKED else cell.text
+    return element("td", text, class_=_kind(heading))
+
+
+def _kind(heading: Heading) -> str | bool:
+    return False if heading.figures else "words"
+
+
+def _is_plain(value: Any) -> bool:
+    return value is None or isinstance(value, str | int | float)
+
+
+def _said(value: Any) -> str:
+    return "" if value is None else format(value, ".4g") if isinstance(value, float) else str(value)
+
+
+FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}
+"""Subfolders of a run, and the pictures in each."""
+CAPTIONS = {
+    "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
+    "samples": ": samples of fixed scenes while training",
+}
+LONGEST = 20_000
+"""Characters of a configuration that are shown."""
+
+
+@dataclass(frozen=True)
+class ShownRun:
+    """A run's folder, its name on the page, its figures by subfolder, and the tables of its scores."""
+
+    path: Path
+    name: str
+    figures: dict[str, list[Path]]
+    tables: list[Table]
+
+
+def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bool) -> Html:
+    """A section of one run.
+
+    Args:
+        run: the run.
+        most_pictures: how many are shown of each subfolder, the latest; the section says how many others there are.
+        budget: bytes that are left in the page.
+        open_: whether it is unfolded at first.
+    """
+    parts = [described(origin(run.path, levels=0)), *map(comparison, run.tables)]
+    for name in ROWS:
+        rows = mapping_or_empty(run.path / name).get("rows")
+        if isinstance(rows, list):
+            parts.append(rows_of(Path(name).stem, rows))
+    for part, paths in run.figures.items():
+        # Of a run's progress the end, of a report's figures the first.
+        for path in paths[-most_pictures:] if part else paths[:most_pictures]:
+            parts.append(picture(path, f"{run.name}, {path.relative_to(run.path)}{CAPTIONS.get(part, '')}", budget))
+        parts += _more(len(paths) - most_pictures, f"more in {run.name}/{part}".rstrip("/"))
+    if (run.path / CONFIG).is_file():
+        text = (run.path / CONFIG).read_text(encoding="utf-8", errors="replace")
+        cut = text[:LONGEST] + ("\n... cut here" if len(text) > LONGEST else "")
+        parts.append(folded("All settings", element("pre", cut, tabindex="0")))
+    return element("details", element("summary", run.name), *parts, class_="run", open=open_)
+
+
+def _more(count: int, what: str) -> list[Html]:
+    return [left_out(f"{count} {what} left out")] if count > 0 else []
+
+
+NAMED = {
+    "image": "photograph",
+    "mask": "mask",
+    "box": "box",
+    "fov_degrees": "degrees of view",
+    "seed": "seed",
+    "skip_weight": "skip weight",
+    "guidance_weight": "guidance",
+    "sampler": "sampler",
+    "steps": "steps",
+}
+"""Settings of a prediction, and what they are called here."""
+
+
+def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget) -> Html:
+    """A section of one photograph: how its samples were made, each of them turning, and the sheet."""
+    settings = mapping_or_empty(path / SCENE).get("settings")
+    settings = settings if isinstance(settings, dict) else {}
+    image = str(settings.get("image") or name)
+    videos = sorted(path.glob("orbit_*.mp4"))
+    turning = [
+        turntable(video, image, video.stem.replace("orbit_", "sample "), limits.frames, budget)
+        for video in videos[: limits.samples]
+    ]
+    parts = [element("h3", name), described({"settings": _settings(settings), **origin(path)})]
+    if turning:
+        parts.append(element("div", *turning, class_="samples"))
+    parts += _more(len(videos) - limits.samples, "more samples")
+    if (path / "sheet.png").is_file():
+        sheet = picture(path / "sheet.png", f"{image}: input, and views around each sample", budget)
+        parts.append(folded("Contact sheet", sheet, open_=not turning))
+    return element("section", *parts, aria_label=f"Prediction {name}")
+
+
+def _settings(settings: dict[str, Any]) -> str:
+    """The settings that matter, in one line."""
+    return ", ".join(f"{name} {_said(settings[key])}" for key, name in NAMED.items() if settings.get(key) is not None)
+
+
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+"""What the browser enforces: this page asks for nothing, whatever is in it."""
+UNFOLDED = 3
+"""Runs up to which all of them are; otherwise those with a report's figure."""
+
+
+HINT = (
+    "Move the mouse over a sample, drag a finger across it, or give it the focus and use the arrow keys: all samples "
+    "of the photograph turn together. What the photograph does not show is made up, differently in each sample."
+)
+
+
+def page(folder: Path, out: Path, limits: Limits, made: Mapping[str, str]) -> tuple[str, list[str]]:
+    """The page, and a line for each file of results that could not be used.
+
+    Args:
+        folder: searched for runs and predictions.
+        out: where the page goes; what lies there is not shown.
+        limits: how much is shown.
+        made: command, date and commit of the page itself.
+
+    Raises:
+        CompleteSplatError: there is no such folder, or nothing to show in it.
+    """
+    tree, budget = find(folder), ByteBudget(limits.megabytes)
+    found, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]
+    if not found and not predicted:
+        raise CompleteSplatError(
+            f"runs={folder}: nothing to show in it or below it; `completesplat fit`, `test`, `predict` and `report` "
+            "write what a page is made of"
+        )
+    predictions = [
+        prediction_section(path, _name(path, folder), limits, budget) for path in predicted[: limits.predictions]
+    ]
+    few = len(found) <= UNFOLDED
+    runs = [run_section(run, limits.pictures, budget, few or "" in run.figures) for run in found[: limits.runs]]
+    predictions += _more(len(predicted) - limits.predictions, "more predictions")
+    runs += _more(len(found) - limits.runs, "more runs")
+    tables = compared(tree) if tree.scores or tree.modes or tree.warnings else []
+    sections = {
+        "Predictions": [element("p", HINT), *predictions] if predictions else [],
+        "Tables": [comparison(table) for table in sorted(tables, key=is_published)],
+        "Runs": runs,
+        "Left out": [element("ul", *(element("li", line) for line in tree.warnings))] if tree.warnings else [],
+    }
+    title = f"completesplat: {folder.resolve().name}"
+    return _document(title, {name: parts for name, parts in sections.items() if parts}, made), tree.warnings
+
+
+def _name(path: Path, root: Path) -> str:
+    return root.resolve().name if path == root else path.relative_to(root).as_posix()
+
+
+def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
+    """The runs with figures, scores or rows."""
+    tables: dict[Path, list[Table]] = {run.folder: own_tables(entries([run])) for run in tree.scores}
+    for run in tree.modes:
+        tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
+    shown = []
+    for path in tree.runs:
+        figures = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
+        figures = {part: paths for part, paths in figures.items() if paths}
+        told = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
+        if told and path.resolve() != out.resolve():
+            shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
+    return shown
+
+
+def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str, str]) -> str:
+    style, script = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+    identities = {name: name.lower().replace(" ", "-") for name in sections}
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=POLICY),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", title),
+        element("style", Html(style)),
+    )
+    links = [element("li", element("a", name, href=f"#{identity}")) for name, identity in identities.items()]
+    top = element("header", element("h1", title), element("nav", element("ul", *links), aria_label="Sections"))
+    body = [
+        element("section", element("h2", name, id=identities[name]), *parts, aria_labelledby=identities[name])
+        for name, parts in sections.items()
+    ]
+    said = [f"{key} {value}" for key, value in made.items() if value]
+    footer = element("footer", f"Made by completesplat {__version__}: {'; '.join(said)}")
+    whole = element("body", top, element("main", *body), footer, element("script", Html(script)))
+    return joined(Html("<!DOCTYPE html>\n"), element("html", head, whole, lang="en"), "\n")

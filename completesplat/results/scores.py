@@ -1,0 +1,221 @@
+"""Scores as rows of tables: one for each setting of a sweep over its seeds, one for each predictor of a run."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from completesplat.results.runs import SEED, Job, Result
+from completesplat.results.tables import ABSENT, FORMATS, Cell, Notes, by_name, marks
+
+MODEL, BEST_OF_K, MEAN_OF_K = "model", "best_of_k", "mean_of_k"
+PROPOSED = "full"
+"""The unchanged method among the ablations: the last row, as in the paper."""
+UPPER_BOUND = "upper_bound"
+"""Marks jobs, and their rows, whose model has seen the views that it is scored on."""
+IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
+AGREEMENT = 1e-4
+"""How far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it."""
+ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
+WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]
+
+
+def rows(finished: Sequence[Job]) -> list[dict[str, Any]]:
+    """One row for each setting, sorted by label, and the naive predictors below, which have no seeds.
+
+    Each row has the columns `IDENTITY` and `NAME_mean`, `NAME_deviation` for every metric NAME of the model, such as
+    `full_novel_psnr`; the deviation is the sample's, over seeds. What was not measured in all jobs of a row is None
+    there: a mean over fewer seeds than the row names would mislead.
+    """
+    names = list(dict.fromkeys(name for job in finished for name in _scores(job, MODEL)))
+    settings: dict[frozenset[tuple[str, str]], list[Job]] = {}
+    for job in finished:
+        shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
+        settings.setdefault(shared, []).append(job)
+    ours = sorted((_row(jobs, names) for jobs in settings.values()), key=_order)
+    return [*ours, *(_naive_row(predictor, finished, names) for predictor in _naive_predictors(finished))]
+
+
+def disagreeing(finished: Sequence[Job]) -> list[str]:
+    """The naive predictors that score differently in different jobs, which should all be tested on the same scenes."""
+    found = []
+    for predictor in _naive_predictors(finished):
+        tables = [_scores(job, predictor) for job in finished]
+        names = {name for table in tables for name in table}
+        if not all(_agree([table[name] for table in tables if name in table]) for name in names):
+            found.append(predictor)
+    return found
+
+
+def _naive_predictors(jobs: Sequence[Job]) -> list[str]:
+    return list(dict.fromkeys(predictor for job in jobs for predictor in job.test if predictor != MODEL))
+
+
+def _scores(job: Job, predictor: str) -> dict[str, float]:
+    return by_name(job.test.get(predictor, {}))
+
+
+def _order(row: dict[str, Any]) -> list[tuple[bool, str]]:
+    """A key that sorts labels alphabetically, part by part, the unchanged method last."""
+    return [(part == PROPOSED, part) for part in row["ablation"].split(", ")]
+
+
+def _row(jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
+    measured = [job.metrics for job in jobs if job.metrics]
+    row: dict[str, Any] = {"ablation": jobs[0].label, "seeds": len(jobs), "scenes": _scenes(jobs, MODEL)}
+    row["steps"] = _one_or_all(metrics["steps"] for metrics in measured)
+    row[UPPER_BOUND] = any(metrics.get(UPPER_BOUND) for metrics in measured)
+    tables = [_scores(job, MODEL) for job in jobs]
+    for name in names:
+        complete = all(name in table for table in tables)
+        values = [table[name] for table in tables] if complete else []
+        with np.errstate(invalid="ignore"):  # of an infinite PSNR there is no deviation
+            row[f"{name}_mean"] = float(np.mean(values)) if values else None
+            row[f"{name}_deviation"] = float(np.std(values, ddof=1)) if len(values) > 1 else None
+    return row
+
+
+def _naive_row(predictor: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
+    row: dict[str, Any] = {"ablation": predictor, "seeds": None, "scenes": _scenes(jobs, predictor), "steps": None}
+    row[UPPER_BOUND] = False
+    tables = [_scores(job, predictor) for job in jobs]
+    for name in names:
+        values = [table[name] for table in tables if name in table]
+        mean = None if not values else values[0] if _agree(values) else float(np.mean(values))
+        row |= {f"{name}_mean": mean, f"{name}_deviation": None}
+    return row
+
+
+def _agree(values: Sequence[float]) -> bool:
+    return np.allclose(values, values[0], rtol=AGREEMENT, atol=0, equal_nan=True)
+
+
+def _scenes(jobs: Sequence[Job], predictor: str) -> int | str | None:
+    return _one_or_all(job.test[predictor]["scenes"] for job in jobs if predictor in job.test)
+
+
+def _one_or_all(values: Iterable[int]) -> int | str | None:
+    """The number on which all agree; `40/38` where they do not."""
+    different = list(dict.fromkeys(values))
+    return different[0] if len(different) == 1 else "/".join(map(str, different)) or None
+
+
+def headline(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """The names of the metrics that a table of rows shows."""
+    return [*ALWAYS, *(name for name in WHERE_MEASURED if any(row.get(f"{name}_mean") is not None for row in rows))]
+
+
+def figures(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> list[list[Cell]]:
+    """A cell for each row and metric: `21.34 ± 0.12`, best and second best marked, empty where nothing was measured.
+
+    Rows without seeds, the naive predictors, and upper bounds do not compete. One seed has no deviation.
+    """
+    competing = [row["seeds"] is not None and not row[UPPER_BOUND] for row in rows]
+    columns = []
+    for name in names:
+        means = [row.get(f"{name}_mean") for row in rows]
+        deviations = [row.get(f"{name}_deviation") for row in rows]
+        texts = [_figure(*pair, FORMATS[name.rpartition("_")[2]]) for pair in zip(means, deviations, strict=True)]
+        columns.append([Cell(*cell) for cell in zip(texts, marks(means, competing, name), means, strict=True)])
+    return [list(cells) for cells in zip(*columns, strict=True)]
+
+
+def _figure(mean: float | None, deviation: float | None, form: str) -> str:
+    if mean is None:
+        return ""
+    return format(mean, form) if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
+
+
+OURS = "completesplat: "
+"""Not "ours": so the paper calls its own rows."""
+DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
+DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
+DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]
+"""Of a protocol, for the note on a row."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What one predictor scored in one run."""
+
+    run: Result
+    predictor: str
+    scores: dict[str, Any]
+
+    @property
+    def own(self) -> bool:
+        """Whether it is the run's model, and no naive predictor."""
+        return self.predictor in (MODEL, BEST_OF_K, MEAN_OF_K)
+
+    @property
+    def upper_bound(self) -> bool:
+        """Whether it has seen the views that it is scored on."""
+        return bool(self.scores.get(UPPER_BOUND))
+
+    def method(self, notes: Notes) -> Cell:
+        """The method, what of its samples was scored, and the number of the note on how it was measured."""
+        return Cell(f"{self._label()} [{notes.number(described(self.run))}]")
+
+    def _label(self) -> str:
+        if not self.own:
+            return OURS + self.predictor.replace("_", " ")
+        protocol = self.run.protocol
+        method, samples = str(protocol.get("method", "model")), protocol.get("samples", 1)
+        kinds = {
+            BEST_OF_K: f", {samples}-best oracle",
+            MEAN_OF_K: f", mean of {samples} samples",
+            MODEL: ", single sample" if protocol.get("sampler") else "",
+        }
+        return OURS + method + kinds[self.predictor] + (" (upper bound)" if self.upper_bound else "")
+
+    def value(self, name: str) -> float | None:
+        """The score named `REGION_VIEW_METRIC`; None if it was not measured."""
+        region, view, metric = name.split("_")
+        value = self.scores.get(region, {}).get(view, {}).get(metric)
+        return float(value) if isinstance(value, int | float) else None
+
+    def cell(self, name: str, notes: Notes) -> Cell:
+        """The score, or the number of the note on why there is none."""
+        value, metric = self.value(name), name.rpartition("_")[2]
+        if value is not None:
+            return Cell(format(value, FORMATS[metric]), value=value)
+        reasons = self.run.protocol.get("missing") or {}
+        return notes.missing(f"{metric}: {reasons.get(metric, f'not measured for {self.predictor}')}")
+
+    def time(self, part: str) -> Cell:
+        """The time of one sequence: `inference` or `rendering`."""
+        return time_cell((self.scores.get("seconds") or {}).get(part))
+
+
+def entries(runs: Sequence[Result]) -> list[Entry]:
+    """All entries of all runs, in the order of their files."""
+    return [Entry(run, predictor, scores) for run in runs for predictor, scores in run.entries.items()]
+
+
+def time_cell(seconds: float | None) -> Cell:
+    """A time in the paper's units: `15.7 ms`, `2.7 sec`, `4.1 min`."""
+    if seconds is None:
+        return Cell(ABSENT)
+    if seconds < 1:
+        text = f"{1000 * seconds:.1f} ms"
+    else:
+        text = f"{seconds:.1f} sec" if seconds < 60 else f"{seconds / 60:.1f} min"
+    return Cell(text, value=float(seconds))
+
+
+def described(run: Result) -> str:
+    """How a run was measured, in one line."""
+    protocol = run.protocol
+    said = [f"{key} {_counted(protocol[key])}" for key in DESCRIBED if protocol.get(key) is not None]
+    checkpoint = protocol.get("checkpoint") or {}
+    said += [f"checkpoint {key} {str(checkpoint[key])[:12]}" for key in ("step", "sha256") if checkpoint.get(key)]
+    fingerprint, machine = protocol.get("data_fingerprint"), protocol.get("machine") or {}
+    said += [f"data {str(fingerprint)[:12]}"] if fingerprint else []
+    said += [f"on {machine.get('gpu') or machine.get('processor')}, {machine.get('date')}"] if machine else []
+    return f"{run.name}: {', '.join(said)}."
+
+
+def _counted(value: Any) -> Any:
+    """The number of names in a list of them."""
+    return len(value) if isinstance(value, list) else value

@@ -1,0 +1,275 @@
+"""Scores of jobs as rows: their numbers against the files of the jobs, how they are named, which are marked."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from completesplat.results.runs import collect
+from completesplat.results.scores import ALWAYS, figures, headline, time_cell
+from completesplat.results.sweeps import summarize, write_summary
+
+
+def read_back(folder) -> pd.DataFrame:
+    return pd.read_csv(folder / "summary.csv").set_index("ablation")
+
+
+def test_the_summary_agrees_with_the_files_of_the_jobs(ablations) -> None:
+    write_summary(ablations.folder)
+    found: dict[tuple[str, str], list[float]] = {}
+    for path in ablations.folder.glob("*/metrics.json"):
+        overrides = json.loads(path.with_name("run.json").read_text())["overrides"]
+        (ablation,) = (o.removeprefix("ablation=") for o in overrides if o.startswith("ablation="))
+        for region, views in json.loads(path.read_text())["test"]["model"].items():
+            if region in ("full", "object"):
+                for view, metrics in views.items():
+                    for metric, value in metrics.items():
+                        found.setdefault((ablation, f"{region}_{view}_{metric}"), []).append(value)
+    table = read_back(ablations.folder)
+    assert len(found) == 9
+    for (ablation, name), values in found.items():
+        assert len(values) == 3
+        np.testing.assert_allclose(table.loc[ablation, f"{name}_mean"], sum(values) / 3, rtol=1e-12)
+        np.testing.assert_allclose(table.loc[ablation, f"{name}_deviation"], np.std(values, ddof=1), atol=1e-12)
+    assert list(table.columns[:4]) == ["seeds", "scenes", "steps", "upper_bound"]
+    assert set(table.columns[4:]) == {f"{name}_{kind}" for _, name in found for kind in ("mean", "deviation")}
+    assert list(table.index) == ["m1", "no_skips", "full", "mean_image", "copy_reference"]
+    assert list(table.loc["full"][:3]) == [3, 40, 9]
+
+
+def test_the_deviation_is_that_of_a_sample(sweep) -> None:
+    for seed, psnr in enumerate((19.0, 21.0)):
+        sweep.scored(f"seed={seed}", psnr=psnr)
+    row = summarize(sweep.folder).rows[0]
+    assert row["full_novel_psnr_mean"] == 20
+    assert row["full_novel_psnr_deviation"] == pytest.approx(math.sqrt(2))
+
+
+def test_one_seed_has_no_deviation(sweep) -> None:
+    sweep.scored("seed=0", psnr=20.0)
+    write_summary(sweep.folder)
+    table = read_back(sweep.folder)
+    assert table.loc["small", "full_novel_psnr_mean"] == 20
+    assert table["full_novel_psnr_deviation"].isna().all()
+
+
+def test_what_one_seed_lacks_is_empty_in_its_row_and_no_mean_of_fewer(sweep) -> None:
+    sweep.scored("ablation=m1", "seed=0", psnr=20.0, full_novel_lpips=0.5)
+    sweep.scored("ablation=m1", "seed=1", psnr=21.0)
+    sweep.scored("ablation=full", "seed=0", psnr=22.0, full_novel_lpips=0.25)
+    write_summary(sweep.folder)
+    table = read_back(sweep.folder)
+    assert table["full_novel_lpips_mean"].isna().tolist() == [True, False, True, True]
+    assert table.loc["full", "full_novel_lpips_mean"] == 0.25
+    assert table.loc["m1", "full_novel_psnr_mean"] == 20.5
+    header, first, *_ = (sweep.folder / "summary.csv").read_text().splitlines()
+    assert dict(zip(header.split(","), first.split(","), strict=True))["full_novel_lpips_mean"] == ""
+
+
+def test_a_seed_that_diverged_is_not_left_out_of_the_mean(sweep) -> None:
+    sweep.scored("seed=0", psnr=20.0)
+    sweep.scored("seed=1", psnr=math.nan)
+    write_summary(sweep.folder)
+    assert math.isnan(summarize(sweep.folder).rows[0]["full_novel_psnr_mean"])
+    assert ",nan,nan" in (sweep.folder / "summary.csv").read_text()
+
+
+def test_the_naive_predictors_are_below_without_seeds(ablations) -> None:
+    *_, mean_image, copy_reference = summarize(ablations.folder).rows
+    for row, psnr in ((mean_image, 15.0), (copy_reference, 12.0)):
+        assert (row["seeds"], row["steps"], row["scenes"]) == (None, None, 40)
+        assert row["full_novel_psnr_mean"] == psnr
+        assert row["full_novel_psnr_deviation"] is None
+        assert row["object_novel_psnr_mean"] is None
+
+
+def test_naive_predictors_that_differ_between_jobs_are_averaged_and_said(sweep) -> None:
+    sweep.scored("seed=0", psnr=20.0)
+    assert not any("mean_image" in said for said in summarize(sweep.folder).remarks)
+    other = sweep.scored("seed=1", psnr=20.0) / "metrics.json"
+    other.write_text(other.read_text().replace("15.0", "17.0"))
+    summary = summarize(sweep.folder)
+    assert [row["full_novel_psnr_mean"] for row in summary.rows] == [20, 16, 12]
+    (said,) = (said for said in summary.remarks if "mean_image" in said)
+    assert "does not score the same in all jobs" in said
+    assert not any("copy_reference" in said for said in summary.remarks)
+
+
+def test_different_numbers_of_scenes_are_not_passed_over(sweep) -> None:
+    sweep.scored("ablation=m1", "seed=0", psnr=20.0, scenes=40, steps=9)
+    sweep.scored("ablation=m1", "seed=1", psnr=20.0, scenes=38, steps=7)
+    sweep.scored("ablation=full", "seed=0", psnr=20.0, scenes=40)
+    summary = summarize(sweep.folder)
+    assert [row["scenes"] for row in summary.rows[:2]] == ["40/38", 40]
+    assert [row["steps"] for row in summary.rows[:2]] == ["9/7", 9]
+    assert "m1: its jobs were tested on different scenes (40/38)." in summary.remarks
+    assert any("do not compare" in said for said in summary.remarks)
+
+
+def test_equal_numbers_of_scenes_need_no_remark(ablations) -> None:
+    assert not any("scenes" in said for said in summarize(ablations.folder).remarks)
+
+
+def test_a_job_without_a_test_has_its_row_without_figures(sweep) -> None:
+    sweep.add("ablation=m1", test={})
+    sweep.scored("ablation=full", psnr=20.0)
+    first, second, *_ = summarize(sweep.folder).rows
+    assert (first["ablation"], first["scenes"], first["full_novel_psnr_mean"]) == ("m1", None, None)
+    assert second["full_novel_psnr_mean"] == 20
+
+
+PREDICTOR = {"scenes": 4, "views": 8, "seconds": {"inference": 2.0}, "full": {"novel": {"psnr": 20.0}}}
+
+
+def test_the_protocol_is_no_predictor(sweep) -> None:
+    sweep.add("seed=0", test={"protocol": {"scenes": 4}, "model": PREDICTOR, "mean_image": PREDICTOR})
+    (job,) = collect(sweep.folder)
+    assert list(job.test) == ["model", "mean_image"]
+    assert job.protocol == {"scenes": 4}
+    assert [row["ablation"] for row in summarize(sweep.folder).rows] == ["small", "mean_image"]
+
+
+def test_seconds_are_no_scores(sweep) -> None:
+    sweep.add("seed=0", test={"model": PREDICTOR})
+    (row,) = summarize(sweep.folder).rows
+    assert [name for name in row if name.endswith("_mean")] == ["full_novel_psnr_mean"]
+
+
+def test_a_job_without_results_has_no_protocol(sweep) -> None:
+    sweep.add("seed=0")
+    assert [job.protocol for job in collect(sweep.folder)] == [{}]
+
+
+def named(sweep) -> list[str]:
+    return [row["ablation"] for row in summarize(sweep.folder).rows if row["seeds"] is not None]
+
+
+def test_a_row_is_named_by_the_one_override_that_varies_the_full_method_last(ablations) -> None:
+    assert named(ablations) == ["m1", "no_skips", "full"]
+
+
+def test_two_overrides_that_vary_are_both_named(sweep) -> None:
+    for model in ("var", "splatter_image"):
+        for ablation in ("no_skips", "full", "m1"):
+            sweep.scored(f"model={model}", f"ablation={ablation}", psnr=20.0)
+    assert named(sweep) == [
+        f"{model}, {ablation}" for model in ("splatter_image", "var") for ablation in ("m1", "no_skips", "full")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("varied", "names"),
+    [
+        (["optimizer.lr=0.1", "optimizer.lr=0.2"], ["optimizer.lr=0.1", "optimizer.lr=0.2"]),
+        (["+loss.kl.weight=1", "+loss.kl.weight=2"], ["loss.kl.weight=1", "loss.kl.weight=2"]),
+        (["batch=2", "batch=10"], ["batch=10", "batch=2"]),  # no group, though without a dot
+        (["model=var", "model=splatter_image"], ["splatter_image", "var"]),
+        (["data/source=a", "data/source=b"], ["a", "b"]),
+        (["a.b=[0,1]", "a.b=[0]"], ["a.b=[0,1]", "a.b=[0]"]),
+    ],
+)
+def test_groups_are_named_by_their_choice_and_settings_with_their_key(sweep, varied, names) -> None:
+    for override in varied:
+        sweep.scored(override, "seed=3", psnr=20.0)
+    assert named(sweep) == names
+
+
+def test_an_override_that_only_some_jobs_have_names_those_jobs(sweep) -> None:
+    sweep.scored("ablation=no_skips", psnr=20.0)
+    sweep.scored("model=splatter_image", psnr=20.0)
+    sweep.scored(psnr=20.0)
+    assert named(sweep) == ["no_skips", "small", "splatter_image"]
+
+
+def test_seeds_alone_make_one_row_with_the_name_of_the_experiment(sweep) -> None:
+    for seed in range(4):
+        sweep.scored(f"seed={seed}", psnr=20.0)
+    (row,) = (row for row in summarize(sweep.folder).rows if row["seeds"] is not None)
+    assert (row["ablation"], row["seeds"]) == ("small", 4)
+    for run in sweep.folder.glob("*/run.json"):
+        run.write_text(run.read_text().replace('"experiment=small", ', ""))
+    assert named(sweep) == ["all"]
+
+
+def test_a_seed_of_something_else_makes_another_row(sweep) -> None:
+    for seed in range(2):
+        sweep.scored(f"data.seed={seed}", psnr=20.0)
+    assert named(sweep) == ["data.seed=0", "data.seed=1"]
+
+
+def test_the_order_in_which_overrides_were_given_is_no_difference(sweep) -> None:
+    sweep.scored("ablation=m1", "model=var", "seed=0", psnr=20.0)
+    sweep.scored("model=var", "seed=1", "ablation=m1", psnr=21.0)
+    sweep.scored("ablation=full", "model=var", "seed=1", psnr=21.0)
+    rows = summarize(sweep.folder).rows
+    assert [(row["ablation"], row["seeds"]) for row in rows[:2]] == [("m1", 2), ("full", 1)]
+
+
+PSNR = "full_novel_psnr"
+
+
+def scored(means: list[Any], column: str = PSNR, naive: int = 0) -> list[dict[str, Any]]:
+    """One row for each mean; the last `naive` of them without seeds."""
+    competing = len(means) - naive
+    return [
+        {"seeds": 2 if i < competing else None, "upper_bound": False, f"{column}_mean": mean}
+        for i, mean in enumerate(means)
+    ]
+
+
+def marked(rows: list[dict[str, Any]], column: str = PSNR) -> list[str]:
+    return [cells[0].mark for cells in figures(rows, [column])]
+
+
+@pytest.mark.parametrize(
+    ("column", "means", "expected"),
+    [
+        (PSNR, [20.0, 22.0, 21.0, 19.0], ["", "best", "second", ""]),
+        ("full_novel_ssim", [0.8, 0.9, 0.7], ["second", "best", ""]),
+        ("full_novel_lpips", [0.2, 0.3, 0.1], ["second", "", "best"]),
+        ("full_novel_fid", [12.0, 11.0], ["second", "best"]),
+        ("full_novel_kid", [0.02, 0.01], ["second", "best"]),
+        (PSNR, [22.0, 22.0, 21.0, 21.0, 20.0], ["best", "best", "second", "second", ""]),
+        (PSNR, [21.996, 22.001, 21.98], ["best", "best", "second"]),  # as written: 22.00, 22.00, 21.98
+        (PSNR, [None, 22.0, float("nan"), 21.0], ["", "best", "", "second"]),
+        (PSNR, [float("inf"), 30.0], ["best", "second"]),
+        (PSNR, [float("nan")], [""]),
+        (PSNR, [None, None], ["", ""]),
+        (PSNR, [20.0], ["best"]),
+    ],
+)
+def test_best_and_second_best_follow_the_metrics_direction(column, means, expected) -> None:
+    assert marked(scored(means, column), column) == expected
+
+
+def test_naive_predictors_do_not_compete() -> None:
+    assert marked(scored([20.0, 21.0, 25.0, 21.0], naive=2)) == ["second", "best", "", ""]
+
+
+def test_metrics_that_few_sweeps_measure_are_shown_where_they_were() -> None:
+    assert headline(scored([20.0])) == ALWAYS
+    assert headline([*scored([20.0]), *scored([0.1], "full_novel_lpips")]) == [*ALWAYS, "full_novel_lpips"]
+
+
+@pytest.mark.parametrize(
+    ("mean", "deviation", "text"),
+    [(21.344, 0.126, "21.34 ± 0.13"), (21.344, None, "21.34"), (None, None, ""), (21.0, 0.0, "21.00 ± 0.00")],
+)
+def test_a_figure_is_mean_and_deviation_equally_precise(mean, deviation, text) -> None:
+    row = {"seeds": 2, "upper_bound": False, f"{PSNR}_mean": mean, f"{PSNR}_deviation": deviation}
+    assert figures([row], [PSNR])[0][0].text == text
+
+
+def test_upper_bounds_do_not_compete() -> None:
+    first, *others = scored([30.0, 18.0, 17.0])
+    assert marked([first | {"upper_bound": True}, *others]) == ["", "best", "second"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.0157, "15.7 ms"), (2.7, "2.7 sec"), (54, "54.0 sec"), (246.0, "4.1 min"), (None, "-")]
+)
+def test_times_are_in_the_units_of_the_paper(seconds, text) -> None:
+    assert time_cell(seconds).text == text

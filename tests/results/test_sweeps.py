@@ -1,0 +1,292 @@
+"""A sweep's summary: its files, the terminal, the remarks, and the hook in a sweep that hydra really runs."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+import imageio.v3 as imageio
+import numpy as np
+import pandas as pd
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf
+
+from completesplat.results.machine import machine
+from completesplat.results.scores import IDENTITY
+from completesplat.results.sweeps import show_summary, summarize, write_summary
+from completesplat.results.tables import SSIM_NOTE, escape
+
+FILES = ["summary.csv", "summary.md", "summary.png", "summary.tex"]
+
+
+def blue(folder) -> np.ndarray:
+    """Which pixels of the chart have the colour of bars, matplotlib's C0."""
+    return (imageio.imread(folder / "summary.png")[..., :3] == (31, 119, 180)).all(-1)
+
+
+def longest_run(line: np.ndarray) -> int:
+    return max(map(len, re.findall("1+", "".join(map(str, line.astype(int))))), default=0)
+
+
+def test_nothing_but_the_four_files_is_written(ablations) -> None:
+    before = {path.name for path in ablations.folder.iterdir()}
+    write_summary(ablations.folder)
+    write_summary(ablations.folder)
+    assert sorted({path.name for path in ablations.folder.iterdir()} - before) == FILES
+
+
+def test_markdown_shows_means_deviations_and_marks(ablations, written) -> None:
+    lines = written(ablations).splitlines()
+    head, rule, m1, no_skips, full, mean_image, copy_reference = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in lines[:7]
+    )
+    assert head[:5] == [
+        "ablation", "seeds", "scenes", "all pixels, novel views: PSNR ↑", "all pixels, novel views: SSIM ↑"
+    ]  # fmt: skip
+    assert len(rule) == len(head) == 8
+    # Offsets 0, 0.25 and 1.25 have the mean 0.5 and the deviation sqrt(0.4375) = 0.66.
+    assert m1[:4] == ["m1", "3", "40", "<ins>20.50 ± 0.66</ins>"]
+    assert no_skips[3:5] == ["19.00 ± 0.66", "0.685 ± 0.000"]
+    assert full[3:6] == ["**22.50 ± 0.66**", "**0.720 ± 0.000**", "**20.50 ± 0.66**"]
+    assert mean_image == ["mean_image", "", "40", "15.00", "", "", "", ""]
+    assert copy_reference[3] == "12.00"
+
+
+def test_latex_has_booktabs_rules_and_as_many_cells_as_columns(ablations) -> None:
+    write_summary(ablations.folder)
+    text = (ablations.folder / "summary.tex").read_text()
+    assert [text.count(rule) for rule in (r"\toprule", r"\midrule", r"\bottomrule")] == [1, 2, 1]
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert [row.count(" & ") for row in rows[1:]] == [7] * 6
+    spanned = sum(int(count) for count in re.findall(r"\\multicolumn\{(\d+)\}", rows[0]))
+    assert spanned == 8
+    assert r"{lrrrrrrr}" in text
+    assert r"no\_skips & 3 & 40 & 19.00 $\pm$ 0.66 & " in text
+    assert r"\textbf{22.50 $\pm$ 0.66}" in text
+    assert r"\underline{20.50 $\pm$ 0.66}" in text
+    assert text.count("{") == text.count("}")
+    assert re.search(r"(?<!\\)_", text) is None
+    assert text.isascii()
+
+
+def test_all_remarks_and_the_command_stand_below_both_tables(ablations, written) -> None:
+    ablations.add("ablation=no_skips", "seed=7")
+    markdown = written(ablations)
+    tex = (ablations.folder / "summary.tex").read_text()
+    summary = summarize(ablations.folder)
+    assert len(summary.remarks) == 4
+    for said in (SSIM_NOTE, *summary.remarks, *summary.commands):
+        assert said in markdown
+        assert escape(said) in tex
+
+
+def test_a_bar_in_a_cell_of_markdown_does_not_end_the_cell(sweep, written) -> None:
+    for value in ("a|b", "c"):
+        sweep.scored(f"some.key={value}", psnr=20.0)
+    assert r"| some.key=a\|b | 1 |" in written(sweep)
+
+
+def test_a_sweep_without_finished_jobs_says_so(sweep, written, capsys) -> None:
+    sweep.add("ablation=m1")
+    markdown = written(sweep)
+    assert markdown.startswith("No job of this sweep has finished.")
+    assert "0 of 1 jobs have finished." in markdown
+    assert "No job of this sweep has finished." in (sweep.folder / "summary.tex").read_text()
+    assert list(pd.read_csv(sweep.folder / "summary.csv").columns) == IDENTITY
+    assert len(np.unique(imageio.imread(sweep.folder / "summary.png"))) > 1
+    assert not blue(sweep.folder).any()
+    show_summary(summarize(sweep.folder))
+    assert "Not finished: job=0." in capsys.readouterr().out
+
+
+def test_a_folder_without_jobs_says_so(sweep, written) -> None:
+    sweep.folder.mkdir()
+    assert "0 of 0 jobs have finished." in written(sweep)
+
+
+def test_the_chart_draws_bars_as_long_as_the_means(sweep) -> None:
+    for ablation, psnr in {"full": 24.0, "m1": 12.0, "no_skips": 18.0}.items():
+        sweep.scored(f"ablation={ablation}", psnr=psnr)
+    for run in sweep.folder.glob("*/metrics.json"):  # no lines across the bars
+        metrics = json.loads(run.read_text())
+        run.write_text(json.dumps(metrics | {"test": {"model": metrics["test"]["model"]}}))
+    write_summary(sweep.folder)
+    bars = [longest_run(line) for line in blue(sweep.folder)]
+    lengths = [length for length, before in zip(bars[1:], bars, strict=False) if length > 50 and before == 0]
+    np.testing.assert_allclose(np.array(lengths) / lengths[-1], [12 / 24, 18 / 24, 1], atol=0.02)
+
+
+def test_the_chart_draws_the_mean_image_where_its_score_is(sweep) -> None:
+    sweep.scored("ablation=full", psnr=30.0)
+    write_summary(sweep.folder)
+    image = imageio.imread(sweep.folder / "summary.png")[..., :3]
+    bar = blue(sweep.folder)
+    columns = np.flatnonzero(bar.sum(0) > 20)
+    rows = np.flatnonzero(bar.sum(1) > 100)
+    black = (image[rows[0] : rows[-1]].astype(int).sum(-1) < 100).mean(0)
+    found = [x for x in range(columns[0] + 5, columns[-1] - 5) if black[x] > 0.2]
+    middle = (columns[0] + columns[-1]) / 2  # the mean image scores half of 30
+    assert min(abs(x - middle) for x in found) <= 3
+
+
+def test_the_terminal_shows_the_headline_and_what_is_missing(ablations, capsys) -> None:
+    ablations.add("ablation=m1", "seed=7")
+    ablations.scored("ablation=x[red]", psnr=1.0)
+    show_summary(summarize(ablations.folder))
+    said = capsys.readouterr().out
+    assert "22.50 ± 0.66" in said
+    assert "x[red]" in said
+    assert "…" not in said
+    assert "10 of 11 jobs have finished." in said
+    assert "Not finished: job=9." in said
+
+
+def test_jobs_that_have_not_finished_are_named(ablations) -> None:
+    ablations.add("ablation=no_skips", "seed=7")
+    broken = ablations.add("ablation=m1", "seed=8")
+    (broken / "metrics.json").write_text('{"steps": 9, "te')
+    (ablations.folder / "silent").mkdir()  # ended before it could say what it was
+    (ablations.folder / ".submitit").mkdir()
+    remarks = summarize(ablations.folder).remarks
+    assert remarks[0] == "9 of 12 jobs have finished."
+    assert remarks[1] == "Not finished: job=9; job=10; silent."
+    assert [row["seeds"] for row in summarize(ablations.folder).rows[:3]] == [3, 3, 3]
+
+
+def test_jobs_that_never_started_are_named_too(sweep) -> None:
+    given = ["experiment=small", "ablation=m1,full", "seed=range(2)", "data.root=/home/someone/data/set"]
+    sweep.plan([*given, "out=written/in/another/way"])
+    sweep.scored("ablation=m1", "seed=0", psnr=20.0)
+    sweep.add("ablation=full", "seed=0")
+    remarks = summarize(sweep.folder).remarks
+    assert remarks[:2] == ["1 of 4 jobs have finished.", "Not finished: job=1; m1, seed=1; full, seed=1."]
+
+
+def test_a_job_that_could_not_say_what_it_was_is_counted_once(sweep) -> None:
+    sweep.plan(["ablation=m1,full"])
+    (sweep.folder / "ablation=full").mkdir()
+    remarks = summarize(sweep.folder).remarks
+    assert remarks[:2] == ["0 of 2 jobs have finished.", "Not finished: m1; full."]
+
+
+def test_a_plan_that_depends_on_other_files_is_not_guessed(sweep) -> None:
+    sweep.plan(["ablation=glob(*)", "seed=0,1"])
+    sweep.scored("ablation=m1", "seed=0", psnr=20.0)
+    assert summarize(sweep.folder).remarks[0] == "1 of 1 jobs have finished."
+
+
+def test_all_jobs_finished_need_no_list(ablations) -> None:
+    first, second, *_ = summarize(ablations.folder).remarks
+    assert first == "9 of 9 jobs have finished."
+    assert second == "Commit c0ffee."
+
+
+def test_the_command_is_given_once_without_the_folders_of_a_machine(ablations) -> None:
+    (command,) = summarize(ablations.folder).commands
+    assert command == "completesplat fit -m experiment=small ablation=full,no_skips data.root=.../set"
+
+
+def test_jobs_of_different_commits_are_told(sweep) -> None:
+    for seed, commit in enumerate(("c0ffee", "decade-dirty", "c0ffee")):
+        sweep.add(f"seed={seed}", commit=commit)
+    assert "Commits c0ffee, decade-dirty." in summarize(sweep.folder).remarks
+
+
+def test_the_machine_and_the_date_are_told(ablations) -> None:
+    last = summarize(ablations.folder).remarks[-1]
+    assert machine()["processor"] in last
+    assert time.strftime("%Y-") in last
+
+
+CONFIG = """
+seed: 0
+fails: null
+killed: null
+hydra:
+  sweep: {dir: swept, subdir: "seed=${seed}"}
+  run: {dir: swept}
+  output_subdir: null
+  callbacks: {summary: {_target_: completesplat.results.sweeps.SweepSummary}}
+"""
+
+
+@pytest.fixture
+def launched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Runs jobs that score 20 dB plus their seed; the jobs with the seeds `fails` and `killed` do not."""
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf/fit.yaml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+
+    def job(config: Any) -> None:
+        out = Path(HydraConfig.get().runtime.output_dir)
+        OmegaConf.save(config, out / "config.yaml")
+        record = {"command": sys.argv, "commit": None, "overrides": list(HydraConfig.get().overrides.task)}
+        (out / "run.json").write_text(json.dumps(record))
+        if config.seed == config.fails:
+            raise ValueError("this job fails")
+        if config.seed == config.killed:
+            raise KeyboardInterrupt
+        test = {"model": {"scenes": 2, "views": 4, "full": {"novel": {"psnr": 20.0 + config.seed}}}}
+        (out / "metrics.json").write_text(json.dumps({"steps": 1, "epochs": 1, "test": test}))
+
+    def launch(*arguments: str) -> Path:
+        monkeypatch.setattr(sys, "argv", ["completesplat fit", *arguments])
+        hydra.main(version_base="1.3", config_path=str(tmp_path / "conf"), config_name="fit")(job)()
+        return tmp_path / "swept"
+
+    return launch
+
+
+def test_a_sweep_ends_with_its_table(launched, capsys) -> None:
+    folder = launched("-m", "seed=0,2")
+    said = capsys.readouterr().out
+    assert "21.00 ± 1.41" in said
+    assert "swept/summary.md" in said
+    assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
+
+
+def test_a_sweep_with_a_failed_job_has_a_summary_of_the_others(launched) -> None:
+    with pytest.raises(ValueError, match="this job fails"):
+        launched("-m", "seed=0,1,2", "fails=1")
+    text = Path("swept/summary.md").read_text()
+    assert "2 of 3 jobs have finished." in text
+    assert "Not finished: seed=1." in text
+
+
+def test_a_sweep_that_is_killed_has_a_summary_of_what_was_done(launched) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        launched("-m", "seed=0,1,2", "killed=1")
+    text = Path("swept/summary.md").read_text()
+    assert "1 of 3 jobs have finished." in text
+    assert "Not finished: all, seed=1; all, seed=2." in text
+
+
+def test_a_single_run_has_no_summary(launched, tmp_path) -> None:
+    folder = launched("seed=1")
+    assert (folder / "metrics.json").is_file()
+    assert list(tmp_path.rglob("summary.*")) == []
+
+
+def test_a_summary_that_cannot_be_written_is_logged_and_stops_nothing(launched, tmp_path, capsys) -> None:
+    (tmp_path / "swept/summary.csv").mkdir(parents=True)
+    folder = launched("-m", "seed=0,2")
+    assert (folder / "seed=2/metrics.json").is_file()
+    said = capsys.readouterr().out  # where hydra's handlers log by default
+    assert said.count("no summary of the sweep: IsADirectoryError") == 3  # after each job and after the last
+
+
+def test_the_hook_is_loaded_without_the_heavy_libraries() -> None:
+    code = (
+        "import sys, completesplat.results.sweeps; "
+        "print(*sorted({'torch', 'pandas', 'numpy', 'rich', 'matplotlib'} & {n.split('.')[0] for n in sys.modules}))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == []
