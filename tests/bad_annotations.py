@@ -1,7 +1,7 @@
 """CO3D annotations that must not reach a batch: changes of `co3d_trees`' frames, sequences and set list."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from co3d_trees import FRAMES, SEQUENCES, SET_LIST
@@ -111,6 +111,12 @@ BAD_FRAMES: dict[str, tuple[Edit, type[DataError], str]] = {
     "size_is_text": (put("image", "size", value="32x32"), BadAnnotation, "size must be of type list"),
     "no_image": (drop("image"), BadAnnotation, "no image"),
     "no_mask": (put("mask", value=None), BadAnnotation, "mask must be of type dict"),
+    "nan_depth_scale": (put("depth", "scale_adjustment", value=NAN), BadAnnotation, "scale_adjustment is not finite"),
+    "infinite_depth_scale": (
+        put("depth", "scale_adjustment", value=INFINITY),
+        BadAnnotation,
+        "scale_adjustment is not finite",
+    ),
     "path_is_a_number": (put("image", "path", value=7), BadAnnotation, "path must be of type str"),
     "empty_path": (put("image", "path", value=""), OutsidePath, "or nowhere"),
     "path_to_the_parent": (put("image", "path", value="things/../../x.jpg"), OutsidePath, "outside"),
@@ -152,6 +158,24 @@ BAD_ENTRIES: dict[str, tuple[str, Edit, type[DataError], str | None, int | None,
     "unknown_frame": (SET_LIST, lambda s: s["train"].append(["a", 99]), BadAnnotation, "a", 99, "but not annotated"),
     "sequence_not_annotated": (SEQUENCES, lambda e: e[1:], BadAnnotation, "a", None, "not annotated"),
 }  # fmt: skip
+
+# Who an entry without a name was of is not known, so what is missing without it is one more refusal.
+CONSEQUENCES = {"name_is_a_number", "sequence_without_name"}
+# What else than nothing a bad entry takes away: these frames of sequence a, which are 0 to 3.
+WITHOUT: dict[str, Sequence[int]] = {
+    "frame_without_number": [2],
+    "number_is_text": [2],
+    "number_is_a_fraction": [2],
+    "number_is_true": [2],
+    "name_is_a_number": [2],
+    "sequence_without_name": range(4),
+    "sequence_not_annotated": range(4),
+    "cloud_without_path": range(4),
+    "cloud_is_text": range(4),
+    "cloud_outside": range(4),
+    "infinite_cloud_quality": range(4),
+    "quality_is_text": range(4),
+}
 
 # Nothing can be used: (file, change, part of the reason).
 BAD_FILES: dict[str, tuple[str, Edit, str]] = {

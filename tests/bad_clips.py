@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from bad_images import png
+from bad_inputs import read_whole
 from realestate10k_trees import StoredClip, assert_refusal, encode, equal, make_clip, module, same
 
 from completesplat.data.realestate10k.module import RE10KDataModule
@@ -100,6 +101,17 @@ def assert_intact(batch: SceneBatch, intact: RE10KDataModule) -> None:
     pictures = [store.image(sequence, frame) / 255 for frame in range(len(sequence.frames))]
     views = [next(f for f, p in enumerate(pictures) if torch.equal(p, image)) for image in batch.all_views().images[0]]
     assert same(batch[0], store.scene(sequence, views[0], views[1:]))
+
+
+def check_source(folder: Path, kind: type[DataError], file: Path, frame: int | None, **settings) -> None:
+    """The broken clip is refused with its place by the source of these training clips, and the others are not."""
+    source = module(folder.parent, **{**SETTINGS, **settings}).source("train")
+    assert source.refused == []
+    with pytest.raises(DataError) as caught:
+        read_whole(source, BAD)
+    assert_refusal(caught.value, kind, file, BAD, frame)
+    for name in INTACT:
+        read_whole(source, name)
 
 
 def check_policies(

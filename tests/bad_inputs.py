@@ -1,6 +1,7 @@
 """How damaged CO3D trees are read: what training saw of them, and what was counted as broken."""
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,29 @@ from co3d_trees import CATEGORY, SUBSET, write_tree
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.loading.loader import SceneLoader
-from completesplat.data.sequences import SPLITS, PosedSequence
+from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource
+from completesplat.data.validation import at
 from completesplat.scene import SceneBatch
 
 ITEMS = 4  # of a sequence in an epoch
 Seen = tuple[str, int]  # sequence, number of the frame
+
+
+def one_of_each_kind(catalogue: Mapping[str, tuple], position: int) -> list[str]:
+    """The first case of each class of error, which a case has at this position."""
+    names: dict[type, str] = {}
+    for name, case in catalogue.items():
+        names.setdefault(case[position], name)
+    return list(names.values())
+
+
+def read_whole(source: SequenceSource, name: str) -> None:
+    """Read a sequence and all of its pictures; refusals say where they happened, as a loader's do."""
+    with at(sequence=name):
+        sequence = source.read(name)
+        for index, number in enumerate(sequence.frames):
+            with at(frame=number):
+                sequence.read(index)
 
 
 def write_three(root: Path, frames: int) -> Path:

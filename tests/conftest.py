@@ -1,10 +1,13 @@
 """Fixtures that several folders of tests use."""
 
 import os
+import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from support import SMALL, call
 
 from completesplat.data.toy import write_objects
@@ -13,12 +16,40 @@ from completesplat.data.toy import write_objects
 os.environ.setdefault("WANDB_CONSOLE", "off")
 
 
+Folders = Callable[[str, Callable[[Path], object]], Path]
+
+
 @pytest.fixture(scope="session")
-def toy_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built_once(tmp_path_factory: pytest.TempPathFactory) -> Folders:
+    """Folders that all processes of a test run share: the first one that needs a folder fills it, the others wait.
+
+    A folder that could not be filled is filled anew by whoever needs it next.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    # A worker's folder lies in that of the test run.
+    base = tmp_path_factory.getbasetemp().parent if worker else tmp_path_factory.getbasetemp()
+
+    def build(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, complete = base / f"shared_{name}", base / f"shared_{name}.complete"
+        with FileLock(base / f"shared_{name}.lock"):
+            if not complete.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                fill(folder)
+                complete.touch()
+        return folder
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def toy_root(built_once: Folders) -> Path:
     """Root of a CO3D tree with the category `toy_objects`: 4 sequences (2 train, 1 val, 1 test), 4 frames, 32 px."""
-    root = tmp_path_factory.mktemp("toy")
-    write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
-    return root
+
+    def fill(root: Path) -> None:
+        write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
+
+    return built_once("toy", fill)
 
 
 @dataclass(frozen=True)
@@ -38,38 +69,44 @@ class Pipeline:
 
 
 @pytest.fixture(scope="session")
-def pipeline(toy_root, tmp_path_factory):
-    runs = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(runs)
+def pipeline(toy_root: Path, built_once: Folders) -> Pipeline:
+    def train(runs: Path) -> None:
         fit = ["fit", f"data.root={toy_root}", *SMALL]
-        assert call(monkeypatch, *fit, "experiment=toy_var", f"out={runs / 'var'}") == 0
         stage1 = runs / "var/checkpoints/last.ckpt"
         stage2 = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={stage1}", "sampler.steps=2"]
-        assert call(monkeypatch, *fit, *stage2, f"out={runs / 'diffusion'}") == 0
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(runs)
+            assert call(monkeypatch, *fit, "experiment=toy_var", f"out={runs / 'var'}") == 0
+            assert call(monkeypatch, *fit, *stage2, f"out={runs / 'diffusion'}") == 0
+
+    runs = built_once("runs", train)
     return Pipeline(toy_root, runs / "var", runs / "diffusion")
 
 
 @pytest.fixture(scope="session")
-def packed_toys(pipeline, tmp_path_factory) -> Path:
+def packed_toys(pipeline: Pipeline, built_once: Folders) -> Path:
     """The pipeline's scenes, packed."""
-    store = tmp_path_factory.mktemp("packed") / "store"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(store.parent)
-        given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
-        assert call(monkeypatch, "data", "prepare", *given, f"out={store}") == 0
-    return store
+
+    def pack(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(folder)
+            given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
+            assert call(monkeypatch, "data", "prepare", *given, f"out={folder / 'store'}") == 0
+
+    return built_once("packed", pack) / "store"
 
 
 @pytest.fixture(scope="session")
-def latent_cache(pipeline, packed_toys, tmp_path_factory) -> Path:
+def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> Path:
     """The training set, encoded by the pipeline's stage 1."""
-    cache = tmp_path_factory.mktemp("latents") / "cache"
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.chdir(cache.parent)
-        given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
-        assert call(monkeypatch, "data", "latents", *given, f"out={cache}") == 0
-    return cache
+
+    def encode(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.chdir(folder)
+            given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
+            assert call(monkeypatch, "data", "latents", *given, f"out={folder / 'cache'}") == 0
+
+    return built_once("latents", encode) / "cache"
 
 
 @dataclass(frozen=True)

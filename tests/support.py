@@ -1,5 +1,7 @@
 """What tests of commands share."""
 
+import copy
+import functools
 import json
 import sys
 from pathlib import Path
@@ -8,6 +10,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import DictConfig
 
 from completesplat import cli
 from completesplat.commands import conf_folder
@@ -46,10 +49,15 @@ def strict_json(path: Path):
     return json.loads(path.read_text(), parse_constant=refuse)
 
 
-def compose_config(verb: str, *overrides: str):
-    """The configuration of a verb, as the command line would compose it."""
+@functools.cache
+def _composed_once(verb: str, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(verb, overrides=list(overrides))
+
+
+def compose_config(verb: str, *overrides: str) -> DictConfig:
+    """The configuration of a verb, as the command line would compose it; a copy that a test may change."""
+    return copy.deepcopy(_composed_once(verb, *overrides))
 
 
 def tiny_generator() -> CompleteSplat:

@@ -4,9 +4,12 @@ import sys
 import time
 
 import pytest
+from support import compose_config
 
 from completesplat import __version__
 from completesplat.cli import VERBS
+from completesplat.commands.predict import check_settings
+from completesplat.errors import CompleteSplatError
 
 
 def test_help_lists_the_verbs(command):
@@ -71,16 +74,8 @@ def test_fits_help_shows_the_groups(command):
         (["nonsense"], "no verb 'nonsense'"),
         (["fit", "nonsense=1"], "nonsense"),
         (["fit", "experiment=nonsense"], "nonsense"),
-        (
-            ["fit", "experiment=toy_diffusion", "data.root=nowhere", "data.scenes=0"],
-            "model.autoreconstructor_checkpoint",
-        ),
         (["predict"], "image is needed"),
         (["predict", "image=x.jpg", "weights=no_such_name"], "no_such_name: no such folder"),
-        (["predict", "image=x.jpg", "weights=nowhere"], "nowhere: no such folder"),
-        (["predict", "image=x.jpg", "weights=nowhere", "skip_weight=1.5"], "skip_weight=1.5"),
-        (["predict", "image=x.jpg", "weights=nowhere", "samples=0"], "samples=0"),
-        (["test"], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
         (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
         (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),
         (["data", "nonsense"], "nonsense"),
@@ -92,6 +87,19 @@ def test_refusals_are_one_line_and_status_two(command, arguments, said):
     assert finished.err.startswith("error: ")
     assert finished.err.count("\n") == 1
     assert said in finished.err
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("skip_weight=1.5", "skip_weight=1.5"),
+        ("guidance_weight=1.5", "guidance_weight=1.5: must lie between 0 and 1"),
+        ("samples=0", "samples=0: must be at least 1"),
+    ],
+)
+def test_settings_of_predict_outside_of_their_range_are_refused(setting, said):
+    with pytest.raises(CompleteSplatError, match=said):
+        check_settings(compose_config("predict", setting))
 
 
 def test_two_launches_in_one_second_do_not_share_a_directory():

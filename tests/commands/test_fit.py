@@ -4,7 +4,10 @@ import pytest
 import torch
 from lightning import Trainer
 from omegaconf import OmegaConf
-from support import SMALL, strict_json
+from support import SMALL, compose_config, strict_json
+
+from completesplat.commands.fit import refuse_missing
+from completesplat.errors import CompleteSplatError
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
@@ -110,25 +113,14 @@ def test_a_fit_scores_what_a_test_of_its_checkpoint_scores(command, pipeline, tm
     assert ours["model"]["views"] == ours["model"]["scenes"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["evaluation=realestate10k_256", "evaluation.evaluation_index=FILE"], "have no setting evaluation_index"),
-        (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
-        (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores pictures only"),
-        (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
-        (["evaluation.scoring.samples=2"], "draws no samples"),
-    ],
-)
-def test_a_protocol_that_does_not_fit_is_refused_before_training(
-    command, pipeline, tmp_path, monkeypatch, arguments, said
-):
+def test_a_protocol_that_does_not_fit_is_refused_before_training(command, pipeline, tmp_path, monkeypatch):
+    """Each protocol that does not fit is refused in `test_test`."""
     monkeypatch.setattr(Trainer, "fit", lambda *_, **__: pytest.fail("it trained"))
-    finished = command(
-        "fit", "experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, *arguments, f"out={tmp_path / 'run'}"
-    )
-    assert finished.status == 2
-    assert said in finished.err.splitlines()[-1]
+    given = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, f"out={tmp_path / 'run'}"]
+    for setting, said in (("evaluation.scoring.samples=2", "draws no samples"), ("evaluation=co3d", "is of co3d")):
+        finished = command("fit", *given, setting)
+        assert finished.status == 2
+        assert said in finished.err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
@@ -140,20 +132,22 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(
             "or null for random weights",
         ),
         (["experiment=toy_var_masked"], "model.checkpoint is needed: give model.checkpoint=RUN/checkpoints/last.ckpt"),
-        (
-            ["experiment=toy_diffusion"],
-            "model.autoreconstructor_checkpoint is needed: give model.autoreconstructor_checkpoint="
-            "RUN/checkpoints/last.ckpt of stage 1",
-        ),
         (["experiment=re10k_diffusion"], "data.root is needed: give data.root=DIR"),
     ],
-    ids=["pretrained", "checkpoint", "stage 1", "data"],
+    ids=["pretrained", "checkpoint", "data"],
 )
-def test_training_does_not_start_from_random_weights_without_a_word(command, toy_root, tmp_path, settings, asked):
-    given = [] if "data.root" in asked else [f"data.root={toy_root}"]
-    finished = command("fit", *settings, *given, *SMALL, "rasterizer=reference", f"out={tmp_path / 'run'}")
+def test_a_missing_setting_is_asked_for(settings, asked):
+    with pytest.raises(CompleteSplatError) as caught:
+        refuse_missing(compose_config("fit", *settings))
+    assert str(caught.value) == asked
+
+
+def test_training_does_not_start_from_random_weights_without_a_word(command, toy_root, tmp_path):
+    given = ["experiment=toy_diffusion", f"data.root={toy_root}", *SMALL]
+    finished = command("fit", *given, f"out={tmp_path / 'run'}")
     assert finished.status == 2
-    assert finished.err.splitlines()[-1] == f"error: {asked}"
+    asked = "give model.autoreconstructor_checkpoint=RUN/checkpoints/last.ckpt of stage 1"
+    assert finished.err.splitlines()[-1] == f"error: model.autoreconstructor_checkpoint is needed: {asked}"
     assert not (tmp_path / "run/checkpoints").exists()
 
 

@@ -103,9 +103,7 @@ def test_each_control_writes_its_files_and_changes_the_scenes(predict, runs):
     ("settings", "said"),
     [
         ([BOX, "skip_weight=0.5"], "skip_weight=0.5: must be 0 where the picture is hidden"),
-        (["guidance_weight=1.5"], "guidance_weight=1.5: must lie between 0 and 1"),
         (["steps=7"], "steps=7: DDIM's must divide 1000"),
-        (["samples=0"], "samples=0: must be at least 1"),
         (["mask=nowhere.png"], "nowhere.png: no such file"),
     ],
 )

@@ -13,7 +13,8 @@ from omegaconf import OmegaConf
 from support import SMALL, call, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.jobs import LONGEST_NAME, job_name, swept_keys
+from completesplat.commands.jobs import LONGEST_NAME, job_name, sweep_arguments, swept_keys
+from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -150,12 +151,13 @@ def test_a_run_is_not_overwritten_by_another(command, toy_root, whole):
 
 
 @pytest.mark.parametrize("variables", [{"LOCAL_RANK": "0"}, {"SLURM_STEP_NUM_TASKS": "2"}], ids=["torchrun", "srun"])
-def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, variables):
+def test_a_sweep_is_not_started_by_each_process_of_a_launcher(monkeypatch, variables):
+    given = ["-m", "experiment=toy_var", "seed=0,1"]
+    assert sweep_arguments("fit", given, "run")
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
-    assert refused.status == 2
-    assert "start it once" in refused.err.splitlines()[-1]
+    with pytest.raises(CompleteSplatError, match="start it once"):
+        sweep_arguments("fit", given, "run")
 
 
 def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:

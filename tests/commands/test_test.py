@@ -5,10 +5,13 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from support import strict_json
+from support import compose_config, strict_json
 
+from completesplat.commands.evaluate import scored_data
+from completesplat.commands.trained import configuration
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
+from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import SSIM_NOTE
 from completesplat.training.scene_module import SceneModule
 
@@ -151,26 +154,32 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
 def test_prepared_pictures_have_one_size(command, pipeline, tmp_path):
     settings = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32"]
     assert command("data", "prepare", *settings, f"out={tmp_path / 'prepared'}").status == 0
-    change = f"overrides=['data.root={tmp_path / 'prepared'}']"
-    checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    finished = command("test", f"ckpt={checkpoint}", change, "evaluation.resolution=48", f"out={tmp_path / 'out'}")
-    assert finished.status == 2
-    assert "evaluation.resolution=48: prepared pictures have one size" in finished.err.splitlines()[-1]
+    run = compose_config("fit", "experiment=toy_var", f"data.root={tmp_path / 'prepared'}", "data.image_size=32")
+    with pytest.raises(CompleteSplatError, match=r"evaluation\.resolution=48: prepared pictures have one size"):
+        scored_data(run, compose_config("fit", "evaluation.resolution=48").evaluation)
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["evaluation.scoring.samples=2"], "draws no samples"),
         (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
         (["evaluation=realestate10k_100", "evaluation.scene_list=FILE"], "have no setting scene_list"),
+        (["evaluation=realestate10k_256", "evaluation.evaluation_index=FILE"], "have no setting evaluation_index"),
         (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
+        (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores pictures only"),
     ],
 )
-def test_protocols_that_do_not_fit_are_refused(command, pipeline, tmp_path, arguments, said):
-    finished = command("test", f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", *arguments, f"out={tmp_path / 'out'}")
+def test_protocols_that_do_not_fit_the_data_are_refused(toy_root, arguments, said):
+    run = compose_config("fit", "experiment=toy_var", f"data.root={toy_root}", "data.image_size=32")
+    with pytest.raises(CompleteSplatError, match=said):
+        scored_data(run, compose_config("fit", *arguments).evaluation)
+
+
+def test_several_samples_of_a_model_that_draws_none_are_refused(command, pipeline, tmp_path):
+    given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"out={tmp_path / 'out'}"]
+    finished = command("test", *given, "evaluation.scoring.samples=2")
     assert finished.status == 2
-    assert said in finished.err.splitlines()[-1]
+    assert "draws no samples" in finished.err.splitlines()[-1]
 
 
 def test_weights_score_as_the_checkpoint_they_were_saved_with(command, pipeline, tmp_path):
@@ -194,7 +203,6 @@ def test_weights_score_as_the_checkpoint_they_were_saved_with(command, pipeline,
         (["ckpt=a", "data=toy_objects"], "a checkpoint's data are its run's"),
     ],
 )
-def test_what_is_to_be_scored_is_said_once(command, arguments, said):
-    finished = command("test", *arguments)
-    assert finished.status == 2
-    assert said in finished.err
+def test_what_is_to_be_scored_is_said_once(arguments, said):
+    with pytest.raises(CompleteSplatError, match=said):
+        configuration(compose_config("test", *arguments))

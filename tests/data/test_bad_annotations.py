@@ -4,15 +4,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from bad_annotations import BAD_ENTRIES, BAD_FILES, BAD_FRAMES, NAN, drop, put
+from bad_annotations import BAD_ENTRIES, BAD_FILES, BAD_FRAMES, CONSEQUENCES, NAN, WITHOUT, drop, put
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, write_tree
 
 from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
 from completesplat.data.validation import BadAnnotation, MissingFile, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
-
-# Who an entry without a name was of is not known, so what it leaves behind is told as well.
-CONSEQUENCES = {"name_is_a_number": 1, "sequence_without_name": 1}
 
 
 @pytest.fixture(scope="module")
@@ -57,13 +54,17 @@ def test_a_bad_frame_is_refused_with_file_sequence_and_frame(name, category):
 
 
 @pytest.mark.parametrize("name", BAD_ENTRIES)
-def test_a_bad_entry_is_refused_with_its_place(name, category):
+def test_a_bad_entry_is_refused_with_its_place_and_takes_away_no_more_than_what_it_is_of(name, category):
     file, edit, kind, sequence, frame, part = BAD_ENTRIES[name]
     change(category / file, edit)
-    first, *others = read(category).refused
+    found = read(category)
+    first, *others = found.refused
     assert (type(first), first.file, first.sequence, first.frame) == (kind, str(category / file), sequence, frame)
     assert part in first.reason
-    assert len(others) == CONSEQUENCES.get(name, 0)
+    assert len(others) == (name in CONSEQUENCES)
+    left = {key: [frame.number for frame in frames] for key, frames in found.splits["train"].frames.items()}
+    a = [number for number in range(4) if number not in WITHOUT.get(name, [])]
+    assert left == {"a": a, "b": [0, 1, 2, 3]} if a else left == {"b": [0, 1, 2, 3]}
 
 
 @pytest.mark.parametrize("name", BAD_FILES)

@@ -1,4 +1,4 @@
-"""Broken clips and files in pixelSplat's form, through the whole data module, under both policies.
+"""Broken clips and files in pixelSplat's form: each at its source, and one of each kind through the data module.
 
 60 cases by name: 20 in which the clip's content is wrong, 18 in which its entry is, 22 in which its file is.
 """
@@ -16,7 +16,19 @@ from typing import Any
 
 import pytest
 import torch
-from bad_clips import BAD, BAD_CLIPS, CLIPS, HELD_OUT, INTACT, SETTINGS, changed, check_policies, read_tree
+from bad_clips import (
+    BAD,
+    BAD_CLIPS,
+    CLIPS,
+    HELD_OUT,
+    INTACT,
+    SETTINGS,
+    changed,
+    check_policies,
+    check_source,
+    read_tree,
+)  # fmt: skip
+from bad_inputs import one_of_each_kind
 from realestate10k_trees import assert_refusal, chunk_entry, module, write_chunk_form, write_tree
 
 from completesplat.data.realestate10k.module import RE10KDataModule
@@ -40,8 +52,15 @@ def write(folder: Path, clips: list = CLIPS) -> Path:
     return folder / CHUNK
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
 @pytest.mark.parametrize("name", BAD_CLIPS)
+def test_a_clip_of_bad_content_is_refused_by_the_source_with_its_place(name, tmp_path):
+    change, kind, frame = BAD_CLIPS[name]
+    path = write(tmp_path / "train", changed(change))
+    check_source(path.parent, kind, path, frame)
+
+
+@pytest.mark.parametrize("policy", ["raise", "skip"])
+@pytest.mark.parametrize("name", one_of_each_kind(BAD_CLIPS, 1))
 def test_a_clip_of_bad_content_never_gets_into_a_batch(name, policy, tmp_path, intact):
     change, kind, frame = BAD_CLIPS[name]
     path = write(tmp_path / "train", changed(change))
@@ -76,14 +95,20 @@ BAD_ENTRIES: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
 @pytest.mark.parametrize("name", BAD_ENTRIES)
-def test_an_entry_of_another_type_or_shape_never_gets_into_a_batch(name, policy, tmp_path, intact):
+def test_an_entry_of_another_type_or_shape_is_refused_by_the_source(name, tmp_path):
     fields, part = BAD_ENTRIES[name]
     path = write(tmp_path / "train")
     torch.save([chunk_entry(CLIPS[0]) | fields], path)
     with pytest.raises(DataError, match=part):
         module(tmp_path, **SETTINGS).source("train").read(BAD)
+    check_source(path.parent, BadAnnotation, path, None)
+
+
+@pytest.mark.parametrize("policy", ["raise", "skip"])
+def test_an_entry_of_another_shape_never_gets_into_a_batch(policy, tmp_path, intact):
+    path = write(tmp_path / "train")
+    torch.save([chunk_entry(CLIPS[0]) | BAD_ENTRIES["cameras_of_17_columns"][0]], path)
     check_policies(path.parent, policy, intact, BadAnnotation, path, None)
 
 
@@ -177,17 +202,26 @@ BAD_FILES: dict[str, tuple[Damage, type[DataError]]] = {
 }
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_a_bad_file_never_gets_into_a_batch(name, policy, tmp_path, intact, monkeypatch):
+def test_a_bad_file_is_refused_by_the_source_and_runs_nothing(name, tmp_path, monkeypatch):
     damage, kind = BAD_FILES[name]
     path = write(tmp_path / "train")
     damage(path)
     calls: list[object] = []
     for module_name in ("os", "posix"):
         monkeypatch.setattr(f"{module_name}.system", calls.append)
-    check_policies(path.parent, policy, intact, kind, path, None)
+    check_source(path.parent, kind, path, None)
     assert not calls
+    assert not (tmp_path / "canary").exists()
+
+
+@pytest.mark.parametrize("policy", ["raise", "skip"])
+@pytest.mark.parametrize("name", [*one_of_each_kind(BAD_FILES, 1), "pickle_that_runs_torch_hub_load"])
+def test_a_bad_file_never_gets_into_a_batch(name, policy, tmp_path, intact):
+    damage, kind = BAD_FILES[name]
+    path = write(tmp_path / "train")
+    damage(path)
+    check_policies(path.parent, policy, intact, kind, path, None)
     assert not (tmp_path / "canary").exists()
 
 

@@ -1,4 +1,4 @@
-"""Broken clips as texts beside frames, through the whole data module, under both policies.
+"""Broken clips as texts beside frames: each at its source, and one of each kind of error through the data module.
 
 35 cases by name: 20 in which the clip's content is wrong, 15 in which its text or folder is.
 """
@@ -7,10 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bad_clips import BAD, BAD_CLIPS, CLIPS, SETTINGS, changed, check_policies
+from bad_clips import BAD, BAD_CLIPS, CLIPS, SETTINGS, changed, check_policies, check_source
+from bad_inputs import one_of_each_kind
 from realestate10k_trees import assert_refusal, module, write_text_form, write_tree
 
-from completesplat.data.realestate10k.module import RE10KDataModule, clips
+from completesplat.data.realestate10k import clips
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -92,23 +94,29 @@ BAD_TEXTS: dict[str, tuple[Damage, type[DataError], str, int | None]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
-@pytest.mark.parametrize("name", BAD_CLIPS)
-def test_a_clip_of_bad_content_never_gets_into_a_batch(name, policy, tmp_path, intact):
+def written(train: Path, name: str) -> tuple[type[DataError], Path, int | None]:
+    """Write the clips with one that is broken; the kind of the error, its file and its frame."""
+    if name in BAD_TEXTS:
+        write_text_form(train, CLIPS)
+        damage, kind, file, frame = BAD_TEXTS[name]
+        damage(train)
+        return kind, train / file, frame
     change, kind, frame = BAD_CLIPS[name]
-    clips, folder = changed(change), tmp_path / "train"
-    write_text_form(folder, clips)
-    file = f"{BAD}/{clips[0].timestamps[frame or 0]}.jpg" if kind is BadPicture else TEXT
-    check_policies(folder, policy, intact, kind, folder / file, frame)
+    clips = changed(change)
+    write_text_form(train, clips)
+    return kind, train / (f"{BAD}/{clips[0].timestamps[frame or 0]}.jpg" if kind is BadPicture else TEXT), frame
+
+
+@pytest.mark.parametrize("name", [*BAD_CLIPS, *BAD_TEXTS])
+def test_a_broken_clip_is_refused_by_the_source_with_its_place(name, tmp_path):
+    check_source(tmp_path / "train", *written(tmp_path / "train", name))
 
 
 @pytest.mark.parametrize("policy", ["raise", "skip"])
-@pytest.mark.parametrize("name", BAD_TEXTS)
-def test_a_clip_of_bad_files_never_gets_into_a_batch(name, policy, tmp_path, intact):
-    damage, kind, file, frame = BAD_TEXTS[name]
-    write_text_form(tmp_path / "train", CLIPS)
-    damage(tmp_path / "train")
-    check_policies(tmp_path / "train", policy, intact, kind, tmp_path / "train" / file, frame)
+@pytest.mark.parametrize("name", [*one_of_each_kind(BAD_CLIPS, 1), *one_of_each_kind(BAD_TEXTS, 1)])
+def test_a_broken_clip_never_gets_into_a_batch(name, policy, tmp_path, intact):
+    kind, file, frame = written(tmp_path / "train", name)
+    check_policies(tmp_path / "train", policy, intact, kind, file, frame)
 
 
 @pytest.mark.parametrize("policy", ["raise", "skip"])
@@ -137,8 +145,9 @@ BAD_SETS: dict[str, tuple[Damage, type[DataError]]] = {
 }
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
-@pytest.mark.parametrize("name", BAD_SETS)
+@pytest.mark.parametrize(
+    ("name", "policy"), [(n, "raise") for n in BAD_SETS] + [(n, "skip") for n in one_of_each_kind(BAD_SETS, 1)]
+)
 def test_a_folder_without_any_use_is_raised_under_either_policy(name, policy, tmp_path):
     damage, kind = BAD_SETS[name]
     write_text_form(tmp_path / "train", CLIPS)
