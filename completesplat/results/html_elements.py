@@ -12,6 +12,17 @@ from PIL import Image
 EMPTY = {"img", "meta", "link", "br"}
 """Elements that have no end tag."""
 
+WIDEST = 1600
+"""Pixels of the widest picture; wider ones are made smaller."""
+MOST_PIXELS = 50_000_000
+AS_THEY_ARE = 300_000
+"""Bytes up to which a picture of that width is not encoded again."""
+QUALITY = 85
+SIDE = 256
+"""Pixels of a frame's longer side, at most."""
+LONGEST = 60_000
+"""Pixels of the widest strip of frames; JPEG ends at 65,535."""
+
 
 class Html(str):
     """Text that is HTML. Everything else is plain text, whatever characters it holds."""
@@ -61,14 +72,6 @@ def described(pairs: dict[str, str]) -> Html:
 def left_out(text: str) -> Html:
     """A line on what is not shown."""
     return element("p", text, class_="left-out")
-
-
-WIDEST = 1600
-"""Pixels; wider pictures are made smaller."""
-MOST_PIXELS = 50_000_000
-AS_THEY_ARE = 300_000
-"""Bytes up to which a picture of that width is not encoded again."""
-QUALITY = 85
 
 
 class ByteBudget:
@@ -125,12 +128,6 @@ def as_jpeg(image: Image.Image) -> bytes:
     file = io.BytesIO()
     image.save(file, "JPEG", quality=QUALITY, optimize=True)
     return file.getvalue()
-
-
-SIDE = 256
-"""Pixels of a frame's longer side, at most."""
-LONGEST = 60_000
-"""Pixels; JPEG ends at 65,535."""
 
 
 def strip(video: Path, count: int) -> tuple[Image.Image, int]:

@@ -23,11 +23,40 @@ from completesplat.results.own import mode_tables, own_tables
 from completesplat.results.published import tables as compared
 from completesplat.results.runs import CONFIG, MODES, ROWS, SCENE, SCORES, RunTree, find, mapping_or_empty, origin
 from completesplat.results.scores import entries
-from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table
+from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table, TableRow
 
 MARKED = {BEST: "strong", SECOND: "u"}
 PUBLISHED = "paper"
 """The source of rows that are no results of ours."""
+
+FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}
+"""Subfolders of a run, and the pictures in each."""
+CAPTIONS = {
+    "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
+    "samples": ": samples of fixed scenes while training",
+}
+LONGEST = 20_000
+"""Characters of a configuration that are shown."""
+NAMED = {
+    "image": "photograph",
+    "mask": "mask",
+    "box": "box",
+    "fov_degrees": "degrees of view",
+    "seed": "seed",
+    "skip_weight": "skip weight",
+    "guidance_weight": "guidance",
+    "sampler": "sampler",
+    "steps": "steps",
+}
+"""Settings of a prediction, and what they are called here."""
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+"""What the browser enforces: this page asks for nothing, whatever is in it."""
+UNFOLDED = 3
+"""Up to this number of runs all are unfolded; of more, only those with a report's figure."""
+HINT = (
+    "Move the mouse over a sample, drag a finger across it, or give it the focus and use the arrow keys: all samples "
+    "of the photograph turn together. What the photograph does not show is made up, differently in each sample."
+)
 
 
 @dataclass(frozen=True)
@@ -59,21 +88,22 @@ def rows_of(title: str, rows: Sequence[Any]) -> Html:
     """Records with the same keys, such as `completesplat report samplers` writes."""
     records = [row for row in rows if isinstance(row, Mapping)]
     keys = list(dict.fromkeys(str(key) for row in records for key, value in row.items() if _is_plain(value)))
-    head = element("tr", *(element("th", key.replace("_", " "), scope="col") for key in keys))
-    body = [element("tr", *(element("td", _said(row.get(key))) for key in keys)) for row in records]
-    shown = element("table", element("caption", title), element("thead", head), element("tbody", *body))
-    return scrollable(title, shown)
+    body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
+    return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body, gaps=True))
 
 
 def _whole(table: Table) -> Html:
-    body, above = [], False
-    for row, ruled in table.ruled_rows():
-        body.append(element("tr", *map(_cell, table.headings, row.cells), class_="rule" if above else False))
-        above = ruled
-    shown = element("table", element("caption", table.title), element("thead", *_head(table)), element("tbody", *body))
     below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
-    said = folded("What this table says, and how it was measured", below)
-    return element("div", scrollable(table.title, shown), said)
+    return element("div", _grid(table), folded("What this table says, and how it was measured", below))
+
+
+def _grid(table: Table) -> Html:
+    body, ruled = [], False
+    for row, ruled_below in table.ruled_rows():
+        body.append(element("tr", *map(_cell, table.headings, row.cells), class_="rule" if ruled else False))
+        ruled = ruled_below
+    shown = element("table", element("caption", table.title), element("thead", *_head(table)), element("tbody", *body))
+    return scrollable(table.title, shown)
 
 
 def _head(table: Table) -> list[Html]:
@@ -98,16 +128,6 @@ def _is_plain(value: Any) -> bool:
 
 def _said(value: Any) -> str:
     return "" if value is None else format(value, ".4g") if isinstance(value, float) else str(value)
-
-
-FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}
-"""Subfolders of a run, and the pictures in each."""
-CAPTIONS = {
-    "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
-    "samples": ": samples of fixed scenes while training",
-}
-LONGEST = 20_000
-"""Characters of a configuration that are shown."""
 
 
 @dataclass(frozen=True)
@@ -150,20 +170,6 @@ def _more(count: int, what: str) -> list[Html]:
     return [left_out(f"{count} {what} left out")] if count > 0 else []
 
 
-NAMED = {
-    "image": "photograph",
-    "mask": "mask",
-    "box": "box",
-    "fov_degrees": "degrees of view",
-    "seed": "seed",
-    "skip_weight": "skip weight",
-    "guidance_weight": "guidance",
-    "sampler": "sampler",
-    "steps": "steps",
-}
-"""Settings of a prediction, and what they are called here."""
-
-
 def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget) -> Html:
     """A section of one photograph: how its samples were made, each of them turning, and the sheet."""
     settings = mapping_or_empty(path / SCENE).get("settings")
@@ -187,18 +193,6 @@ def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget
 def _settings(settings: dict[str, Any]) -> str:
     """The settings that matter, in one line."""
     return ", ".join(f"{name} {_said(settings[key])}" for key, name in NAMED.items() if settings.get(key) is not None)
-
-
-POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-"""What the browser enforces: this page asks for nothing, whatever is in it."""
-UNFOLDED = 3
-"""Runs up to which all of them are; otherwise those with a report's figure."""
-
-
-HINT = (
-    "Move the mouse over a sample, drag a finger across it, or give it the focus and use the arrow keys: all samples "
-    "of the photograph turn together. What the photograph does not show is made up, differently in each sample."
-)
 
 
 def page(folder: Path, out: Path, limits: Limits, made: Mapping[str, str]) -> tuple[str, list[str]]:
@@ -251,8 +245,8 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
     for path in tree.runs:
         figures = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
         figures = {part: paths for part, paths in figures.items() if paths}
-        told = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
-        if told and path.resolve() != out.resolve():
+        shows = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
+        if shows and path.resolve() != out.resolve():
             shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
     return shown
 

@@ -25,10 +25,16 @@ ALIKE += ["precision", "data_fingerprint", "metrics"]
 """What the protocols of a table's rows have in common."""
 SAID = ["subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "crop"]
 SAID += ["precision"]
+"""What a table says of its protocol."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
+"""The scores that a table shows where a run has them."""
 IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]
 IDENTITY += [Heading("rendering", "time per sequence"), Heading("scenes"), Heading("pixels")]
+
+SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
+SCORES |= {"rejected": "rejected ↓"}
+COUNTS = ("scenes", "samples")
 
 
 def alike(protocol: dict[str, Any]) -> str:
@@ -87,11 +93,6 @@ def _known(entry: Entry, column: str) -> bool:
     region, _, name = column.split("_")
     stated = name in (entry.run.protocol.get("missing") or {}) and region in entry.scores
     return stated or entry.value(column) is not None
-
-
-SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
-SCORES |= {"rejected": "rejected ↓"}
-COUNTS = ("scenes", "samples")
 
 
 def mode_tables(runs: Sequence[Result]) -> list[Table]:

@@ -31,6 +31,20 @@ FILE = Path(__file__).with_name("figures.yaml")
 MARKS = ("best", "second", "dagger", "star")
 METRICS = ("psnr", "lpips", "fid", "kid")
 
+SIGNS = {"dagger": "†", "star": "★"}
+IDENTITY = {"method": "method", "speed": "rendering speed"}
+COST = {"inference": "inference", "rendering": "rendering"}
+LEADING = {**IDENTITY, **COST, "scenes": "scenes", "resolution": "pixels"}
+VIEWS = (
+    "The paper names both reference and novel views in its protocol and does not say how it weighs them; "
+    "our rows are of novel views."
+)
+COLUMNS = [f"full_novel_{name}" for name in ("psnr", "ssim", "lpips", "fid", "kid")]
+APART = (
+    "The published columns are by the paper's protocol, ours by the one stated here: figures compare within the "
+    "columns of one heading only."
+)
+
 
 @dataclass(frozen=True)
 class PrintedCell:
@@ -121,16 +135,6 @@ def _table(entry: Mapping[str, Any]) -> PublishedTable:
     return PublishedTable(**given, legend={mark: entry[mark] for mark in MARKS if mark in entry})
 
 
-SIGNS = {"dagger": "†", "star": "★"}
-IDENTITY = {"method": "method", "speed": "rendering speed"}
-COST = {"inference": "inference", "rendering": "rendering"}
-LEADING = {**IDENTITY, **COST, "scenes": "scenes", "resolution": "pixels"}
-VIEWS = (
-    "The paper names both reference and novel views in its protocol and does not say how it weighs them; "
-    "our rows are of novel views."
-)
-
-
 def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     """The published rows, then those of our runs that `belongs` lets in.
 
@@ -212,13 +216,6 @@ def _own(entry: Entry, key: str, notes: Notes) -> Cell:
     if key in COST:
         return entry.time(key)
     return Cell(ABSENT if key == "speed" else str(entry.run.protocol[key]))
-
-
-COLUMNS = [f"full_novel_{name}" for name in ("psnr", "ssim", "lpips", "fid", "kid")]
-APART = (
-    "The published columns are by the paper's protocol, ours by the one stated here: figures compare within the "
-    "columns of one heading only."
-)
 
 
 def published_ablations(table: PublishedTable) -> Table:

@@ -19,6 +19,14 @@ AGREEMENT = 1e-4
 """How far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it."""
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
 WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]
+"""Scores in the table of a sweep."""
+
+OURS = "completesplat: "
+"""Not "ours": so the paper calls its own rows."""
+DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
+DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
+DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]
+"""What the note on a row says of its protocol."""
 
 
 def rows(finished: Sequence[Job]) -> list[dict[str, Any]]:
@@ -125,14 +133,6 @@ def _figure(mean: float | None, deviation: float | None, form: str) -> str:
     if mean is None:
         return ""
     return format(mean, form) if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
-
-
-OURS = "completesplat: "
-"""Not "ours": so the paper calls its own rows."""
-DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
-DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
-DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]
-"""Of a protocol, for the note on a row."""
 
 
 @dataclass(frozen=True)

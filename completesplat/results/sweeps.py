@@ -12,7 +12,7 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import SEED, Job, collect, typed
 from completesplat.results.tables import (
@@ -27,12 +27,22 @@ from completesplat.results.tables import (
     score_heading,
     show,
     write_csv,
-    write_text,
 )
 
 # Hydra imports this file for every run, also to print the help: numpy, torch, rich and matplotlib are imported when a
 # job has ended.
 log = logging.getLogger(__name__)
+
+CAPTION = (
+    "Mean ± sample standard deviation over seeds; PSNR in dB. "
+    f"The best of our rows is in bold, the second best underlined. {SSIM_NOTE}"
+)
+NOTHING = "No job of this sweep has finished."
+FOLDERS = re.compile(r"""(?<![^=,\[\s'"])/(?:[^/,\]\s'"]+/)+(?=[^/,\]\s'"])""")
+"""An absolute path inside an argument, up to its last part."""
+COLUMN = "full_novel_psnr"
+AXIS = "PSNR of novel views, all pixels (dB)"
+LINES = {"mean_image": "--", "copy_reference": ":"}
 
 
 class SweepSummary(Callback):
@@ -61,13 +71,6 @@ def _summarize(config: Any, last: bool) -> None:
             print(folder / "summary.md")
     except Exception as error:  # whatever it is, the jobs that are still to come matter more
         log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
-
-
-CAPTION = (
-    "Mean ± sample standard deviation over seeds; PSNR in dB. "
-    f"The best of our rows is in bold, the second best underlined. {SSIM_NOTE}"
-)
-NOTHING = "No job of this sweep has finished."
 
 
 @dataclass(frozen=True)
@@ -150,10 +153,6 @@ def _machine() -> str:
     return f"Summary of {here['date']}, made on {hardware}, {software}."
 
 
-# An absolute path inside an argument, up to its last part.
-FOLDERS = re.compile(r"""(?<![^=,\[\s'"])/(?:[^/,\]\s'"]+/)+(?=[^/,\]\s'"])""")
-
-
 def _commands(jobs: Sequence[Job]) -> list[str]:
     """The commands that started the jobs, usually one, each absolute path cut to its last part."""
     lines = (typed(job.record["command"]) for job in jobs if job.record)
@@ -194,11 +193,6 @@ def show_summary(summary: Summary) -> None:
     table = summary.table
     narrow = [replace(heading, group=heading.group.replace(", ", "\n")) for heading in table.headings]
     show(replace(table, headings=narrow, remarks=[SSIM_NOTE, *table.remarks]), width=160)
-
-
-COLUMN = "full_novel_psnr"
-AXIS = "PSNR of novel views, all pixels (dB)"
-LINES = {"mean_image": "--", "copy_reference": ":"}
 
 
 def _plot(rows: Sequence[dict[str, Any]], path: Path) -> None:

@@ -7,7 +7,7 @@ from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import Any
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, write_text
 
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
 FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
@@ -33,6 +33,14 @@ ESCAPES = str.maketrans(
 )
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
+
+Column = tuple[str, str, str]
+"""A heading, the key of the record, and the format of its values, empty for text."""
+LABELS = {"full": "all\npixels", "object": "object\npixels"}
+EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
+EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
+"""Scores in the table of an evaluation."""
+CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
 
 def metric(name: str) -> str:
@@ -161,9 +169,6 @@ class Table:
         return shown
 
 
-Column = tuple[str, str, str]  # heading, key of the record, format
-
-
 def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any]]) -> Table:
     """One row for each record; what a record lacks stays empty."""
     rows = []
@@ -187,16 +192,11 @@ def by_name(entry: dict[str, Any]) -> dict[str, float]:
     }
 
 
-LABELS = {"full": "all\npixels", "object": "object\npixels"}
-ALWAYS = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
-WHERE_MEASURED = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
-
-
 def evaluation_table(results: dict[str, Any]) -> Table:
     """One row for each predictor of `Evaluation.results`, PSNR in dB."""
     records = [{"predictor": predictor} | by_name(entry) for predictor, entry in results.items()]
     columns = [("predictor", "predictor", "")]
-    for name in [*ALWAYS, *(name for name in WHERE_MEASURED if name in records[0])]:
+    for name in [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]:
         region, view, kind = name.split("_")
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
     first = next(iter(results.values()))
@@ -261,9 +261,6 @@ def as_latex(table: Table) -> str:
     return "\n".join([*top, *shrunk, *below, r"\end{table*}", ""])
 
 
-CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
-
-
 def write_tables(tables: Sequence[Table], out: Path) -> None:
     """Write `tables.md`, `tables.tex` and `tables.csv`, the last with a line for each cell."""
     write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
@@ -284,9 +281,3 @@ def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]])
         writer = csv.writer(file)
         writer.writerow(header)
         writer.writerows(lines)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file of text whole or not at all."""
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

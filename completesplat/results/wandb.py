@@ -35,8 +35,9 @@ class SceneTable:
     sample; the turntables are also `folder/00.mp4` and so on.
 
     Args:
-        folder: of the videos.
-        most: scenes.
+        module: the model that is tested.
+        folder: where the videos go.
+        most: how many scenes are kept.
     """
 
     def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
@@ -48,7 +49,7 @@ class SceneTable:
 
     @torch.no_grad()
     def add(self, scene: ScoredScene) -> None:
-        """Keep what is shown of a scene."""
+        """Keep pictures, video and scores of a scene, up to `most` scenes."""
         if len(self.rows) >= self.most:
             return
         row: dict[str, Any] = {"scene": scene.name, "input": strip(scene.input[None])}
@@ -111,7 +112,7 @@ def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
 
 
 def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
-    """If W&B is among the loggers, begin its run, and collect what it is to show of the scenes of a test."""
+    """If W&B is among the loggers, begin its run, and collect the scenes of a test for it; None otherwise."""
     runs = wandb_runs(trainer.loggers)
     if not runs or not trainer.is_global_zero:
         return None
@@ -126,8 +127,9 @@ def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Traine
     """Log `test/PREDICTOR/REGION_VIEW_METRIC`; for W&B also tables, pictures and videos.
 
     Args:
-        results: of `SceneModule.test_results`.
-        scenes: of `begin`.
+        results: those of `SceneModule.test_results`.
+        scenes: what `begin` returned.
+        trainer: the trainer of the test, with its loggers.
         out: the run directory, with the results in its `metrics.json`.
     """
     flat = {predictor: by_name(scores) for predictor, scores in results.items()}
