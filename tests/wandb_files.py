@@ -76,9 +76,9 @@ def raw_records(data: bytes) -> Iterator[bytes]:
             record = b""
 
 
-def shown_by(values: dict[str, Any], panel: Any) -> set[str]:
-    """The keys of those values that a panel shows."""
-    if panel.kind == "line":
-        return {key for key, x in values.items() if fnmatchcase(key, panel.keys) and isinstance(x, float | int)}
+def logged(values: dict[str, Any], keys: str, kind: str) -> set[str]:
+    """Those of the values that have such a key (`*` stands for anything) and are of this kind."""
+    if kind == "number":
+        return {key for key, x in values.items() if fnmatchcase(key, keys) and isinstance(x, float | int)}
     types = {key.removesuffix("/_type"): x for key, x in values.items() if key.endswith("/_type")}
-    return {key for key, x in types.items() if fnmatchcase(key, panel.keys) and x == TYPES[panel.kind]}
+    return {key for key, x in types.items() if fnmatchcase(key, keys) and x == TYPES[kind]}

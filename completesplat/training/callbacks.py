@@ -1,4 +1,4 @@
-"""What happens around training: averaged weights, seeds of each step, the progress bar."""
+"""Callbacks of training: seeds of each step, averaged weights, the progress bar, and the weights that are exported."""
 
 import logging
 from collections.abc import Iterator
@@ -14,6 +14,8 @@ from rich import get_console
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.training.latent_diffusion import LatentDiffusion
+
+logger = logging.getLogger(__name__)
 
 
 class StepSeeds(Callback):
@@ -34,34 +36,6 @@ class StepSeeds(Callback):
 def step_seed(*place: int) -> int:
     """64 bits that are different and unrelated for different places (NumPy's `SeedSequence`)."""
     return int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
-
-
-logger = logging.getLogger(__name__)
-
-
-class Progress(RichProgressBar):
-    """Lightning's bar, with optimizer steps; where nobody watches (no terminal), a line after every validation."""
-
-    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
-        """What stands behind the bar."""
-        metrics = super().get_metrics(trainer, pl_module)
-        metrics.pop("v_num", None)
-        return {"step": _steps(trainer), **metrics}
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_validation_end(trainer, pl_module)
-        if get_console().is_terminal or not trainer.is_global_zero:
-            return
-        shown = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
-        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
-
-    def _get_train_description(self, current_epoch: int) -> str:
-        """Lightning's speaks of -2 epochs where there is no limit to them."""
-        return f"Epoch {current_epoch}"
-
-
-def _steps(trainer: Trainer) -> str:
-    return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
 
 
 class ExponentialMovingAverage(WeightAveraging):
@@ -91,6 +65,31 @@ class ExponentialMovingAverage(WeightAveraging):
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_end(trainer, pl_module)
+
+
+class Progress(RichProgressBar):
+    """Lightning's bar, with optimizer steps; where nobody watches (no terminal), a line after every validation."""
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+        """The figures behind the bar."""
+        metrics = super().get_metrics(trainer, pl_module)
+        metrics.pop("v_num", None)
+        return {"step": _steps(trainer), **metrics}
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_validation_end(trainer, pl_module)
+        if get_console().is_terminal or not trainer.is_global_zero:
+            return
+        shown = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
+        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
+
+    def _get_train_description(self, current_epoch: int) -> str:
+        """Lightning's speaks of -2 epochs where there is no limit to them."""
+        return f"Epoch {current_epoch}"
+
+
+def _steps(trainer: Trainer) -> str:
+    return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
 
 
 class ExportWeights(Callback):

@@ -1,4 +1,4 @@
-"""Checkpoints: when they are written, how they get onto the disk, how they are read."""
+"""Checkpoints: when they are written, how a file is replaced whole, and how weights are read from them."""
 
 import os
 import shutil
@@ -49,7 +49,7 @@ class Checkpoints(Checkpoint):
     Args:
         folder: of the files.
         every_n_train_steps: optimizer steps between them; None: they do not matter.
-        every_minutes: the next is due so long after the one before; None: time does not matter.
+        every_minutes: minutes between them; None: time does not matter.
         keep_every: optimizer steps between milestones; None: none are kept.
 
     Raises:

@@ -77,7 +77,7 @@ class LatentDiffusion(SceneModule):
         prepare_network(completesplat.denoiser, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Measure what the training set alone tells: the latents' scale, and the camera of a typical photograph.
+        """Measure on the training set the latents' scale, and the camera of a typical photograph.
 
         Raises:
             WeightsError: frozen parts have no weights.

@@ -1,4 +1,4 @@
-"""`metrics.csv`, also of a run that goes on, and runs of Weights & Biases, whatever happens to its server."""
+"""Two loggers: `metrics.csv`, which a continued run goes on with, and one run of Weights & Biases for a directory."""
 
 import csv
 import logging
@@ -18,7 +18,19 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from lightning.pytorch.utilities import rank_zero_only
 
+from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError
+
+MODES = ("online", "offline", "disabled")
+ANSWER_SECONDS, START_SECONDS = 4, 6
+"""How long a server may take to answer at all, and to start a run: together the longest that it can delay training."""
+AXIS = "trainer/global_step"
+SWEEP = "multirun.yaml"  # hydra's, in a sweep's folder
+ID = "wandb_id"
+DATA = "WANDB_DATA_DIR"
+GATEWAY_ERRORS = 502
+
+log = logging.getLogger(__name__)
 
 
 class ContinuedCSVLogger(CSVLogger):
@@ -75,23 +87,10 @@ class MetricsFile(ExperimentWriter):
         return [row for row in rows if self.begun or int(row["step"]) < first]
 
     def _replace(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        temporary = self.path.with_suffix(".csv.new")
-        with temporary.open("w", newline="") as file:
+        with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self.metrics_keys)
             writer.writeheader()
             writer.writerows(rows)
-        temporary.replace(self.path)
-
-
-log = logging.getLogger(__name__)
-MODES = ("online", "offline", "disabled")
-ANSWER_SECONDS, START_SECONDS = 4, 6
-"""How long a server may take to answer at all, and to start a run: together the longest that it can delay training."""
-AXIS = "trainer/global_step"
-SWEEP = "multirun.yaml"  # hydra's, in a sweep's folder
-ID = "wandb_id"
-DATA = "WANDB_DATA_DIR"
-GATEWAY_ERRORS = 502
 
 
 class WandbRun(WandbLogger):
@@ -138,7 +137,7 @@ class WandbRun(WandbLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        """W&B's run (Lightning's name for what a logger writes to), which begins when it is first asked for."""
+        """W&B's run (Lightning's name for what a logger writes to), which begins at the first access."""
         if self._experiment is None:
             self._experiment = self._begin()
             self._experiment.define_metric(AXIS)
@@ -240,7 +239,7 @@ def wandb_runs(loggers: Iterable[Logger]) -> list[WandbRun]:
 
 
 def answers(url: str, seconds: float) -> bool:
-    """Whether there is a server that says anything, if only no, within a time that also covers looking up its name."""
+    """Whether there is a server that answers, by a refusal too, within a time that includes the look-up of its name."""
     found: list[bool] = []
     # Left behind if it takes longer: a look-up of a name cannot be interrupted.
     asking = threading.Thread(target=lambda: found.append(_asked(url, seconds)), daemon=True)

@@ -1,4 +1,4 @@
-"""How fast a run is, what it waits for, and what it needs."""
+"""Speed of a run, its waiting for data, and its memory."""
 
 import time
 from pathlib import Path
@@ -18,7 +18,7 @@ class Throughput(Callback):
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
     for data, are of the steps since the last row; `memory/process_gb` is what the training process has in memory now
-    (where the system tells), `memory/gpu_gb` the most that torch had allocated on the GPU (where there is one), in GiB.
+    (on Linux), `memory/gpu_gb` the most that torch had allocated on the GPU (where there is one), in GiB.
     The clock stands still during validation, and from a row to the next batch: while pictures are drawn and checkpoints
     written, if their intervals are multiples of the trainer's, and this callback stands before those.
     """
@@ -64,7 +64,7 @@ class Throughput(Callback):
 
 
 class DataClock(Profiler):
-    """Measures what Lightning tells a profiler about fetching batches, and passes everything on to another profiler."""
+    """A profiler that measures the time of fetching batches, and passes every call on to another profiler."""
 
     def __init__(self, profiler: Profiler) -> None:
         super().__init__()
@@ -73,14 +73,14 @@ class DataClock(Profiler):
         self.waited = 0.0
 
     def start(self, action_name: str) -> None:
-        """Something begins."""
+        """Called by Lightning before an action."""
         if action_name == FETCHING:
             self.since = time.perf_counter()
             self.begin = self.since if self.begin is None else self.begin
         self.profiler.start(action_name)
 
     def stop(self, action_name: str) -> None:
-        """It ends."""
+        """Called by Lightning behind it."""
         self.profiler.stop(action_name)
         if action_name == FETCHING:
             self.waited += time.perf_counter() - self.since
@@ -110,7 +110,7 @@ def memory(device: torch.device) -> dict[str, float]:
 
 
 def _now(module: LightningModule) -> float:
-    """Seconds, when the device has done all that it was told."""
+    """Seconds, when the device has finished its work."""
     if module.device.type == "cuda":
         torch.cuda.synchronize(module.device)
     return time.perf_counter()
