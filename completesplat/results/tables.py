@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table as TerminalTable
+from rich.text import Text
 
 from completesplat.atomic import atomic_path
 
@@ -252,9 +253,7 @@ def _piped(cell: Cell) -> str:
     return cell.text.replace("|", r"\|")
 
 
-def _styled(cell: Cell, style: str):
-    from rich.text import Text
-
+def _styled(cell: Cell, style: str) -> Text:
     return Text(cell.text, style=style)
 
 
