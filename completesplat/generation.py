@@ -120,7 +120,7 @@ class CompleteSplat(nn.Module):
             steps: denoising steps; the sampler's own number by default.
             seed: of all noise, or one for each image: what is drawn for it then depends on no other image.
             visible: 0 where an image is hidden: what is there has no influence.
-            batch: at most so many latents at a time; all by default, or fewer if a GPU's memory does not suffice.
+            batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
             on_step: called after each denoiser call, for each batch, with its number, the timestep and the scenes that
                 the estimate of the clean latent stands for.
 

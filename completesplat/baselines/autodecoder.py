@@ -50,7 +50,7 @@ class AutoDecoder(nn.Module):
         return self.reconstructor(codes, ())
 
     def make_room(self, rows: int) -> None:
-        """A new table for so many pictures, all rows of it free."""
+        """A new table for this number of pictures, all rows of it free."""
         device = self.reconstructor.post_quant_conv.weight.device
         self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape).to(device))
         self._rows = {}

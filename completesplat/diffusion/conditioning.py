@@ -1,6 +1,6 @@
 """Feature encoders F_feat of the reference image: phi_ref = F_feat(I_ref) (paper, Section 3.3).
 
-`frozen` tells whether an encoder stays as it is in training, so that its features may be computed once and kept.
+`frozen` says whether an encoder stays as it is in training, so that its features may be computed once and kept.
 """
 
 from collections.abc import Sequence

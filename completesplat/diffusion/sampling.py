@@ -103,7 +103,7 @@ def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any])
 def draw_noise(
     images: int, samples: int, shape: tuple[int, ...], seed: int | Sequence[int]
 ) -> Float[Tensor, "latent _ _ _"]:
-    """Noise of this shape for so many samples of each image, those of one image next to each other.
+    """Noise of this shape for several samples of each image, those of one image next to each other.
 
     Args:
         seed: of all noise, or one for each image.

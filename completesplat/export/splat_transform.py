@@ -114,7 +114,7 @@ class PageView:
 
 
 def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
-    """Write the page: the scene upright, seen from the front, turning until somebody touches it.
+    """Write the page: the scene upright, seen from the front, turning until a person touches it.
 
     Raises:
         CompleteSplatError: nothing to show, or the converter fails.

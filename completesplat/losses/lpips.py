@@ -14,6 +14,10 @@ from completesplat.weights import weights_file
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 ADVICE = f"fetch VGG16 with `curl -LO {URL}` and give the file as loss.terms.lpips.term.vgg_weights=FILE"
+# Mean and deviation of ImageNet's colours on [-1, 1], as rounded by Zhang et al. (`lpips/lpips.py`, ScalingLayer).
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+SMALLEST_NORM = 1e-10
 
 
 class VGG16Features(nn.Module):
@@ -69,12 +73,6 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
         first = str(error).splitlines()[1].strip()
         raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({first:.200}); {ADVICE}") from error
     return network.float()
-
-
-# Mean and deviation of ImageNet's colours on [-1, 1], as rounded by Zhang et al. (`lpips/lpips.py`, ScalingLayer).
-SHIFT = (-0.030, -0.088, -0.188)
-SCALE = (0.458, 0.448, 0.450)
-SMALLEST_NORM = 1e-10
 
 
 class PerceptualDistance(nn.Module):

@@ -17,36 +17,6 @@ from completesplat.metrics.missing import Missing
 from completesplat.metrics.samples import best, diversity, expected_best_curve
 from completesplat.scene import SceneBatch, Views
 
-
-def depth_errors(
-    predicted: Float[Tensor, "image 1 height width"],
-    true: Float[Tensor, "image 1 height width"],
-    valid: Bool[Tensor, "image 1 height width"],
-) -> list[dict[str, float] | None]:
-    """For each image, over its valid pixels (Eigen et al. 2014, Section 4.2), without alignment of scale.
-
-    `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
-    predicted / true and true / predicted are less than 1.25. None for an image without a valid pixel.
-
-    Args:
-        predicted: depth, in the unit of `true`; where nothing is predicted, 0.
-        true: depth; a pixel counts only where it is finite and above 0.
-        valid: pixels that count.
-    """
-    counted = valid & true.isfinite() & (true > 0)
-    return [_errors(p[c], t[c]) if c.any() else None for p, t, c in zip(predicted, true, counted, strict=True)]
-
-
-def _errors(predicted: Float[Tensor, " pixel"], true: Float[Tensor, " pixel"]) -> dict[str, float]:
-    difference = predicted - true
-    ratio = torch.maximum(predicted / true, true / predicted)
-    return {
-        "abs_rel": (difference.abs() / true).mean().item(),
-        "rmse": difference.square().mean().sqrt().item(),
-        "delta1": ((ratio < 1.25) & (predicted > 0)).float().mean().item(),
-    }
-
-
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
 REGIONS = ("full", "object")
@@ -211,3 +181,32 @@ def _region(
     images: Float[Tensor, "view 3 height width"], truth: Views, region: str
 ) -> Float[Tensor, "view 3 height width"]:
     return object_only(images, truth.masks) if region == "object" else images
+
+
+def depth_errors(
+    predicted: Float[Tensor, "image 1 height width"],
+    true: Float[Tensor, "image 1 height width"],
+    valid: Bool[Tensor, "image 1 height width"],
+) -> list[dict[str, float] | None]:
+    """For each image, over its valid pixels (Eigen et al. 2014, Section 4.2), without alignment of scale.
+
+    `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
+    predicted / true and true / predicted are less than 1.25. None for an image without a valid pixel.
+
+    Args:
+        predicted: depth, in the unit of `true`; where nothing is predicted, 0.
+        true: depth; a pixel counts only where it is finite and above 0.
+        valid: pixels that count.
+    """
+    counted = valid & true.isfinite() & (true > 0)
+    return [_errors(p[c], t[c]) if c.any() else None for p, t, c in zip(predicted, true, counted, strict=True)]
+
+
+def _errors(predicted: Float[Tensor, " pixel"], true: Float[Tensor, " pixel"]) -> dict[str, float]:
+    difference = predicted - true
+    ratio = torch.maximum(predicted / true, true / predicted)
+    return {
+        "abs_rel": (difference.abs() / true).mean().item(),
+        "rmse": difference.square().mean().sqrt().item(),
+        "delta1": ((ratio < 1.25) & (predicted > 0)).float().mean().item(),
+    }

@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 REJECTED = -1
+# Of variances of colours in [0, 1]: all below a deviation of 0.001, then two bins in each decade.
+EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -115,10 +117,6 @@ def draw_modes(
     """What a perfect model would draw: modes by their probabilities."""
     generator = torch.Generator().manual_seed(seed)
     return modes[torch.multinomial(probabilities.cpu(), samples, replacement=True, generator=generator)]
-
-
-# Of variances of colours in [0, 1]: all below a deviation of 0.001, then two bins in each decade.
-EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.float64)
 
 
 def spread_and_error(

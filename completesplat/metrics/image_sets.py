@@ -14,117 +14,11 @@ from completesplat.metrics.missing import Missing, unless_missing
 from completesplat.metrics.sliced_wasserstein import descriptors, sliced_wasserstein
 from completesplat.weights import weights_file
 
-
-def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
-    """Squared Frechet distance of the normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6), in float64.
-
-    Needs far more items than features for a trustworthy value; sets of different sizes must not be compared.
-
-    Raises:
-        ValueError: a set of less than two.
-    """
-    from torchmetrics.image.fid import FrechetInceptionDistance
-
-    _check_sizes(first, second)
-    given = nn.Identity()
-    given.num_features = first.shape[1]  # type: ignore[assignment]
-    # The sets are complete: among several processes torchmetrics would wait for the others' and add them.
-    metric = FrechetInceptionDistance(given, sync_on_compute=False).to(first.device)
-    metric.update(first.double(), real=True)
-    metric.update(second.double(), real=False)
-    return metric.compute().item()
-
-
-def kernel_distance(
-    first: Float[Tensor, "first feature"],
-    second: Float[Tensor, "second feature"],
-    subset_size: int = 1000,
-    subsets: int = 100,
-    seed: int = 0,
-) -> float:
-    """Squared maximum mean discrepancy, unbiased, hence at times below zero (Binkowski et al. 2018, Section 4).
-
-    The kernel is (x.y / features + 1)^3. The mean over random subsets, in float64 and not multiplied by 1000; where a
-    set is larger than a subset, it depends on the order of the items.
-
-    Args:
-        subset_size: items in a subset, at most; all items of the smaller set where it has fewer.
-        subsets: number of subsets drawn from each set.
-        seed: of the subsets.
-
-    Raises:
-        ValueError: a set of less than two.
-    """
-    from torchmetrics.image.kid import poly_mmd
-
-    _check_sizes(first, second)
-    size = min(subset_size, len(first), len(second))
-    generator = torch.Generator().manual_seed(seed)
-    values = []
-    for _ in range(subsets):
-        one, other = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
-        values.append(poly_mmd(one.double(), other.double()))
-    return torch.stack(values).mean().item()
-
-
-def _check_sizes(first: Tensor, second: Tensor) -> None:
-    if min(len(first), len(second)) < 2:
-        raise ValueError("needs two items in each set")
-
-
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
 SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 """Of the file behind `URL`, as k-diffusion (`k_diffusion/evaluation.py`) states it too."""
-INCEPTION_ADVICE = (
-    f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
-)
-
-
-class InceptionFeatures(nn.Module):
-    """Pool features of images, by a TorchScript Inception that takes bytes and resizes them itself; frozen.
-
-    Args:
-        network: called as NVlabs' `stylegan2-ada-pytorch/metrics` do: `network(bytes, return_features=True)`.
-    """
-
-    def __init__(self, network: torch.jit.ScriptModule) -> None:
-        super().__init__()
-        self.network = network.eval()
-        self.requires_grad_(False)
-
-    @torch.no_grad()
-    def forward(self, images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image feature"]:
-        """Features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
-        pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
-        with torch.autocast(images.device.type, enabled=False):
-            return self.network(pixels, return_features=True).float()
-
-
-def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
-    """NVlabs' translation of the network that FID is defined with (Heusel et al. 2017; `inception-2015-12-05`).
-
-    A TorchScript file is a program, not mere weights: only the one with this hash is run. With `sha256` None any file
-    is run, and whoever gives it vouches for it.
-
-    Args:
-        weights: a file, or a URL (http or https) that is downloaded into torch's hub cache once.
-        sha256: the file's SHA-256, or its first digits.
-
-    Raises:
-        WeightsError: the file is missing, cannot be downloaded, is another one, or is no such network.
-    """
-    path = weights_file(weights, sha256, INCEPTION_ADVICE, "evaluation.scoring.sets.inception.sha256")
-    try:
-        with warnings.catch_warnings():
-            # torch would have new programs exported; this one is published as TorchScript only.
-            warnings.simplefilter("ignore", DeprecationWarning)
-            network = torch.jit.load(str(path), map_location="cpu")
-    except (OSError, RuntimeError, ValueError) as error:
-        raise WeightsError(f"{path}: not a readable TorchScript file; {INCEPTION_ADVICE}") from error
-    if "return_features" not in {argument.name for argument in network.forward.schema.arguments}:
-        raise WeightsError(f"{path}: a TorchScript file, but of a network that gives no features; {INCEPTION_ADVICE}")
-    return InceptionFeatures(network)
-
+ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
+DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
 Descriptors = list[Tensor]
 """Of some images, kinds of descriptors: each [images * n features]."""
@@ -196,9 +90,6 @@ def _joined(parts: Sequence[Descriptors]) -> Descriptors:
     return [torch.cat(kinds) for kinds in zip(*parts, strict=True)]
 
 
-ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
-
-
 class Patches:
     """The sliced Wasserstein distance of patches, all pixels, as "swd"; see `sliced_wasserstein`.
 
@@ -222,6 +113,26 @@ class Patches:
     def settings(self) -> dict[str, dict[str, Any]]:
         """See `SetMetric`."""
         return {"swd": {"patches": self.patches, "patch": 7, "projections": 512, "factor": 1000}}
+
+
+class InceptionFeatures(nn.Module):
+    """Pool features of images, by a TorchScript Inception that takes bytes and resizes them itself; frozen.
+
+    Args:
+        network: called as NVlabs' `stylegan2-ada-pytorch/metrics` do: `network(bytes, return_features=True)`.
+    """
+
+    def __init__(self, network: torch.jit.ScriptModule) -> None:
+        super().__init__()
+        self.network = network.eval()
+        self.requires_grad_(False)
+
+    @torch.no_grad()
+    def forward(self, images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image feature"]:
+        """Features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
+        pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
+        with torch.autocast(images.device.type, enabled=False):
+            return self.network(pixels, return_features=True).float()
 
 
 class Inception:
@@ -257,3 +168,86 @@ def inception(weights: str | None, sha256: str | None = None, subset_size: int =
     """FID and KID, or why there are none; see `load_inception` for the weights."""
     load = lambda given: Inception(load_inception(given, sha256), subset_size)  # noqa: E731
     return unless_missing(weights, load, ADVICE, ("fid", "kid"))
+
+
+def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
+    """NVlabs' translation of the network that FID is defined with (Heusel et al. 2017; `inception-2015-12-05`).
+
+    A TorchScript file is a program, not mere weights: only the one with this hash is run. With `sha256` None any file
+    is run, and whoever gives it vouches for it.
+
+    Args:
+        weights: a file, or a URL (http or https) that is downloaded into torch's hub cache once.
+        sha256: the file's SHA-256, or its first digits.
+
+    Raises:
+        WeightsError: the file is missing, cannot be downloaded, is another one, or is no such network.
+    """
+    path = weights_file(weights, sha256, DOWNLOAD_ADVICE, "evaluation.scoring.sets.inception.sha256")
+    try:
+        with warnings.catch_warnings():
+            # torch would have new programs exported; this one is published as TorchScript only.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            network = torch.jit.load(str(path), map_location="cpu")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise WeightsError(f"{path}: not a readable TorchScript file; {DOWNLOAD_ADVICE}") from error
+    if "return_features" not in {argument.name for argument in network.forward.schema.arguments}:
+        raise WeightsError(f"{path}: a TorchScript file, but of a network that gives no features; {DOWNLOAD_ADVICE}")
+    return InceptionFeatures(network)
+
+
+def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
+    """Squared Frechet distance of the normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6), in float64.
+
+    Needs far more items than features for a trustworthy value; sets of different sizes must not be compared.
+
+    Raises:
+        ValueError: a set of less than two.
+    """
+    from torchmetrics.image.fid import FrechetInceptionDistance
+
+    _check_sizes(first, second)
+    given = nn.Identity()
+    given.num_features = first.shape[1]  # type: ignore[assignment]
+    # The sets are complete: among several processes torchmetrics would wait for the others' and add them.
+    metric = FrechetInceptionDistance(given, sync_on_compute=False).to(first.device)
+    metric.update(first.double(), real=True)
+    metric.update(second.double(), real=False)
+    return metric.compute().item()
+
+
+def kernel_distance(
+    first: Float[Tensor, "first feature"],
+    second: Float[Tensor, "second feature"],
+    subset_size: int = 1000,
+    subsets: int = 100,
+    seed: int = 0,
+) -> float:
+    """Squared maximum mean discrepancy, unbiased, hence at times below zero (Binkowski et al. 2018, Section 4).
+
+    The kernel is (x.y / features + 1)^3. The mean over random subsets, in float64 and not multiplied by 1000; where a
+    set is larger than a subset, it depends on the order of the items.
+
+    Args:
+        subset_size: items in a subset, at most; all items of the smaller set where it has fewer.
+        subsets: number of subsets drawn from each set.
+        seed: of the subsets.
+
+    Raises:
+        ValueError: a set of less than two.
+    """
+    from torchmetrics.image.kid import poly_mmd
+
+    _check_sizes(first, second)
+    size = min(subset_size, len(first), len(second))
+    generator = torch.Generator().manual_seed(seed)
+    values = []
+    for _ in range(subsets):
+        one, other = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
+        values.append(poly_mmd(one.double(), other.double()))
+    return torch.stack(values).mean().item()
+
+
+def _check_sizes(first: Tensor, second: Tensor) -> None:
+    if min(len(first), len(second)) < 2:
+        raise ValueError("needs two items in each set")

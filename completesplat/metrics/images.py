@@ -11,6 +11,7 @@ from completesplat.metrics.missing import Missing, unless_missing
 
 PSNR_LIMIT = 100.0
 """Identical images have an infinite PSNR; reported values stop here (dB), so that averages stay finite."""
+ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
 
 
 def psnr(
@@ -48,9 +49,6 @@ def object_only(
     The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.
     """
     return torch.where(masks > 0.5, images, torch.zeros_like(images))
-
-
-ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
 
 
 class PerceptualMetric:

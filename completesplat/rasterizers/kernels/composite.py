@@ -37,6 +37,8 @@ from completesplat.rasterizers.kernels.simd import (
 Array = np.ndarray
 
 FORWARD_STATE_VECTORS = 6  # transmittance, red, green, blue, depth, alpha
+BACKWARD_STATE_VECTORS = 6  # transmittance, sum behind, gradients of red, green, blue, depth
+reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
 
 
 @kernel
@@ -120,10 +122,6 @@ def write_images(first_row, end_row, columns, state, color, depth, alpha):
                 color[channel, y, x] = state[pixel + (1 + channel) * LANES]
             depth[y, x] = state[pixel + 4 * LANES]
             alpha[y, x] = state[pixel + 5 * LANES]
-
-
-BACKWARD_STATE_VECTORS = 6  # transmittance, sum behind, gradients of red, green, blue, depth
-reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
 
 
 @kernel

@@ -24,8 +24,18 @@ from completesplat.rasterizers.kernels.simd import LANES
 from completesplat.rasterizers.kernels.splat_backward import camera_backward
 from completesplat.rasterizers.protocol import RenderingConstants
 
+ALIGNMENT = 64  # bytes, one cache line
+MOST_FREE_BYTES = 512 * 2**20
+# A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
+# sums over bands depend on where the bands end, and results must not depend on the number of threads.
+FEWEST_TASKS = 4
+VIEWS_AT_ONCE = 8  # without gradients, where the projected Gaussians are not kept
+CHUNK = 2048  # Gaussians to a task of the projection's backward pass
+
 _pools: dict[int, ThreadPoolExecutor] = {}
 _pool_lock = threading.Lock()
+_free: list[np.ndarray] = []  # buffers of uint8, oldest first
+_buffers_lock = threading.Lock()
 
 
 def parallel(task: Callable[[int], None], count: int) -> None:
@@ -70,13 +80,6 @@ def _forget_pools() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pools)
-
-
-ALIGNMENT = 64  # bytes, one cache line
-MOST_FREE_BYTES = 512 * 2**20
-
-_free: list[np.ndarray] = []  # of uint8, oldest first
-_buffers_lock = threading.Lock()
 
 
 class Buffers:
@@ -124,13 +127,6 @@ def _forget_lock() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_lock)
-
-
-# A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
-# sums over bands depend on where the bands end, and results must not depend on the number of threads.
-FEWEST_TASKS = 4
-VIEWS_AT_ONCE = 8  # without gradients, where the projected Gaussians are not kept
-CHUNK = 2048  # Gaussians to a task of the projection's backward pass
 
 
 class Parameters(NamedTuple):
@@ -211,7 +207,7 @@ class Drawing:
         return images
 
     def backward(self, images: Images, gradients: Images, to_cameras: bool) -> tuple[Parameters, np.ndarray | None]:
-        """Gradients of the parameters and, if asked for, the cameras, given those of the images that `draw` returned.
+        """Gradients of the parameters and, if wanted, the cameras, given those of the images that `draw` returned.
 
         The latter are [batch view 16]: of the first 16 columns of `cameras`.
         """

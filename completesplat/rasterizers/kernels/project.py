@@ -45,6 +45,8 @@ PASSES = 4
 # 36 of the fraction. With a float32's 23, some neighbours in a large scene would come out in the wrong order.
 SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
+# What is summed over views, before the rest of the chain rule, which is each Gaussian's own.
+COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
 
 
 @helper
@@ -172,10 +174,6 @@ def radix_sort(keys, order, count):
             starts[digit, bucket] = position + 1
             keys[target, position] = key
             order[target, position] = order[source, i]
-
-
-# What is summed over views, before the rest of the chain rule, which is each Gaussian's own.
-COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
 
 
 @kernel

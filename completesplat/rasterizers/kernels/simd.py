@@ -15,6 +15,12 @@ FLAGS = ("contract", "nsz", "arcp", "reassoc", "afn")  # as in `compilation.OPTI
 
 F32, I32 = ir.FloatType(), ir.IntType(32)
 VECTOR_IR, INTEGERS_IR = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
+# x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
+_ROUNDING_SHIFT = 1.5 * 2**23
+_ROUNDING_BITS = int(np.float32(_ROUNDING_SHIFT).view(np.int32))
+_EXP2_POLYNOMIAL = (
+    np.polynomial.Chebyshev.interpolate(np.exp2, 5, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
+)
 
 
 class VectorType(types.Type):
@@ -170,14 +176,6 @@ def any_lane(builder: Any, mask: Any) -> Any:
 def square_root(builder: Any, vector: Any) -> Any:
     """The square root of every lane."""
     return _call(builder, f"llvm.sqrt.v{LANES}f32", VECTOR_IR, vector)
-
-
-# x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
-_ROUNDING_SHIFT = 1.5 * 2**23
-_ROUNDING_BITS = int(np.float32(_ROUNDING_SHIFT).view(np.int32))
-_EXP2_POLYNOMIAL = (
-    np.polynomial.Chebyshev.interpolate(np.exp2, 5, domain=[-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
-)
 
 
 @vector_function(VECTOR)

@@ -30,6 +30,8 @@ from completesplat.rasterizers.kernels.simd import (
 )
 
 ZERO = np.float32(0)
+Array = np.ndarray
+lane_index = lane_constant(range(LANES))
 
 
 @helper
@@ -225,11 +227,6 @@ def point_gradient(
     # slope = point / z, and d(1 / z) / dz = -1 / z^2.
     grad_z = -inverse_z * (grad_slope_x * slope_x + grad_slope_y * slope_y + grad_inverse_z * inverse_z)
     return grad_slope_x * inverse_z, grad_slope_y * inverse_z, grad_z + grad_depth
-
-
-Array = np.ndarray
-
-lane_index = lane_constant(range(LANES))
 
 
 @kernel
