@@ -1,12 +1,21 @@
 import hashlib
+import re
 from pathlib import Path
 
 import imageio.v2 as imageio
 import numpy as np
 import pytest
+import torch
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
 from PIL import Image
 from plyfile import PlyData
-from support import strict_json
+from support import compose_config, strict_json
+
+from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.commands.generator import check_settings
+from completesplat.commands.predict import RANGES, visible_part
+from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=2", "frames=4", "steps=2"]
 
@@ -121,28 +130,52 @@ def test_the_sampler_can_be_another_one(command, pipeline, tmp_path, name, sched
     assert scene["steps"] == (20 if name else 2)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (["box=[0,0,1]"], "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
-        (["box=0.5"], "box=0.5: give [x0,y0,x1,y1]"),
-        (["box=[a,b,c,d]"], "give [x0,y0,x1,y1]"),
-        (["box=[0.5,0,0.5,1]"], "needs 0 <= x0 < x1 <= 1"),
-        (["mask=nowhere.png"], "nowhere.png: no such file"),
-        (["mask=nowhere.png", BOX], "not both"),
-        ([BOX, "skip_weight=1"], "skip_weight=1: must be 0 where the picture is hidden"),
-        (["sampler=nonsense"], "nonsense"),
-        (["steps=3"], "steps=3: DDIM's must divide 1000"),
-        (["batch=0"], "batch=0: must be at least 1"),
-        (["skip_weight=2"], "skip_weight=2: must lie between 0 and 1"),
-    ],
-)
-def test_settings_without_a_meaning_are_refused_in_one_line(command, pipeline, tmp_path, settings, said):
-    finished = predict(command, pipeline, tmp_path / "out", *settings)
+def test_a_setting_without_a_meaning_is_refused_in_one_line(command, pipeline, tmp_path):
+    finished = predict(command, pipeline, tmp_path / "out", "steps=3")
     assert finished.status == 2
     assert finished.err.splitlines()[-1].startswith("error: ")
-    assert said in finished.err.splitlines()[-1]
+    assert "steps=3: DDIM's must divide 1000" in finished.err.splitlines()[-1]
     assert not (tmp_path / "out" / pipeline.photograph().stem).exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("sampler=nonsense", "nonsense"),
+        ("batch=0", "batch=0: must be at least 1"),
+        ("steps=1001", "steps=1001: must lie between 1 and 1000"),
+        ("background=2", "background=2: must lie between 0 and 1"),
+        ("skip_weight=2", "skip_weight=2: must lie between 0 and 1"),
+        ("guidance_weight=-1", "guidance_weight=-1: must lie between 0 and 1"),
+    ],
+)
+def test_settings_have_ranges(setting, said):
+    with pytest.raises((CompleteSplatError, HydraException), match=re.escape(said)):
+        check_settings(compose_config("predict", "image=a.png", setting), RANGES)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "said"),
+    [
+        ({"box": [0, 0, 1]}, "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
+        ({"box": 0.5}, "box=0.5: give [x0,y0,x1,y1]"),
+        ({"box": ["a", "b", "c", "d"]}, "give [x0,y0,x1,y1]"),
+        ({"box": [0.5, 0, 0.5, 1]}, "needs 0 <= x0 < x1 <= 1"),
+        ({"mask": "nowhere.png"}, "nowhere.png: no such file"),
+        ({"mask": "nowhere.png", "box": [0.5, 0, 1, 1]}, "not both"),
+    ],
+)
+def test_what_hides_nothing_is_refused(tmp_path, hidden, said):
+    image = tmp_path / "a.png"
+    Image.new("RGB", (32, 32)).save(image)
+    config = OmegaConf.create({"box": None, "mask": None} | hidden)
+    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        visible_part(config, image, 32)
+
+
+def test_skips_are_refused_where_something_is_hidden():
+    with pytest.raises(CompleteSplatError, match="skip_weight=1: must be 0 where the picture is hidden"):
+        allowed_skip_weight(1, torch.zeros(1, 2, 2))
 
 
 def test_maps_are_written_if_wanted(command, pipeline, tmp_path):

@@ -1,5 +1,6 @@
 """Several pictures at once, file formats, videos, and what is said about them."""
 
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,14 @@ from fake_converter import calls, install
 from PIL import Image
 from support import compose_config, some_gaussians, strict_json, tiny_generator
 
-from completesplat.commands.predict import RANGES, check_settings, find_pictures, folder_names, unusual_field_of_view
+from completesplat.commands.predict import (
+    RANGES,
+    check_settings,
+    find_pictures,
+    folder_names,
+    run,
+    unusual_field_of_view,
+)
 from completesplat.data.pictures.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
@@ -40,10 +48,10 @@ def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settin
 def predict(command, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(CompleteSplat, "forward", draw)
 
-    def run(image: object, *settings: str):
+    def start(image: object, *settings: str):
         return command("predict", f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", *QUICK, *settings)
 
-    return run
+    return start
 
 
 def picture(path: Path, color: str = "red") -> Path:
@@ -143,11 +151,10 @@ def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict,
         (["mask=x.png"], "mask=FILE belongs to one picture"),
     ],
 )
-def test_wishes_without_a_meaning_are_refused(predict, tmp_path, settings, said):
-    finished = predict("[a.png,b.png]", *settings)
-    assert finished.status == 2
-    assert said in finished.err
-    assert finished.err.count("\n") == 1
+def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path, settings, said):
+    config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", *settings)
+    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        run(config, tmp_path)
 
 
 @pytest.mark.parametrize("broken", ["some", "all"])

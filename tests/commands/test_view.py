@@ -1,9 +1,12 @@
+import re
 import sys
 
 import pytest
+from support import compose_config
 from viewer_scenes import balls
 
-from completesplat.commands.view import overrides, settings_of
+from completesplat.commands.generator import check_settings
+from completesplat.commands.view import RANGES, data_cameras, overrides, settings_of
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 
@@ -58,21 +61,34 @@ def test_several_predictions_are_named_not_guessed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("path", "said"),
     [
-        (["nowhere.ply"], "nowhere.ply: no such file or folder"),
-        (["."], "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
-        (["samples=9"], "samples=9: must lie between 1 and 8"),
-        (["skip_weight=-1"], "skip_weight=-1: must lie between 0 and 1"),
-        (["port=99999"], "port=99999: must lie between 1 and 65535"),
+        ("nowhere.ply", "nowhere.ply: no such file or folder"),
+        (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
     ],
 )
-def test_what_cannot_be_shown_is_refused_in_one_line(command, tmp_path, arguments, said):
+def test_what_cannot_be_shown_is_refused(tmp_path, path, said):
+    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        settings_of(tmp_path / path)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("samples=9", "samples=9: must lie between 1 and 8"),
+        ("skip_weight=-1", "skip_weight=-1: must lie between 0 and 1"),
+        ("port=99999", "port=99999: must lie between 1 and 65535"),
+    ],
+)
+def test_settings_have_ranges(setting, said):
+    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        check_settings(compose_config("view", setting), RANGES)
+
+
+def test_a_refusal_is_one_line(command, tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    finished = command("view", *arguments, f"out={tmp_path / 'other' / 'out'}")
-    assert finished.status == 2
-    assert said in finished.err
-    assert finished.err.count("\n") == 1
+    finished = command("view", "nowhere.ply", f"out={tmp_path / 'out'}")
+    assert (finished.status, finished.err) == (2, "error: nowhere.ply: no such file or folder\n")
 
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
@@ -104,10 +120,6 @@ def test_an_offline_page_is_written_of_what_is_drawn(command, pipeline, tmp_path
 
 
 def test_cameras_of_a_data_set_are_read(pipeline):
-    from support import compose_config
-
-    from completesplat.commands.view import data_cameras
-
     cameras = data_cameras(
         compose_config("view", "data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32").data
     )

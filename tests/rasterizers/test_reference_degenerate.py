@@ -2,92 +2,52 @@
 
 import pytest
 import torch
+from degenerate_gaussians import DRAWN, INF, NAN, NEVER_DRAWN, camera, changed, healthy
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
-from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, alphas_at
 
 FIELDS = ("means", "quaternions", "scales", "opacities", "colors")
-NAN, INF = float("nan"), float("inf")
 DTYPES = [torch.float32, torch.float64]
 
-LEFT_OUT = {
-    "behind the camera": {"means": [0, 0, -1]},
-    "in the camera": {"means": [0, 0, 0]},
-    "on the camera's plane": {"means": [1, 0.5, 0]},
-    "on the near plane": {"means": [0, 0, 0.01]},
-    "mean NaN": {"means": [0, NAN, 2]},
-    "depth NaN": {"means": [0, 0, NAN]},
-    "mean infinite": {"means": [INF, 0, 2]},
-    "depth infinite": {"means": [0, 0, INF]},
-    "mean far aside": {"means": [1e30, 0, 2]},
-    "mean far aside in both axes": {"means": [-1e30, 1e30, 2]},
-    "mean far behind": {"means": [1e30, -1e30, -1e30]},
-    "quaternion NaN": {"quaternions": [NAN, 0, 0, 1]},
-    "quaternion infinite": {"quaternions": [1, INF, 0, 0]},
-    "scale NaN": {"scales": [0.1, NAN, 0.1]},
-    "scale infinite": {"scales": [0.1, 0.1, INF]},
-    "scale whose square overflows": {"scales": [1e30, 1e30, 1e30]},
-    "one scale whose square overflows": {"scales": [1e30, 0.1, 0.1], "quaternions": [1, 2, 3, 4]},
-    "scale whose determinant overflows": {"scales": [1e12, 1e12, 1e12], "quaternions": [1, 2, 3, 4]},
-    "opacity 0": {"opacities": 0},
-    "opacity negative": {"opacities": -1},
-    "opacity NaN": {"opacities": NAN},
-    "color NaN": {"colors": [0.5, 0.5, NAN]},
-    "color infinite": {"colors": [INF, 0.5, 0.5]},
+LEFT_OUT = NEVER_DRAWN | {
+    "on the camera's plane": {"means": (1.0, 0.5, 0.0)},
+    "depth NaN": {"means": (0.0, 0.0, NAN)},
+    "mean infinite": {"means": (INF, 0.0, 2.0)},
+    "mean far aside in both axes": {"means": (-1e30, 1e30, 2.0)},
+    "mean far behind": {"means": (1e30, -1e30, -1e30)},
+    "scale whose square overflows": {"scales": (1e30, 1e30, 1e30)},
+    "one scale whose square overflows": {"scales": (1e30, 0.1, 0.1), "quaternions": (1.0, 2.0, 3.0, 4.0)},
+    "scale whose determinant overflows": {"scales": (1e12, 1e12, 1e12), "quaternions": (1.0, 2.0, 3.0, 4.0)},
 }
-
-DRAWN = {
-    "zero quaternion": {"quaternions": [0, 0, 0, 0]},
-    "tiny quaternion": {"quaternions": [1e-30, 1e-30, 0, 0]},
-    "zero scale": {"scales": [0, 0, 0]},
-    "one zero scale": {"scales": [0.3, 0, 0.2], "quaternions": [1, 2, 3, 4]},
-    "needle": {"scales": [1e3, 1e-6, 1e-6], "quaternions": [1, 2, 3, 4]},
+EXTREME = DRAWN | {
     # Found by search: the determinant of its projection is lost to rounding in float32.
     "needle as long as the sky": {
-        "means": [7.726273536682129, 0.7486287355422974, 0.6572197675704956],
-        "quaternions": [-0.9036192297935486, 1.5352706909179688, -0.6311081051826477, -0.4898175895214081],
-        "scales": [389714.34375, 0.00031615764601156116, 0.00031615764601156116],
+        "means": (7.726273536682129, 0.7486287355422974, 0.6572197675704956),
+        "quaternions": (-0.9036192297935486, 1.5352706909179688, -0.6311081051826477, -0.4898175895214081),
+        "scales": (389714.34375, 0.00031615764601156116, 0.00031615764601156116),
     },
-    "negative scale": {"scales": [-0.1, -0.2, 0.3]},
-    "scale 1e3": {"scales": [1e3, 1e3, 1e3], "quaternions": [1, 2, 3, 4]},
-    "scale 1e6": {"scales": [1e6, 1e6, 1e6], "quaternions": [1, 2, 3, 4]},
-    "opacity 1": {"opacities": 1},
-    "just beyond the near plane": {"means": [0.004, 0.001, 0.0101]},
-    "just beyond the near plane, far aside": {"means": [50, 0, 0.0101]},
-    "very far on the axis": {"means": [0, 0, 1e30]},
-    "very far in the corner": {"means": [1e30, 1e30, 1e30]},
+    "scale 1e3": {"scales": (1e3, 1e3, 1e3)},
+    "needle 1e-6": {"scales": (1e3, 1e-6, 1e-6)},
+    "just beyond the near plane, far aside": {"means": (50.0, 0.0, 0.0101)},
+    "very far in the corner": {"means": (1e30, 1e30, 1e30)},
 }
 
 
-def healthy(count: int, dtype: torch.dtype) -> Gaussians:
-    generator = torch.Generator().manual_seed(count)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(count, *shape, generator=generator, dtype=torch.float64).to(dtype)
-
-    means = torch.cat([rand(2) * 2 - 1, 2 + rand(1) * 2], dim=-1)
-    return Gaussians(means, rand(4) * 2 - 1, 0.02 + 0.3 * rand(3), 0.1 + 0.9 * rand(), rand(3))
+def some(count: int, dtype: torch.dtype) -> Gaussians:
+    return healthy(count)[0].to(dtype)
 
 
 def one(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
-    values = {
-        "means": [0.1, -0.2, 1.5],
-        "quaternions": [1, 0, 0, 0],
-        "scales": [0.3, 0.2, 0.1],
-        "opacities": 0.8,
-        "colors": [0.2, 0.4, 0.6],
-    } | changes
-    return Gaussians(**{name: torch.tensor([values[name]], dtype=dtype) for name in FIELDS})
+    return changed(changes)[0].to(dtype)
 
 
 def render_and_differentiate(gaussians: Gaussians) -> tuple[Tensor, dict[str, Tensor]]:
     """Colour, depth and alpha in one image, and the gradients of a random linear function of it."""
     dtype = gaussians.means.dtype
-    intrinsics = torch.tensor([[12.0, 0, 6.5], [0, 12.0, 4.2], [0, 0, 1]], dtype=dtype)
-    cameras = Cameras(torch.eye(4, dtype=dtype)[None, None], intrinsics[None, None], (9, 12))
+    cameras = camera().to(dtype)
     inputs = {name: getattr(gaussians, name).clone().requires_grad_() for name in FIELDS}
     inputs |= {"world_to_camera": cameras.world_to_camera.requires_grad_()}
     inputs |= {"intrinsics": cameras.intrinsics.requires_grad_()}
@@ -108,7 +68,7 @@ def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", LEFT_OUT)
 def test_what_cannot_be_drawn_leaves_no_trace(kind: str, dtype: torch.dtype) -> None:
-    rest = healthy(20, dtype)
+    rest = some(20, dtype)
     image, gradients = render_and_differentiate(rest)
     bad = one(LEFT_OUT[kind], dtype)
     mixed_image, mixed_gradients = render_and_differentiate(concatenate([rest[:7], bad, rest[7:]]))
@@ -122,18 +82,19 @@ def test_what_cannot_be_drawn_leaves_no_trace(kind: str, dtype: torch.dtype) -> 
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("kind", DRAWN)
+@pytest.mark.parametrize("kind", EXTREME)
 def test_extreme_gaussians_are_drawn_with_finite_values_and_gradients(kind: str, dtype: torch.dtype) -> None:
-    assert_finite(*render_and_differentiate(concatenate([healthy(20, dtype), one(DRAWN[kind], dtype)])))
-    assert_finite(*render_and_differentiate(one(DRAWN[kind], dtype)))
+    assert_finite(*render_and_differentiate(concatenate([some(20, dtype), one(EXTREME[kind], dtype)])))
+    assert_finite(*render_and_differentiate(one(EXTREME[kind], dtype)))
 
 
 def test_the_sign_of_a_scale_and_a_zero_quaternion_have_a_meaning() -> None:
     """Only the squares of scales enter; a zero quaternion is the identity."""
-    image, _ = render_and_differentiate(one({}, torch.float64))
+    identity = {"quaternions": (1.0, 0.0, 0.0, 0.0)}
+    image, _ = render_and_differentiate(one(identity, torch.float64))
     assert image.any()
-    negative, _ = render_and_differentiate(one({"scales": [-0.3, 0.2, -0.1]}, torch.float64))
-    zero, gradients = render_and_differentiate(one({"quaternions": [0, 0, 0, 0]}, torch.float64))
+    negative, _ = render_and_differentiate(one(identity | {"scales": (-0.2, 0.3, -0.1)}, torch.float64))
+    zero, gradients = render_and_differentiate(one({"quaternions": (0.0, 0.0, 0.0, 0.0)}, torch.float64))
     assert torch.equal(negative, image)
     assert torch.equal(zero, image)
     assert not gradients["quaternions"].any()
@@ -150,7 +111,7 @@ def test_nothing_is_drawn_where_rounding_makes_the_exponent_positive() -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("count", [0, 1, 5])
 def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count: int, dtype: torch.dtype) -> None:
-    gaussians = concatenate([healthy(0, dtype), *[one(LEFT_OUT["behind the camera"], dtype)] * count])
+    gaussians = concatenate([some(0, dtype), *[one(LEFT_OUT["behind the camera"], dtype)] * count])
     image, gradients = render_and_differentiate(gaussians)
     assert not image.any()
     assert gradients["means"].shape == (count, 3)
@@ -165,4 +126,4 @@ def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
     image, _ = render_and_differentiate(concatenate([front, back]))
     swapped, _ = render_and_differentiate(concatenate([back, front]))
     assert image[0, 0, 0].max() < swapped[0, 0, 0].max()
-    assert_finite(*render_and_differentiate(concatenate([one({"opacities": 1}, dtype)] * 400)))
+    assert_finite(*render_and_differentiate(concatenate([one({"opacities": 1.0}, dtype)] * 400)))
