@@ -4,7 +4,7 @@ import torch
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.viewer.samples import Sample
+from completesplat.viewer.sample import Sample
 
 BALLS = {
     "red": ((0.0, 0.0, 4.0), (0.9, 0.1, 0.1)),

@@ -105,7 +105,7 @@ def make_page(config: Any, out: Path) -> Any:
     from completesplat.commands.generator import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page, Saver, start_server, stop_server
-    from completesplat.viewer.samples import read_scene
+    from completesplat.viewer.sample import read_scene
     from completesplat.viewer.stage import Stage
 
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -20,7 +20,7 @@ from completesplat.results.published import tables
 from completesplat.results.tables import Table
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.samples import evenly_spaced
+from completesplat.training.sample_pictures import evenly_spaced
 from completesplat.training.scene_module import SceneModule, ScoredScene
 
 VIEWS, FRAMES = 4, 48

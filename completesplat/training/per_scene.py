@@ -6,7 +6,7 @@ import torch
 from torchmetrics import MeanMetric
 
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
-from completesplat.baselines.projection import project_to_splatter_image
+from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum

@@ -15,9 +15,9 @@ from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
-from completesplat.viewer.controls import MOST_SAMPLES, add_drawing, nearest_steps
 from completesplat.viewer.page import Page
-from completesplat.viewer.samples import Sample
+from completesplat.viewer.panel import MOST_SAMPLES, add_drawing, nearest_steps
+from completesplat.viewer.sample import Sample
 
 MOST_BYTES = 32 * 2**20
 PAUSE = 0.2  # seconds between two pictures of a scene that forms

@@ -15,8 +15,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.video import orbit_views, write_video
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.controls import SIDE_BY_SIDE, add_looking, add_saving
-from completesplat.viewer.samples import Sample
+from completesplat.viewer.panel import SIDE_BY_SIDE, add_looking, add_saving
+from completesplat.viewer.sample import Sample
 from completesplat.viewer.stage import Stage
 from completesplat.viewer.worker import Worker
 
@@ -126,7 +126,7 @@ class Page:
         self.status.content = status
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
-        """A message in the browser that asked, or in all; what is no refusal stands in the log as well."""
+        """A message in one browser, or in all; faults of the program stand in the log as well."""
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"

@@ -17,7 +17,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import matrix_to_quaternion
 from completesplat.geometry.trajectories import orbit
-from completesplat.viewer.samples import Sample
+from completesplat.viewer.sample import Sample
 
 LARGEST_COVARIANCE = 3e4
 GAP = 1.25

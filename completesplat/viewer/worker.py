@@ -12,10 +12,10 @@ log = logging.getLogger(__name__)
 class Worker:
     """Does one job after the other, in a thread of its own.
 
-    Of the jobs of one kind that wait only the newest is done: a slider on the move asks for more than can be computed.
+    Of the waiting jobs of one kind only the newest is done: a moving slider submits more than can be computed.
 
     Args:
-        failed: told of every exception that a job raises; the thread goes on.
+        failed: called with every exception that a job raises; the thread goes on.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -33,7 +33,7 @@ class Worker:
             self._changed.notify_all()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Until nothing is to be done; whether that came about within so many seconds."""
+        """Wait until no job is left, at most `timeout` seconds; returns whether none is left."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
 

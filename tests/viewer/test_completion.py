@@ -13,7 +13,7 @@ from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.viewer import completion
 from completesplat.viewer.completion import read_upload
-from completesplat.viewer.controls import nearest_steps, possible_steps
+from completesplat.viewer.panel import nearest_steps, possible_steps
 
 
 @pytest.fixture(scope="module")

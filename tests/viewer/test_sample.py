@@ -9,7 +9,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import write_scene_json
 from completesplat.geometry.cameras import project
-from completesplat.viewer.samples import UP, Sample, framing_camera, read_scene
+from completesplat.viewer.sample import UP, Sample, framing_camera, read_scene
 
 
 def prediction(folder, count=2, points=1024):

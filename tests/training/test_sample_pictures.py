@@ -13,8 +13,8 @@ from support import SMALL, compose_config
 
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.metrics.samples import diversity
-from completesplat.training.pictures import fixed_scenes
-from completesplat.training.samples import SceneDrawings, evenly_spaced, samples_sheet, strip_sheet
+from completesplat.training.fixed_scenes import fixed_scenes
+from completesplat.training.sample_pictures import SceneDrawings, evenly_spaced, samples_sheet, strip_sheet
 
 SIDE = 32
 

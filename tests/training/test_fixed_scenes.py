@@ -16,7 +16,7 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.pictures import (
+from completesplat.training.fixed_scenes import (
     distributions,
     fixed_scenes,
     latent_bits,

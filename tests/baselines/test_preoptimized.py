@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from completesplat.baselines.projection import project_to_splatter_image
+from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.splatter_image import CHANNELS, Parameterization, SplatterImage

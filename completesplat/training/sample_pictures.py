@@ -15,8 +15,8 @@ from completesplat.metrics.images import psnr
 from completesplat.metrics.samples import diversity
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
+from completesplat.training.fixed_scenes import DrawsFixedScenes, log_drawings
 from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.pictures import DrawsFixedScenes, log_drawings
 from completesplat.training.scene_module import SceneModule
 
 
