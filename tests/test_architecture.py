@@ -238,3 +238,9 @@ def test_the_naming_rule_notices(source: str) -> None:
 def test_the_naming_rule_overlooks_documentation() -> None:
     source = '"""CO3D."""\n# toy\nclass A:\n    """Toy."""\n\n    x: int = 1\n    """RealEstate10K."""\n'
     assert dataset_names(ast.parse(source)) == []
+
+
+def test_nothing_imports_the_benchmarks() -> None:
+    """Their opponents are no part of the method; the configurations alone name what they run."""
+    imported = {path: set(imported_modules(tree, path)) for path, tree in TREES.items() if floor(path) != "benchmarks"}
+    assert [path for path, modules in imported.items() if any(floor(m) == "benchmarks" for m in modules)] == []
