@@ -135,9 +135,6 @@ def start(verb: str, config: Any, out: Path) -> None:
     if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
         return
-    if isinstance(config.task, str):
-        get_method(config.task)(config, out)
-        return
     settings: Any = OmegaConf.to_container(config.task, resolve=True)
     check_settings(get_method(settings["_target_"]), settings)
     instantiate(config.task, out=out, _convert_="all")
