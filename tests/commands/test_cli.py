@@ -76,6 +76,7 @@ def test_fits_help_shows_the_groups(command):
             "model.autoreconstructor_checkpoint",
         ),
         (["predict"], "image is needed"),
+        (["report", "samplers"], "ckpt is needed: give ckpt=VALUE"),
         (["predict", "image=x.jpg", "weights=no_such_name"], "no_such_name: no such folder"),
         (["predict", "image=x.jpg", "weights=nowhere"], "nowhere: no such folder"),
         (["predict", "image=x.jpg", "weights=nowhere", "skip_weight=1.5"], "skip_weight=1.5"),
