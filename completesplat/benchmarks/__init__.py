@@ -1,1 +1,1 @@
-"""What takes how long, side by side in one process. Nothing else imports this package."""
+"""Benchmarks of speed and their opponents, side by side in one process. Nothing else imports this package."""

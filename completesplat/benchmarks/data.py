@@ -1,176 +1,132 @@
-"""How fast training batches are read, and what that takes."""
+"""`completesplat bench data`: reading from published and packed forms of the same scenes, side by side."""
 
-import statistics
-import time
-import weakref
+import json
+import logging
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib import import_module
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import mkdtemp
+from typing import Annotated, Any, Literal, TypedDict
 
 from rich.console import Console
 
-from completesplat.data.loading.loader import SceneLoader
+from completesplat.benchmarks.printing import print_results
+from completesplat.benchmarks.reading import MakeData, chunks, decoding_share, opening_figures, rows
+from completesplat.commands.schema import Filled, Natural, OneOf, Positive, Range
+from completesplat.data.packed.rows import CODECS
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.errors import DataError
-from completesplat.results.tables import Column, table
-
-KIBIBYTES_OF_MEBIBYTE = 1024
-STATUS = Path("/proc/self/status")
-KEYS = {"anonymous": "RssAnon", "file": "RssFile"}
+from completesplat.results.machine import machine
+from completesplat.results.tables import Column, Table, table
 
 
-def resident_megabytes() -> dict[str, float] | None:
-    """Of this process, in MB: `anonymous`, which is its own, and `file`; None where the system does not tell.
+class Opening(TypedDict):
+    """A store of many sequences, which is opened and read for some epochs."""
 
-    Pages of mapped files (`file`) count as soon as they are touched; the system takes them back when it needs them.
+    sequences: Annotated[int, Range(2)]  # one for training and one for validation at least
+    epochs: Positive
+
+
+def run(
+    objects: Mapping[str, Any],
+    rooms: Mapping[str, Any] | Literal[False],
+    opening: Opening | Literal[False],
+    workers: Annotated[Sequence[Natural], Filled()],
+    repeats: Positive,
+    codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Filled()],
+    keep: bool,
+    out: Path,
+) -> None:
+    """Write scenes, read them in all their forms; write `data.json`, print tables.
+
+    Args:
+        objects: `write` (out) makes the scenes, `data` (settings) their data module; `references_per_sequence`, `raw`
+            and `prepared`, is the number of items of each training sequence in an epoch.
+        rooms: `write` and `data` of clips, and `read_chunk`, the name of the function that reads a chunk of them; False
+            leaves them out.
+        opening: False leaves it out.
+        workers: numbers of loading processes; everything is measured for each.
+        repeats: timed epochs of each form.
+        codecs: of the packed stores; the store of many sequences has the first.
+        keep: whether the files that were read stay in `out`.
     """
-    if not STATUS.exists():
-        return None
-    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines() if ":" in line)
-    return {name: int(lines[key].split()[0]) / KIBIBYTES_OF_MEBIBYTE for name, key in KEYS.items()}
+    folder = Path(mkdtemp(prefix="bench_data_", dir=out))
+    try:
+        with _warnings_only("completesplat.data"):
+            # Everything is written before anything is read: writing shows progress bars of its own.
+            forms = _objects(objects, codecs, folder)
+            clips = _rooms(rooms, codecs, folder) if rooms else {}
+            store = _store(forms, opening["sequences"], codecs[0], folder) if opening else None
+            with Console(stderr=True).status("reading") as status:
+                measure = partial(_rows, workers, repeats, lambda text: status.update(f"reading {text}"))
+                figures: dict[str, Any] = {"rows": measure(forms, decoding=True)}
+                if opening and store is not None:
+                    status.update("reading many sequences in a fresh process")
+                    found = opening_figures(store, opening["epochs"])
+                    figures["opening"] = {"sequences": opening["sequences"], **found}
+                if rooms:
+                    figures["clips"] = measure(clips, decoding=False)
+                    figures["chunks"] = chunks(clips["chunks"](workers=0), rooms["read_chunk"])
+    finally:
+        if not keep:
+            shutil.rmtree(folder)
+    results = {"machine": machine(), "not_measured": {}, **figures}
+    if "opening" in figures and "added_mb" not in figures["opening"]:
+        results["not_measured"] = {"memory": "this system has no /proc/self/status"}
+    (out / "data.json").write_text(json.dumps(results, indent=2) + "\n")
+    show(results)
 
 
-# Settings of a data module that are still open (workers, ...) -> the data module.
-MakeData = Callable[..., Any]
+@contextmanager
+def _warnings_only(name: str) -> Iterator[None]:
+    """Keep a logger to warnings: each of dozens of data modules would say how many sequences it has."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
-class Epoch(NamedTuple):
-    """What one epoch gave, in how many seconds."""
+def _objects(settings: Mapping[str, Any], codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
+    """Makers of data modules by the form they read; the form as published comes first."""
+    settings["write"](out=folder / "objects")
+    data = partial(settings["data"], root=str(folder / "objects"))
+    references = settings["references_per_sequence"]
+    packed = prepared(
+        partial(data, references_per_sequence=references["prepared"]), folder / "prepared objects", codecs
+    )
+    return {"raw": partial(data, references_per_sequence=references["raw"]), **packed}
 
-    seconds: float
-    batches: int
-    scenes: int
-    images: int
+
+def _rooms(settings: Mapping[str, Any], codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
+    root = settings["write"](out=folder / "rooms")
+    chunks, text = (partial(settings["data"], root=str(root / form)) for form in ("chunks", "text"))
+    return {"chunks": chunks, "text": text, **prepared(text, folder / "prepared rooms", codecs)}
 
 
-def rows(
-    forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, tick: Callable[[str], None]
+def _store(objects: Mapping[str, MakeData], sequences: int, codec: str, folder: Path) -> MakeData:
+    few = partial(objects[f"prepared {codec}"], references_per_sequence=1)
+    return repeated(few, sequences, folder / "many", codec)
+
+
+def _rows(
+    workers: Sequence[int], repeats: int, tick: Callable[[str], None], forms: Mapping[str, MakeData], decoding: bool
 ) -> list[dict[str, Any]]:
-    """One row for each number of workers and form: batches, scenes and images per second, and times the first form.
-
-    All forms take turns. Of each, the median of `repeats` epochs counts, after an untimed one in which workers start
-    and files come into memory.
-    """
-    result = []
-    for count in workers:
-        loaders = {}
-        for name, make in forms.items():
-            tick(f"{name}, {count} workers: first epoch")
-            loaders[name] = make(workers=count).train_dataloader()
-            read_epoch(loaders[name], 0)
-        epochs: dict[str, list[Epoch]] = {name: [] for name in forms}
-        for number in range(1, repeats + 1):
-            for name, loader in loaders.items():
-                tick(f"{name}, {count} workers: epoch {number} of {repeats}")
-                epochs[name].append(read_epoch(loader, number))
-        rates = {name: _rates(taken) for name, taken in epochs.items()}
-        first = rates[next(iter(forms))]["scenes_per_second"]
-        result += [
-            {"form": name, "workers": count} | rate | {"times_first": rate["scenes_per_second"] / first}
-            for name, rate in rates.items()
-        ]
-    return result
-
-
-def read_epoch(loader: SceneLoader, number: int) -> Epoch:
-    """Read all batches of an epoch and do nothing with them."""
-    if loader.sampler is not None:
-        loader.sampler.set_epoch(number)
-    batches = scenes = images = 0
-    start = time.perf_counter()
-    for batch in loader:
-        count, targets = batch.targets.images.shape[:2]
-        batches += 1
-        scenes += count
-        images += count * (1 + targets)
-    return Epoch(time.perf_counter() - start, batches, scenes, images)
-
-
-def _rates(epochs: Sequence[Epoch]) -> dict[str, float]:
-    seconds = statistics.median(epoch.seconds for epoch in epochs)
-    first = epochs[0]
-    return {
-        "epoch_seconds": seconds,
-        "batches_per_second": first.batches / seconds,
-        "scenes_per_second": first.scenes / seconds,
-        "images_per_second": first.images / seconds,
-    }
-
-
-@dataclass
-class RepeatedSource:
-    """`count` sequences: those of another source again and again, under new names. See `SequenceSource`."""
-
-    source: SequenceSource
-    count: int
-    refused: list[DataError] = field(default_factory=list)
-    left_out: dict[str, list[str]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.names = [f"{number:06d}" for number in range(self.count)]
-        self.listed = self.count
-
-    def read(self, name: str) -> PosedSequence:
-        """A sequence of the other source under this name."""
-        originals = self.source.names
-        return replace(self.source.read(originals[int(name) % len(originals)]), name=name)
-
-    def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """All in one."""
-        return [list(range(len(names)))]
-
-    def fingerprint(self) -> str:
-        """That of the other source."""
-        return self.source.fingerprint()
-
-
-def opening(make: MakeData, epochs: int) -> dict[str, Any]:
-    """Open a data module in a new process, and read its training items for some epochs there.
-
-    Returns:
-        `seconds` to open it (train and val); `added_mb`, resident then above the imports; `growth_mb` of anonymous
-        memory from the first epoch's end to the last one's; `steps` with resident memory after each. No memory is given
-        where the system does not tell.
-    """
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        steps = pool.submit(_steps, make, epochs).result()
-    result = {"seconds": steps[1]["seconds"], "scenes": steps[2]["scenes"]}
-    if "anonymous_mb" in steps[0]:
-        result["added_mb"] = _resident(steps[1]) - _resident(steps[0])
-        result["growth_mb"] = steps[-1]["anonymous_mb"] - steps[2]["anonymous_mb"]
-    return result | {"steps": steps}
-
-
-def _resident(step: dict[str, Any]) -> float:
-    return float(step["anonymous_mb"] + step["file_mb"])
-
-
-def _steps(make: MakeData, epochs: int) -> list[dict[str, Any]]:
-    """One entry after the imports, one after opening, one after each epoch."""
-    import datasets  # noqa: F401  which the store itself imports with its first sequence
-
-    steps = [_step("imports")]
-    start = time.perf_counter()
-    data = make(workers=0)
-    data.setup("fit")
-    steps.append(_step("opening", seconds=time.perf_counter() - start))
-    loader = data.train_dataloader()
-    for number in range(epochs):
-        epoch = read_epoch(loader, number)
-        steps.append(_step(f"epoch {number + 1}", seconds=epoch.seconds, scenes=epoch.scenes))
-    return steps
-
-
-def _step(name: str, **figures: float) -> dict[str, Any]:
-    resident = resident_megabytes() or {}
-    return {"after": name, **figures, **{f"{kind}_mb": value for kind, value in resident.items()}}
+    """Rates of all forms; with `decoding` also its share of the time, where the main process loads."""
+    found = rows(forms, workers, repeats, tick)
+    for name, make in forms.items() if decoding else ():
+        tick(f"{name}: time in decoding")
+        share = decoding_share(make(workers=0).train_dataloader())
+        for row in found:
+            if (row["form"], row["workers"]) == (name, 0):
+                row["decoding_share"] = share
+    return found
 
 
 VALIDATION_SHARE = 0.1
@@ -195,7 +151,7 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
 
 
 def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeData:
-    """A packed store of so many sequences for training and validation, made of a module's few training sequences."""
+    """A packed store of `sequences` sequences for training and validation, of a module's few training sequences."""
     module = data()
     validation = max(1, round(VALIDATION_SHARE * sequences))
     counts = {"train": sequences - validation, "val": validation}
@@ -203,107 +159,31 @@ def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeDa
     return partial(data, root=str(prepare(sources, module.packed_settings(), folder, codec)))
 
 
-# Where image files become pixels, of a published data set and of a prepared one.
-DECODERS = ("completesplat.data.pictures.crop.decode", "completesplat.data.packed.rows.decode")
-MEBIBYTE = 2**20
+@dataclass
+class RepeatedSource:
+    """`count` sequences: those of another source again and again, under new names. See `SequenceSource`."""
 
-Function = Callable[..., Any]
+    source: SequenceSource
+    count: int
+    refused: list[DataError] = field(default_factory=list)
+    left_out: dict[str, list[str]] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.names = [f"{number:06d}" for number in range(self.count)]
+        self.listed = self.count
 
-@contextmanager
-def replaced(path: str, wrap: Callable[[Function], Function]) -> Iterator[None]:
-    """While it lasts, the function `path` (package.module.name) of a module is `wrap(function)`."""
-    module_name, _, name = path.rpartition(".")
-    module = import_module(module_name)
-    function = getattr(module, name)
-    setattr(module, name, wrap(function))
-    try:
-        yield
-    finally:
-        setattr(module, name, function)
+    def read(self, name: str) -> PosedSequence:
+        """A sequence of the other source under this name."""
+        originals = self.source.names
+        return replace(self.source.read(originals[int(name) % len(originals)]), name=name)
 
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """All sequences are in one group."""
+        return [list(range(len(names)))]
 
-class Stopwatch:
-    """Adds up the seconds that are spent in the functions it wraps."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def wrap(self, function: Function) -> Function:
-        """The same function, timed."""
-
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.seconds += time.perf_counter() - start
-
-        return timed
-
-
-def decoding_share(loader: SceneLoader) -> float:
-    """The share of an epoch's time that decoding image files takes, after an unwatched epoch.
-
-    The loader must read in this process.
-    """
-    read_epoch(loader, 0)
-    watch = Stopwatch()
-    with ExitStack() as stack:
-        for path in DECODERS:
-            stack.enter_context(replaced(path, watch.wrap))
-        epoch = read_epoch(loader, 1)
-    return watch.seconds / epoch.seconds
-
-
-class _Counted(dict[Any, Any]):
-    """A dictionary that weak references may point to."""
-
-
-class Counter:
-    """Counts the calls of a function, and how many of the dictionaries that it gave are in memory at once.
-
-    Attributes:
-        calls: so far.
-        most: dictionaries in memory at once, the one that is being made included.
-    """
-
-    def __init__(self) -> None:
-        self.calls = 0
-        self.most = 0
-        self._given: list[weakref.ref[_Counted]] = []
-
-    def wrap(self, function: Function) -> Function:
-        """The same function, counted."""
-
-        def counted(*args: Any, **kwargs: Any) -> Any:
-            self._given = [given for given in self._given if given() is not None]
-            self.calls += 1
-            self.most = max(self.most, len(self._given) + 1)
-            result = _Counted(function(*args, **kwargs))
-            self._given.append(weakref.ref(result))
-            return result
-
-        return counted
-
-
-def chunks(data: Any, read_chunk: str) -> dict[str, Any]:
-    """How many chunks there are and how large, how many an epoch reads, and how many are in memory at once.
-
-    Args:
-        data: a module without workers; its training clips lie in chunks, `<root>/train/*.torch`.
-        read_chunk: the function that reads one of them.
-    """
-    sizes = [path.stat().st_size for path in (data.root / "train").glob("*.torch")]
-    counter = Counter()
-    with replaced(read_chunk, counter.wrap):
-        read_epoch(data.train_dataloader(), 0)
-    return {
-        "files": len(sizes),
-        "largest_mb": max(sizes) / MEBIBYTE,
-        "read_in_an_epoch": counter.calls,
-        "most_in_memory": counter.most,
-    }
+    def fingerprint(self) -> str:
+        """The fingerprint of the other source."""
+        return self.source.fingerprint()
 
 
 READING: list[Column] = [
@@ -325,19 +205,16 @@ STEPS: list[Column] = [
 
 def show(results: dict[str, Any]) -> None:
     """Print all that there is in the results."""
-    machine = results["machine"]
-    console = Console(width=None if Console().is_terminal else 120, markup=False)
-    console.print(f"{machine['processor']}, {machine['cores']} cores, torch {machine['torch']}, {machine['date']}")
-    console.print(table("Training batches", [*READING, DECODING], results["rows"]))
+    shown: list[Table | str] = [table("Training batches", [*READING, DECODING], results["rows"])]
     if "opening" in results:
         opening = results["opening"]
-        console.print(table(f"A packed store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
+        shown.append(table(f"A packed store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
     if "clips" in results:
-        console.print(table("Training batches of clips", READING, results["clips"]))
+        shown.append(table("Training batches of clips", READING, results["clips"]))
         chunks = results["chunks"]
         size, read, most = chunks["largest_mb"], chunks["read_in_an_epoch"], chunks["most_in_memory"]
-        console.print(
+        shown.append(
             f"{chunks['files']} chunks of up to {size:.1f} MB: {read} read in an epoch, {most} in memory at once"
         )
-    for name, reason in results["not_measured"].items():
-        console.print(f"{name}: not measured, because {reason}")
+    machine = results["machine"]
+    print_results(results, f"{machine['processor']}, {machine['cores']} cores", shown)

@@ -1,5 +1,6 @@
-"""What stage 2 costs, in training and in drawing: one way against another, on the same work."""
+"""`completesplat bench diffusion`: what stage 2 costs, one way against another on the same work."""
 
+import json
 import signal
 import statistics
 import threading
@@ -10,12 +11,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
 
 import torch
+from hydra.utils import instantiate
 from rich.console import Console
 from torch.optim import Optimizer
 
+from completesplat.benchmarks.printing import device_of, print_results
+from completesplat.commands import quieten
+from completesplat.commands.schema import Positive, Range
 from completesplat.data.loading.module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
@@ -23,6 +29,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.training.encoding import encode_training_set
 from completesplat.training.scene_module import SceneModule
@@ -33,7 +40,7 @@ Work = Callable[[], object]
 
 
 class NotMeasured(CompleteSplatError):
-    """Why there are no figures of a comparison on this machine."""
+    """A comparison has no figures on this machine, for the reason in the message."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,86 @@ class Comparison:
     name: str
     a: tuple[str, Work]
     b: tuple[str, Work]
+
+
+def run(
+    data: Mapping[str, Any],
+    model: Mapping[str, Any],
+    few: Mapping[str, Any],
+    device: Literal["auto", "cpu", "cuda"],
+    precision: Literal["32-true", "bf16-mixed"],
+    repeats: Positive,
+    samples: Positive,
+    steps: Positive,
+    compile_limit: Annotated[float, Range(0)],
+    seed: int,
+    out: Path,
+) -> None:
+    """Compare on random weights; write `diffusion.json`, print a table.
+
+    Args:
+        data, model: configurations of the data module and of stage 2's module.
+        few: configuration of a sampler with few steps.
+        device: "auto" takes a GPU where there is one.
+        precision: of training steps.
+        repeats: timed calls of each way.
+        samples: drawn of one picture, in a batch and one by one, in `steps` steps.
+        compile_limit: seconds that `torch.compile` may take; 0 leaves it out.
+
+    Raises:
+        CompleteSplatError: there is no such device.
+    """
+    chosen = chosen_device(device)
+    quieten()
+    with TemporaryDirectory(prefix="bench_diffusion_", dir=out) as folder:
+        make_data = partial(instantiate, data, root=f"{folder}/scenes", _convert_="all")
+        make_data().prepare_data()  # it shows progress of its own
+        torch.manual_seed(seed)
+        module = instantiate(model, _convert_="all").to(chosen)
+        generator, batch = module.completesplat, data["batch_size"]
+        training = Training(module, precision)
+        drawn = comparisons(generator, few, samples, steps, batch)
+        prepared: dict[str, Callable[[], Comparison]] = {
+            "cached_vs_on_the_fly": lambda: cached_vs_on_the_fly(training, make_data, Path(folder) / "latents"),
+            **{comparison.name: partial(_same, comparison) for comparison in drawn},
+            "compiled_vs_eager": lambda: compiled_vs_eager(generator, batch, precision, compile_limit),
+        }
+        rows, not_measured = _measured_in_turn(prepared, repeats, chosen)
+    workload = {"device": chosen.type, "precision": precision, "image_size": data["image_size"], "batch": batch}
+    results = {"machine": machine(), "workload": workload, "rows": rows, "not_measured": not_measured}
+    (out / "diffusion.json").write_text(json.dumps(results, indent=2) + "\n")
+    show(results)
+
+
+def chosen_device(device: str) -> torch.device:
+    """The device of a setting.
+
+    Raises:
+        CompleteSplatError: "cuda", where there is no GPU.
+    """
+    there = torch.cuda.is_available()
+    if device == "cuda" and not there:
+        raise CompleteSplatError("device=cuda: there is no GPU here; device=auto takes what there is")
+    return torch.device("cuda" if there and device != "cpu" else "cpu")
+
+
+def _measured_in_turn(
+    prepared: Mapping[str, Callable[[], Comparison]], repeats: int, device: torch.device
+) -> tuple[list[dict[str, Any]], dict[str, str]]:
+    """Rows of the comparisons, each of which is prepared when it is its turn, and why others have none, by name."""
+    rows, not_measured = [], {}
+    with Console(stderr=True).status("building") as status:
+        for name, prepare in prepared.items():
+            status.update(f"timing {name}")
+            try:
+                rows.append(measured(prepare(), repeats, device))
+            except NotMeasured as reason:
+                not_measured[name] = str(reason)
+    return rows, not_measured
+
+
+def _same(comparison: Comparison) -> Comparison:
+    return comparison
 
 
 def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict[str, Any]:
@@ -61,7 +148,7 @@ def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict
 
 
 def milliseconds(work: Work, device: torch.device) -> float:
-    """Of one call, until the device has finished it."""
+    """Time of one call, until the device has finished it."""
     wait = torch.cuda.synchronize if device.type == "cuda" else _nothing
     wait()
     start = time.perf_counter()
@@ -160,7 +247,7 @@ MANY_STEPS = 50  # the paper's
 
 
 def comparisons(model: CompleteSplat, few: Mapping[str, Any], samples: int, steps: int, batch: int) -> list[Comparison]:
-    """Of a generator on its device.
+    """The comparisons of drawing samples with a generator, which is on its device.
 
     Args:
         few: configuration of a sampler with few steps.
@@ -289,13 +376,7 @@ COMPARED: list[Column] = [
 
 def show(results: dict[str, Any]) -> None:
     """Print all that there is in the results."""
-    machine, work = results["machine"], results["workload"]
-    console = Console(width=None if Console().is_terminal else 120, markup=False)
-    where = machine["gpu"] if work["device"] == "cuda" else f"{machine['processor']}, {machine['threads']} threads"
-    console.print(f"{where}, torch {machine['torch']}, {machine['date']}")
-    title = (
-        f"{work['image_size']} x {work['image_size']} pixels, batch {work['batch']}, training in {work['precision']}"
-    )
-    console.print(table(title, COMPARED, results["rows"]))
-    for name, reason in results["not_measured"].items():
-        console.print(f"{name}: not measured, because {reason}")
+    work = results["workload"]
+    size = work["image_size"]
+    title = f"{size} x {size} pixels, batch {work['batch']}, training in {work['precision']}"
+    print_results(results, device_of(results), [table(title, COMPARED, results["rows"])])

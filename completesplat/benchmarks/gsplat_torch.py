@@ -152,7 +152,7 @@ def pairs(
 
 
 def _chunks(counts: Integer[Tensor, " tile"]) -> Iterator[Int[Tensor, " t"]]:
-    """Tiles with lists of similar lengths, so many that their padded lists stay within the budget."""
+    """Groups of tiles with lists of similar lengths, whose padded lists stay within the budget."""
     lengths, order = counts.sort()
     tiles = order[lengths > 0]
     while tiles.numel():

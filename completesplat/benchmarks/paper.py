@@ -1,21 +1,30 @@
-"""The paper's figures of speed (one A100), beside what they are here."""
+"""`completesplat bench paper`: the durations that the paper gives for an A100, beside ours."""
 
 import gc
+import json
 import statistics
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from functools import cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import torch
+from hydra.utils import instantiate
 from rich.console import Console
 from torch import Tensor, nn
 
 from completesplat.benchmarks.diffusion import WARM_UP, Training, autocast, milliseconds
+from completesplat.benchmarks.printing import device_of, print_results
+from completesplat.commands import quieten
+from completesplat.commands.schema import Positive
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit
+from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.scene import SceneBatch
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -32,7 +41,7 @@ class Figure:
     aim_ms: float | None
 
     def durations(self) -> dict[str, float | None]:
-        """For the row of a table."""
+        """Both durations by their columns of the table."""
         return {"paper_ms": self.paper_ms, "aim_ms": self.aim_ms}
 
 
@@ -72,9 +81,122 @@ WAYS = (
 )
 
 
+Works = dict[str, Callable[[], object]]
+
+# Where the paper's durations are of other work, they do not stand beside ours.
+PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
+PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
+
+
+def run(
+    data: Mapping[str, Any],
+    stage1: Mapping[str, Any],
+    stage2: Mapping[str, Any],
+    steps: Positive,
+    device: Literal["cuda", "cpu"],
+    repeats: Positive,
+    samples: Positive,
+    compile: bool,
+    training: bool,
+    channels: Mapping[str, Sequence[int]],
+    seed: int,
+    out: Path,
+) -> None:
+    """Measure on random weights; write `paper.json`, print a table.
+
+    Args:
+        data, stage1, stage2: configurations of the data module and of both stages' modules.
+        steps: of the sampler.
+        repeats: timed calls of each.
+        samples: drawn of one picture at once.
+        compile: also with `torch.compile`, and with CUDA graphs.
+        training: also optimizer steps of both stages.
+        channels: of the `encoder` and the `denoiser`, which tell whether the work is the paper's.
+
+    Raises:
+        CompleteSplatError: there is no GPU.
+    """
+    _refuse_missing_gpu(device)
+    stages: dict[str, tuple[Mapping[str, Any], Callable[..., Works]]]
+    stages = {"stage1": (stage1, stage1_works), "stage2": (stage2, partial(stage2_works, samples=samples))}
+    ways = [way for way in WAYS if compile or way.compile is None]
+    quieten()
+    found = []
+    with (
+        TemporaryDirectory(prefix="bench_paper_", dir=out) as folder,
+        Console(stderr=True).status("building") as status,
+    ):
+        measure = partial(rows, repeats=repeats, tick=lambda text: status.update(f"timing {text}"))
+        scenes = _first_batch(data, folder).to(torch.device(device))
+        # One after the other, so that the memory of one is not counted for the other.
+        for name, (config, works) in stages.items():
+            torch.manual_seed(seed)
+            module = instantiate(config, _convert_="all").to(device)
+            found += _rows_of_stage(name, module, ways, partial(works, module, scenes), training, measure)
+    work = {"image_size": data["image_size"], "batch": data["batch_size"], "samples": samples, "steps": steps}
+    found = _beside_the_papers(found) if is_as_in_the_paper(work, channels) else found
+    results = {"machine": machine(), "workload": {"device": device, **work, "repeats": repeats}, "rows": found}
+    (out / "paper.json").write_text(json.dumps(results, indent=2) + "\n")
+    show(results)
+
+
+def _refuse_missing_gpu(device: str) -> None:
+    """Refuse "cuda" where there is none.
+
+    Raises:
+        CompleteSplatError: there is no GPU.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise CompleteSplatError(
+            "the paper's figures are a GPU's, and there is none here: device=cpu measures all the same, "
+            "autoreconstructor=tiny conditioning=learned denoiser=tiny in minutes"
+        )
+
+
+def _beside_the_papers(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with the paper's durations."""
+    return [FIGURES[row["name"]].durations() | row for row in rows]
+
+
+def _first_batch(data: Mapping[str, Any], folder: str) -> SceneBatch:
+    """The first batch of training scenes, which are made in a folder."""
+    made = instantiate(data, root=f"{folder}/scenes", _convert_="all")
+    made.prepare_data()
+    return next(iter(made.train_dataloader()))
+
+
+def _rows_of_stage(
+    name: str,
+    module: ReconstructionModule | LatentDiffusion,
+    ways: Sequence[Way],
+    works: Callable[..., Works],
+    training: bool,
+    measure: Callable[..., list[dict[str, Any]]],
+) -> list[dict[str, Any]]:
+    """Each way in turn. CUDA graphs and optimizer steps do not go together.
+
+    Args:
+        works: makes the works of the stage for a `precision`.
+        measure: gives the rows of a way and its works.
+    """
+    found = []
+    for way in ways:
+        with compiled(networks(module), way):
+            pieces = works(precision=way.precision)
+            if not training or way.graphs:
+                del pieces[f"{name}_step"]
+            found += measure(way, pieces, device=module.device)
+    return found
+
+
+def is_as_in_the_paper(work: Mapping[str, int], channels: Mapping[str, Sequence[int]]) -> bool:
+    """Whether the work is that which the paper's durations are of, so that they can stand beside ours."""
+    return dict(work) == PAPERS_WORK and dict(channels) == PAPERS_CHANNELS
+
+
 @contextmanager
 def compiled(networks: list[nn.Module], way: Way) -> Iterator[None]:
-    """Within the context, these networks are compiled on their first call."""
+    """Compile these networks on their first call within the context."""
     before = [network._compiled_call_impl for network in networks]
     if way.compile is not None:
         torch.compiler.reset()
@@ -89,11 +211,9 @@ def compiled(networks: list[nn.Module], way: Way) -> Iterator[None]:
 
 VIEWS = 100
 
-Works = dict[str, Callable[[], object]]
 
-
-def stage1(module: ReconstructionModule, scenes: SceneBatch, precision: str) -> Works:
-    """Of the autoreconstructor: the first scene from its picture, its views, and an optimizer step on all scenes."""
+def stage1_works(module: ReconstructionModule, scenes: SceneBatch, precision: str) -> Works:
+    """Works of the autoreconstructor: the first scene from its picture, its views, and a step on all scenes."""
     scene = scenes[:1]
 
     @torch.no_grad()
@@ -111,8 +231,8 @@ def stage1(module: ReconstructionModule, scenes: SceneBatch, precision: str) -> 
     return {"reconstruct": reconstruct, "render": render, "stage1_step": _step(module, scenes, precision)}
 
 
-def stage2(module: LatentDiffusion, scenes: SceneBatch, precision: str, samples: int) -> Works:
-    """Of latent diffusion: samples of the first picture, and an optimizer step on all, encoded within the time."""
+def stage2_works(module: LatentDiffusion, scenes: SceneBatch, precision: str, samples: int) -> Works:
+    """Works of latent diffusion: samples of the first picture, and a step on all, encoded within the time."""
     scene = scenes[:1]
     parts = module.completesplat
 
@@ -129,7 +249,7 @@ def stage2(module: LatentDiffusion, scenes: SceneBatch, precision: str, samples:
 
 
 def networks(module: ReconstructionModule | LatentDiffusion) -> list[nn.Module]:
-    """What can be compiled: the parts that are called as a whole."""
+    """The parts that are called as a whole, which can be compiled."""
     if isinstance(module, ReconstructionModule):
         return [module.model.get_submodule("encoder"), module.model.get_submodule("reconstructor")]
     parts = module.completesplat
@@ -203,13 +323,11 @@ COLUMNS: list[Column] = [
 
 def show(results: dict[str, Any]) -> None:
     """Print all that there is in the results, the ways of one work next to each other."""
-    machine, work = results["machine"], results["workload"]
-    console = Console(width=None if Console().is_terminal else 140, markup=False)
-    where = machine["gpu"] if work["device"] == "cuda" else f"{machine['processor']}, {machine['threads']} threads"
-    console.print(f"{where}, torch {machine['torch']}, {machine['date']}")
+    work = results["workload"]
     order = list(FIGURES)
     rows = sorted(results["rows"], key=lambda row: order.index(row["name"]))
     size = work["image_size"]
     drawn = f"{work['samples']} samples in {work['steps']} steps"
     title = f"{size} x {size} pixels, {drawn}, training batches of {work['batch']}"
-    console.print(table(title, COLUMNS, [row | {"text": FIGURES[row["name"]].text} for row in rows]))
+    shown = table(title, COLUMNS, [row | {"text": FIGURES[row["name"]].text} for row in rows])
+    print_results(results, device_of(results), [shown], width=140)

@@ -1,32 +1,148 @@
-"""The rasterizers side by side: speed, growth, agreement on a large scene."""
+"""`completesplat bench rasterizers`: the backends side by side, in speed, growth and agreement."""
 
-import math
+import json
+import logging
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypedDict
 
-import torch
-from jaxtyping import Bool, Float, Int
+from hydra.utils import instantiate
+from lightning import LightningModule
 from rich.console import Console
-from torch import Tensor
 
-from completesplat.benchmarks.workloads import OPACITIES, milliseconds, peak_megabytes, splatter_scene
+from completesplat.benchmarks.agreement import agreement_rows
+from completesplat.benchmarks.printing import device_of, print_results
+from completesplat.benchmarks.training_step import share
+from completesplat.benchmarks.workloads import (
+    DEFAULTS,
+    OPACITIES,
+    Backend,
+    milliseconds,
+    peak_megabytes,
+    read_scene,
+    splatter_scene,
+)
+from completesplat.commands import quieten
+from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, RenderingConstants
-from completesplat.rasterizers.reference import (
-    ReferenceRasterizer,
-    alphas_at,
-    project_gaussians,
-    visible_in_depth_order,
-)
+from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
+
+logger = logging.getLogger(__name__)
+
+
+class Growth(TypedDict):
+    """Growth of time with the workload, of these backends, up to this number of Gaussians."""
+
+    backends: Sequence[str]
+    most_gaussians: Positive
+
+
+class TrainingStep(TypedDict):
+    """A step of training with each of these backends, on scenes of this size; the precision is Lightning's."""
+
+    backends: Sequence[str]
+    size: Positive
+    batch: Positive
+    targets: Positive
+    precision: str
+
+
+def run(
+    scene: str | None,
+    backends: Sequence[str],
+    sizes: Sequence[Positive],
+    views: Sequence[Positive],
+    repeats: Positive,
+    growth: Growth | Literal[False],
+    training_step: TrainingStep | Literal[False],
+    model: Mapping[str, Any],
+    constants: Mapping[str, Any],
+    out: Path,
+) -> None:
+    """Time the rasterizers, or compare them on a scene; write `rasterizers.json` and a plot, print tables.
+
+    Args:
+        scene: a file that `read_scene` reads, drawn instead of all that follows.
+        backends: keys of `CLASSES`; those that do not work here are left out, with the reason.
+        sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
+        repeats: timed calls of each.
+        growth, training_step: False leaves them out.
+        model: configuration of the module whose steps are timed.
+        constants: configuration of the `RenderingConstants` that all backends share.
+
+    Raises:
+        CompleteSplatError: no such file or backend.
+    """
+    compared = read_scene(Path(scene)) if scene else None
+    shared = instantiate(constants)
+    with Console(stderr=True).status("compiling") as status:
+        working, absent = working_backends(backends, shared)
+
+        def tick(text: str) -> None:
+            status.update(f"timing {text}")
+
+        if compared is not None:
+            figures = _on_a_scene(str(scene), *compared, working, shared, repeats, tick)
+        else:
+            quieten()
+            figures = {"rows": speed_rows(working, sizes, views, repeats, tick)}
+            if growth:
+                chosen = [backend for backend in working if backend.name in growth["backends"]]
+                figures["growth"] = growth_rows(chosen, tick, growth["most_gaussians"])
+            if training_step:
+                figures["training_step"] = _step_rows(working, training_step, model, tick)
+    results = {"machine": machine(), "not_measured": absent, **figures}
+    (out / "rasterizers.json").write_text(json.dumps(results, indent=2) + "\n")
+    if results.get("growth"):
+        plot(results["growth"], out / "rasterizers.png")
+    show(results)
+
+
+def _step_rows(
+    backends: Sequence[Backend], settings: TrainingStep, model: Mapping[str, Any], tick: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    size, batch, targets = settings["size"], settings["batch"], settings["targets"]
+
+    def make_module(rasterizer: Rasterizer) -> LightningModule:
+        return instantiate(model, rasterizer=rasterizer, _convert_="all")
+
+    found = []
+    for backend in (backend for backend in backends if backend.name in settings["backends"]):
+        tick(f"a training step with {backend.name}")
+        found.append(share(backend, make_module, size, batch, targets, settings["precision"]))
+    return found
+
+
+def _on_a_scene(
+    file: str, gaussians: Gaussians, cameras: Cameras, defaults: Sequence[str], backends: Sequence[Backend],
+    constants: RenderingConstants, repeats: int, tick: Callable[[str], None],
+) -> dict[str, Any]:  # fmt: skip
+    """Time and agreement of the backends on one scene.
+
+    Args:
+        defaults: names of what the file lacks.
+    """
+    if defaults:
+        values = ", ".join(f"{name}={DEFAULTS[name]}" for name in defaults)
+        logger.info("%s has no %s: every Gaussian gets %s", file, ", ".join(defaults), values)
+    views, (height, width) = cameras.intrinsics.shape[1], cameras.image_size
+    tick(f"{gaussians.count} Gaussians in {views} views")
+    workload = {"size": max(height, width), "gaussians": gaussians.count, "views": views, "opacity": "file"}
+    timed = side_by_side(backends, gaussians, cameras, repeats)
+    return {
+        "rows": [{"backend": name} | workload | figures for name, figures in timed.items()],
+        "scene": {"file": file, "height": height, "width": width, "defaults": defaults},
+        "agreement": agreement_rows(backends, gaussians, cameras, constants, tick),
+    }
+
 
 # `torch_tiled` and `gsplat_torch` are baselines: kept for this comparison, not to be chosen for training.
 CLASSES = {
@@ -36,27 +152,10 @@ CLASSES = {
     "tiled": "completesplat.rasterizers.tiled.TiledRasterizer",
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
 }
-MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel: the reference takes a second for a tenth of them
-
-
-@dataclass(frozen=True)
-class Backend:
-    """A rasterizer, its name in the tables, and where it takes its tensors."""
-
-    name: str
-    rasterizer: Rasterizer
-
-    @property
-    def device(self) -> str:
-        return "cuda" if self.name == "cuda" else "cpu"
-
-    def takes(self, gaussians: int, pixels: int) -> bool:
-        """Whether a workload with this many pixels in all views is not hopelessly large for it."""
-        return self.name != "reference" or gaussians * pixels <= MOST_REFERENCE_PAIRS
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
-    """Those of the named backends that render a small scene here, and for each of the others the reason why not.
+    """The named backends that render a small scene here, and for each of the others the reason why it does not.
 
     Raises:
         CompleteSplatError: a name that is not in `CLASSES`.
@@ -195,81 +294,6 @@ def plot(growth: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-# `tiled` projects and sorts in float64, like the reference. The others do so in float32: in a large scene some
-# neighbours in depth then change places.
-TOLERANCE, FLOAT32_TOLERANCE = {"tiled": 1e-5}, 1e-4
-PIXELS_PER_VIEW, PIXELS_AT_ONCE = 128, 8
-# Where an alpha is this close to its threshold, or a transmittance to the stop (relatively), float32 may decide
-# otherwise than float64, rightly so. Such pixels are counted, not compared.
-BAND, STOP_BAND = 1e-4, 1e-3
-
-
-def agreement_rows(
-    backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants,
-    tick: Callable[[str], None],
-) -> list[dict[str, Any]]:  # fmt: skip
-    """For each backend the largest errors over the sampled pixels of all views of one scene (batch of 1).
-
-    `color` and `alpha` are absolute, `depth` is relative to the largest depth of the sample; `pixels` of them were
-    compared, `undecided` left out. `agrees` says whether all three are within the backend's tolerance; one that is not
-    finite is None, and does not agree.
-    """
-    scene, seen = gaussians[0].to(torch.float64), cameras[0].to(torch.float64)
-    views, (height, width) = len(seen.intrinsics), cameras.image_size
-    generator = torch.Generator().manual_seed(0)
-    positions = torch.randint(height * width, (views, PIXELS_PER_VIEW), generator=generator)
-    exact, decided = [], []
-    for view in range(views):
-        tick(f"reference at {PIXELS_PER_VIEW} pixels of view {view}")
-        pixels = (torch.stack([positions[view] % width, positions[view] // width], dim=-1) + 0.5).double()
-        exact.append(ReferenceRasterizer(constants).at_pixels(scene, seen[view], pixels))
-        decided.append(is_decided(scene, seen[view], pixels, constants))
-    expected, mask = torch.stack(exact), torch.stack(decided)
-    scale = torch.ones(5).index_fill(0, torch.tensor(3), expected[..., 3].max().item() or 1.0)
-    result = []
-    for backend in backends:
-        if backend.name == "reference":
-            continue
-        tick(backend.name)
-        errors = ((draw_at(backend, gaussians, cameras, positions) - expected).abs() / scale)[mask]
-        largest = errors.amax(0) if len(errors) else torch.full((5,), torch.nan)
-        figures = {"color": largest[:3].max().item(), "depth": largest[3].item(), "alpha": largest[4].item()}
-        agrees = bool((largest <= TOLERANCE.get(backend.name, FLOAT32_TOLERANCE)).all())
-        counts = {"pixels": int(mask.sum()), "undecided": int((~mask).sum())}
-        finite = {name: error if math.isfinite(error) else None for name, error in figures.items()}
-        result.append({"backend": backend.name, **finite, "agrees": agrees, **counts})
-    return result
-
-
-@torch.no_grad()
-def draw_at(
-    backend: Backend, gaussians: Gaussians, cameras: Cameras, positions: Int[Tensor, "view pixel"]
-) -> Float[Tensor, "view pixel 5"]:
-    """Red, green, blue, depth and alpha of one scene at these positions (row-major) of each view's image."""
-    rendering = backend.rasterizer(gaussians.to(backend.device), cameras.to(backend.device)).to("cpu")[0]
-    images = torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=1).flatten(-2)
-    return images.gather(-1, positions[:, None].expand(-1, 5, -1)).mT
-
-
-@torch.no_grad()
-def is_decided(
-    gaussians: Gaussians, camera: Cameras, pixels: Float[Tensor, "pixel 2"], constants: RenderingConstants
-) -> Bool[Tensor, " pixel"]:
-    """Which pixels keep clear of the steps of the function: no decision there hangs on rounding."""
-    visible, order = visible_in_depth_order(gaussians, camera, constants)
-    chosen = gaussians[visible][order]
-    centers, _, covariances = project_gaussians(chosen, camera, constants)
-    marks = []
-    for chunk in pixels.split(PIXELS_AT_ONCE):
-        alphas = alphas_at(chunk, centers, covariances, chosen.opacities, replace(constants, min_alpha=0.0))
-        drawn = torch.where(alphas >= constants.min_alpha, alphas, 0)
-        behind = torch.cumprod(1 - drawn, dim=0)
-        steps = (alphas / constants.min_alpha - 1).abs() < BAND
-        steps |= (behind / constants.min_transmittance - 1).abs() < STOP_BAND
-        marks.append(~steps.any(0))
-    return torch.cat(marks)
-
-
 SPEED: list[Column] = [
     ("backend", "backend", ""),
     ("size", "size", ""),
@@ -316,17 +340,12 @@ WORKLOAD = ("axis", "size", "gaussians", "views", "opacity")
 
 def show(results: dict[str, Any]) -> None:
     """Print all that there is in the results."""
-    machine = results["machine"]
-    # No markup: a reason may hold brackets, `pip install "completesplat[cuda]"` for one.
-    console = Console(width=None if Console().is_terminal else 120, markup=False)
-    console.print(f"{machine['processor']}, {machine['threads']} threads, torch {machine['torch']}, {machine['date']}")
+    shown = []
     for key, title, columns in SECTIONS:
         rows = results.get(key, [])
         if rows:
-            compared = against_tiled(rows) if key in ("rows", "growth") else rows
-            console.print(table(title, columns, compared))
-    for name, reason in results["not_measured"].items():
-        console.print(f"{name}: not measured, because {reason}")
+            shown.append(table(title, columns, against_tiled(rows) if key in ("rows", "growth") else rows))
+    print_results(results, device_of(results), shown)
 
 
 def against_tiled(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -56,7 +56,7 @@ class TorchTiledRasterizer:
 
 @dataclass(frozen=True)
 class _Board:
-    """What both passes read."""
+    """The tensors that both passes read."""
 
     rows: Float[Tensor, "splat 16"]
     windows: Int[Tensor, "start entry"]
@@ -112,7 +112,7 @@ class _Round:
         self.alphas = self._alphas(board, fields[:6])
 
     def _alphas(self, board: _Board, fields: Float[Tensor, "6 tile entry"]) -> Float[Tensor, "tile entry pixel"]:
-        """Of the exponents -(root + root_x x + root_y y)^2 - rest_y (dy + y)^2 + log opacity, as polynomials.
+        """Alphas; their exponents -(root + root_x x + root_y y)^2 - rest_y (dy + y)^2 + log opacity are polynomials.
 
         Nothing is lost to cancellation: a splat that reaches a tile is not many deviations away from its centre.
         """

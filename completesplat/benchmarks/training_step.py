@@ -10,8 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from completesplat.benchmarks.rasterizers import Backend
-from completesplat.benchmarks.workloads import DISTANCE, orbit
+from completesplat.benchmarks.workloads import DISTANCE, Backend, orbit
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, Rendering

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ MEBIBYTE = 2**20
 
 
 def milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:
-    """Of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
+    """Times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     ones = [_ones(cameras, channels) for channels in (3, 1, 1)]
     wait = torch.cuda.synchronize if gaussians.means.is_cuda else _nothing
@@ -157,7 +158,7 @@ def _nothing() -> None: ...
 
 
 def peak_megabytes(work: Callable[[], object], device: str) -> float | None:
-    """What `work` adds to the memory of the process, or of the GPU; None where the system does not tell.
+    """The memory in MB that `work` adds to the process, or to the GPU; None where the system does not tell.
 
     The memory of the process is read from /proc every 2 ms, and once more at the end.
     """
@@ -198,3 +199,22 @@ def _return_free_memory() -> None:
     release()
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)  # of glibc
+
+
+MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel: the reference takes a second for a tenth of them
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A rasterizer, its name in the tables, and where it takes its tensors."""
+
+    name: str
+    rasterizer: Rasterizer
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.name == "cuda" else "cpu"
+
+    def takes(self, gaussians: int, pixels: int) -> bool:
+        """Whether a workload with this many pixels in all views is not hopelessly large for it."""
+        return self.name != "reference" or gaussians * pixels <= MOST_REFERENCE_PAIRS

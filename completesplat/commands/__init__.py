@@ -111,7 +111,7 @@ def quieten() -> None:
 def refusal(error: BaseException) -> str | None:
     """One line for an error that the user can put right; None for a fault of the program."""
     from hydra.errors import HydraException, InstantiationException
-    from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+    from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
     chain: BaseException | None = error
     while chain is not None:
@@ -120,6 +120,9 @@ def refusal(error: BaseException) -> str | None:
         chain = chain.__cause__
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} is needed: give {error.full_key}=VALUE"
+    if isinstance(error, InterpolationToMissingValueError):
+        key = str(error).partition("Missing mandatory value: ")[2].split()[0]  # omegaconf keeps it nowhere else
+        return f"{key} is needed: give {key}=VALUE"
     if isinstance(error, HydraException | OmegaConfBaseException) and not isinstance(error, InstantiationException):
         return " ".join(str(error).split())
     return None

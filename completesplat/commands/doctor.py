@@ -24,7 +24,7 @@ State = Literal["yes", "no", "broken"]
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found, or not, or is broken.
+    """One thing that was found, is missing or is broken.
 
     Args:
         part: of the machine, the same for lines that belong together.
@@ -111,7 +111,7 @@ def needed_packages(needed: Iterable[Requirement]) -> list[Finding]:
 
 
 def extra_packages(name: str, gives: str, requirements: Iterable[Requirement]) -> list[Finding]:
-    """What an extra brings, or would bring: one that is not installed is no error."""
+    """A line for each package of an extra; one that is not installed is no error."""
     lines = []
     for requirement in requirements:
         if applies(requirement, "") or not applies(requirement, name):
@@ -270,7 +270,7 @@ def run(config: Any, out: Path) -> None:
 
 
 def checks(place: Path) -> list[tuple[str, Callable[[], list[Finding]]]]:
-    """What is looked at: a part of the machine, and the check of it."""
+    """The parts of the machine with their checks, in the order of the table."""
     from completesplat.commands import conf_folder
 
     return [
@@ -285,7 +285,7 @@ def checks(place: Path) -> list[tuple[str, Callable[[], list[Finding]]]]:
 
 
 def findings_of(part: str, check: Callable[[], list[Finding]]) -> list[Finding]:
-    """What one check finds. What it cannot import is a finding too."""
+    """The findings of a check; an exception, such as a failing import, becomes a finding."""
     try:
         return check()
     except Exception as error:  # of any library: the other parts are looked at all the same

@@ -1,4 +1,4 @@
-"""What `completesplat doctor` needs the package's own parts for: do rasterizers draw, are weights whole."""
+"""The checks of `completesplat doctor` that need the package's own parts: rasterizers and weights."""
 
 import math
 from pathlib import Path
@@ -35,7 +35,7 @@ def check_rasterizers() -> list[Finding]:
 
 @torch.no_grad()
 def wrong(rasterizer: Rasterizer) -> str | None:
-    """What is wrong with the picture of two round Gaussians, one behind the other on the optical axis; None if nothing.
+    """How the picture of two round Gaussians, one behind the other on the optical axis, is wrong; None if it is right.
 
     With focal length f, a Gaussian of size s at depth z is a disc of variance (f s / z)^2 and the blur's, in px^2: its
     alpha is its opacity in the middle, and exp(-1 / (2 variance)) of that one pixel aside. The front one covers the

@@ -1,13 +1,26 @@
 """`completesplat test`: images of a trained model against true ones; `fit` scores in the same way."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
+from lightning import seed_everything
+from omegaconf import OmegaConf
+
+from completesplat.commands import quieten
+from completesplat.commands.jobs import CONFIG
+from completesplat.commands.protocol import protocol
+from completesplat.commands.trained import Trained
+from completesplat.data.packed.manifest import is_packed
 from completesplat.errors import CompleteSplatError
+from completesplat.results.tables import evaluation_table, show
+from completesplat.results.wandb import begin, log_test
+from completesplat.training.loggers import finished
 
 
-def scored_data(run_config: Any, evaluation: Any) -> Any:
+def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
     """The data of a run's settings, which are changed as the protocol says.
 
     Where it scores at a larger size than the model's, the model sees what the data give at its own size.
@@ -17,24 +30,20 @@ def scored_data(run_config: Any, evaluation: Any) -> Any:
             got, or scores at a smaller size, or at another one than that of prepared pictures.
         DataError: the protocol's files cannot be used.
     """
-    from hydra.utils import instantiate
-
-    from completesplat.data.packed.manifest import is_packed
-
     if "scoring" not in evaluation:
-        raise CompleteSplatError(f"evaluation={evaluation.name}: fit scores pictures only; set test=false")
-    for key, value in evaluation.data.items():
+        raise CompleteSplatError(f"evaluation={evaluation['name']}: fit scores pictures only; set test=false")
+    for key, value in evaluation["data"].items():
         if key not in run_config.data:
-            raise CompleteSplatError(f"evaluation={evaluation.name}: the data of this run have no setting {key}")
+            raise CompleteSplatError(f"evaluation={evaluation['name']}: the data of this run have no setting {key}")
         run_config.data[key] = value
     data = instantiate(run_config.data, _convert_="all")
     found = data.describe()["data_set"]
-    if evaluation.data_set is not None and found.partition("/")[0] != evaluation.data_set:
+    if evaluation["data_set"] is not None and found.partition("/")[0] != evaluation["data_set"]:
         raise CompleteSplatError(
-            f"evaluation={evaluation.name} is of {evaluation.data_set}, this run's data are {found}: "
+            f"evaluation={evaluation['name']} is of {evaluation['data_set']}, this run's data are {found}: "
             "use evaluation=images"
         )
-    resolution, size = evaluation.resolution, data.image_size
+    resolution, size = evaluation["resolution"], data.image_size
     if resolution is None or resolution == size:
         return data
     if resolution < size:
@@ -47,60 +56,63 @@ def scored_data(run_config: Any, evaluation: Any) -> Any:
     return larger
 
 
-def set_scoring(module: Any, evaluation: Any) -> None:
+def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
     """Give a model the protocol's metrics.
 
     Raises:
-        CompleteSplatError: several samples are asked of a model that has one answer.
+        CompleteSplatError: the protocol has several samples, the model gives one answer.
     """
-    from hydra.utils import instantiate
-
-    module.evaluation = instantiate(evaluation.scoring, _convert_="all")
+    module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
 
 
-def scoring_trainer(config: Any, **settings: Any) -> Any:
+def scoring_trainer(trainer: Mapping[str, Any], evaluation: Mapping[str, Any], **settings: Any) -> Any:
     """A trainer that tests in the protocol's precision, whatever the networks were trained in.
 
     Args:
-        settings: of the trainer, besides those of the configuration.
+        settings: of the trainer, besides those of its configuration.
     """
-    from hydra.utils import instantiate
-
-    return instantiate(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
+    return instantiate(trainer, precision=evaluation["precision"], **settings, _convert_="all")
 
 
-def run(config: Any, out: Path) -> None:
-    """Write `metrics.json` and print the table."""
-    from hydra.utils import instantiate
-    from lightning import seed_everything
+def run(
+    trained: Mapping[str, Any],
+    evaluation: Mapping[str, Any],
+    trainer: Mapping[str, Any],
+    logger: Mapping[str, Any] | None,
+    out: Path,
+) -> None:
+    """Write `metrics.json` and print the table.
 
-    from completesplat.commands import quieten
-    from completesplat.commands.protocol import protocol
-    from completesplat.commands.trained import configuration, facts, open_module
-    from completesplat.results.tables import evaluation_table, show
-    from completesplat.results.wandb import begin, log_test
-    from completesplat.training.loggers import finished
+    Args:
+        trained: the arguments of `Trained`.
+        evaluation: configuration of the protocol (`conf/evaluation/`).
+        trainer: configuration of the trainer, without precision.
+        logger: configurations of loggers by name.
 
-    run_config = configuration(config)
+    Raises:
+        CompleteSplatError: model, data and protocol do not go together, or some of them are missing.
+    """
+    tested = Trained(**trained)
+    run_config = tested.configuration()
     quieten()
-    seed_everything(config.seed, verbose=False)
-    data = scored_data(run_config, config.evaluation)
-    module = open_module(config, run_config)
-    set_scoring(module, config.evaluation)
-    loggers = list(instantiate(config.get("logger", {}), _convert_="all").values())
-    trainer = scoring_trainer(config, logger=loggers)
+    seed_everything(tested.seed, verbose=False)
+    data = scored_data(run_config, evaluation)
+    module = tested.open_module(run_config)
+    set_scoring(module, evaluation)
+    loggers = list(instantiate(logger or {}, _convert_="all").values())
+    testing = scoring_trainer(trainer, evaluation, logger=loggers)
     with finished(loggers):
-        shown = begin(module, trainer, config, out)
-        trainer.test(module, datamodule=data, verbose=False)
+        shown = begin(module, testing, OmegaConf.load(out / CONFIG), out)
+        testing.test(module, datamodule=data, verbose=False)
         results = module.test_results()
-        if not trainer.is_global_zero:
+        if not testing.is_global_zero:
             return
-        described = protocol(config.evaluation, module, data, results) | facts(config)
+        described = protocol(evaluation, module, data, results) | tested.facts()
         text = json.dumps({"protocol": described} | results, indent=2, allow_nan=False)
         (out / "metrics.json").write_text(text + "\n")
-        log_test(results, shown, trainer, out)
+        log_test(results, shown, testing, out)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")

@@ -42,7 +42,7 @@ EXAMPLES = {
     "checkpoint": "RUN/checkpoints/last.ckpt",
     "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
 }
-"""What to give for a setting that is missing."""
+"""Examples of settings that may be missing."""
 
 
 def run(config: Any, out: Path) -> None:
@@ -104,7 +104,7 @@ def _parts(config: Any) -> list[Any]:
 
 
 def _write(results: dict[str, Any], path: Path) -> None:
-    """At once, since the file also tells that the job is done."""
+    """Write the results in one step, because the file also means that the job is done."""
     from completesplat.atomic import atomic_path
 
     with atomic_path(path) as temporary:
@@ -161,13 +161,15 @@ def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
 
     progress = instantiate(config.callbacks.progress, _convert_="all")
     callbacks = [] if progress is None else [progress]
-    trainer = scoring_trainer(config, callbacks=callbacks, logger=False, enable_checkpointing=False)
+    trainer = scoring_trainer(
+        config.trainer, config.evaluation, callbacks=callbacks, logger=False, enable_checkpointing=False
+    )
     trainer.test(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 
 def _facts(trainer: Any, out: Path) -> dict[str, Any]:
-    """Which weights were scored: those of the last checkpoint, if any was written."""
+    """Facts of the weights that were scored: those of the last checkpoint, if any was written."""
     from lightning.pytorch.callbacks import WeightAveraging
 
     from completesplat.commands.protocol import checkpoint_facts

@@ -14,6 +14,7 @@ from typing import Any
 
 from completesplat import __version__
 from completesplat.commands.protocol import git_commit
+from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
 
 LONGEST_NAME = 120
@@ -30,7 +31,7 @@ def one_of_several() -> bool:
 
 
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
-    """What a sweep needs besides its own arguments: one directory, and in it one for each job, named by what is swept.
+    """Arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
 
     Raises:
         CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
@@ -123,16 +124,20 @@ def run_process_of_job(verb: str, out: Path) -> None:
 
 
 def start(verb: str, config: Any, out: Path) -> None:
-    """Do what the configuration names as its task, else what the verb's module runs."""
-    from hydra.utils import get_method, instantiate
+    """Call the function that the configuration names as its task, else the one of a verb that has a single task.
 
-    task = config.get("task")
-    if task is None:
+    Raises:
+        CompleteSplatError: a setting does not fit the function's signature.
+    """
+    from hydra.utils import get_method, instantiate
+    from omegaconf import OmegaConf
+
+    if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
-    elif isinstance(task, str):
-        get_method(task)(config, out)
-    else:
-        instantiate(task, out=out, _convert_="all")
+        return
+    settings: Any = OmegaConf.to_container(config.task, resolve=True)
+    check_settings(get_method(settings["_target_"]), settings)
+    instantiate(config.task, out=out, _convert_="all")
 
 
 def is_first_process() -> bool:
@@ -173,7 +178,7 @@ def _differences(one: Any, other: Any, key: str = "") -> set[str]:
 
 
 def _record(path: Path, command: list[str], overrides: list[str]) -> None:
-    """What was started, and when it was continued."""
+    """Write `run.json`: what was started and when, and when it was continued."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {
         "version": __version__,
@@ -190,7 +195,7 @@ def _record(path: Path, command: list[str], overrides: list[str]) -> None:
 
 @contextmanager
 def _for_other_processes(arguments: list[str]) -> Iterator[None]:
-    """What Lightning starts for a second device is to work on this job.
+    """Make the processes that Lightning starts for further devices work on this job.
 
     It repeats the program's arguments, which in a sweep would be a second sweep; where it finds Hydra at work, it adds
     settings of Hydra's. The next job of a sweep is to start its own processes: what Lightning leaves behind would make

@@ -1,7 +1,8 @@
-"""What figures were measured of, and how: without it they say nothing."""
+"""The statement of what was measured and how, which stands beside all figures of a test."""
 
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,36 +33,36 @@ METRICS: dict[str, dict[str, Any]] = {
 }
 
 
-def protocol(asked: Any, module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
+def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
     """The statement that stands beside the results of a test.
 
     Args:
-        asked: the configuration of the protocol (`conf/evaluation/`).
+        evaluation: the configuration of the protocol (`conf/evaluation/`).
         results: of the module's test.
     """
     from completesplat.results.machine import machine
 
-    evaluation, model = module.evaluation, results["model"]
+    scored, model = module.evaluation, results["model"]
     described = {
-        "name": asked.name,
+        "name": evaluation["name"],
         "method": module.method,
         **data.describe(),
         "image_size": (data.at_model_size or data).image_size,
         "resolution": data.image_size,
-        "precision": asked.precision,
+        "precision": evaluation["precision"],
         "scenes_listed": data.source("test").listed,
-        **{"scenes": model["scenes"], "skipped": evaluation.skipped, "views": model["views"]},
-        **{"samples": evaluation.samples, "criterion": evaluation.criterion, "seed": evaluation.seed},
+        **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},
+        **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
         **drawing(module),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",
-        "metrics": {name: METRICS[name] for name in evaluation.metrics if name in METRICS},
-        "missing": evaluation.missing,
+        "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},
+        "missing": scored.missing,
         "data_fingerprint": data.source("test").fingerprint(),
         **{"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)},
         "machine": machine(),
     }
-    for metric in evaluation.set_metrics:
+    for metric in scored.set_metrics:
         described["metrics"] |= metric.settings()
     return described
 
@@ -80,7 +81,7 @@ def drawing(module: Any) -> dict[str, Any]:
 
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
-    """Which weights a file holds, and whether they are an average over training (Lightning's `WeightAveraging`)."""
+    """Path, checksum and step of a checkpoint, and whether it holds an average (Lightning's `WeightAveraging`)."""
     from completesplat.training.checkpoints import read_checkpoint
 
     contents = read_checkpoint(path)

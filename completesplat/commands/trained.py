@@ -1,6 +1,8 @@
-"""What is to be measured: a run's checkpoint with its configuration, or a folder of weights and data."""
+"""Trained models that are measured: a run's checkpoint with its configuration, or a folder of weights and data."""
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,49 +19,109 @@ ONLY_FOR_TRAINING = (
 )
 
 
-def configuration(config: Any) -> Any:
-    """Model and data: of the run that `ckpt` belongs to, or of `weights` with the group `data`.
+@dataclass(frozen=True)
+class Trained:
+    """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    Raises:
-        WeightsError: the checkpoint, its run's configuration or the weights are missing.
-        CompleteSplatError: neither is given, or both, or weights without data.
+    Args:
+        ckpt: a checkpoint, whose run's directory holds the configuration of model and data.
+        overrides: changes to that configuration, as on the command line.
+        weights: a folder of weights, or a name of those in the package, instead of a checkpoint.
+        data, rasterizer: configurations that belong to `weights`.
+        sampler: configuration of another sampler than the model's own.
     """
-    if (config.ckpt is None) == (config.get("weights") is None):
-        raise CompleteSplatError("give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR")
-    if config.ckpt is not None:
-        if config.get("data") is not None:
-            raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
-        return config_of_run(Path(config.ckpt), list(config.overrides))
-    if config.get("data") is None:
-        raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
-    return _config_of_weights(config)
+
+    ckpt: str | None
+    overrides: Sequence[str] = ()
+    weights: str | None = None
+    data: Mapping[str, Any] | None = None
+    rasterizer: Mapping[str, Any] | None = None
+    sampler: Mapping[str, Any] | None = None
+    seed: int = 0
+
+    def configuration(self) -> Any:
+        """The configuration of model and data.
+
+        Raises:
+            WeightsError: the checkpoint, its run's configuration or the weights are missing.
+            CompleteSplatError: neither is given, or both, or weights without data.
+        """
+        if (self.ckpt is None) == (self.weights is None):
+            raise CompleteSplatError("give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR")
+        if self.ckpt is not None:
+            if self.data is not None:
+                raise CompleteSplatError(
+                    "a checkpoint's data are its run's: change them by overrides=['data.root=DIR']"
+                )
+            return config_of_run(Path(self.ckpt), list(self.overrides))
+        if self.data is None:
+            raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
+        return self._config_of_weights(str(self.weights))
+
+    def open_module(self, configuration: Any) -> Any:
+        """The model of the configuration, with its weights and the sampler that is to draw.
+
+        Raises:
+            WeightsError: the weights do not fit.
+            CompleteSplatError: a sampler for a model that draws nothing.
+        """
+        from hydra.utils import instantiate
+
+        from completesplat.training.checkpoints import load_part
+
+        module = instantiate(configuration.model, _convert_="all")
+        if self.ckpt is not None:
+            load_part(module, self.ckpt, prefix="")
+        if self.sampler is not None:
+            diffusion_of(module).replace_sampler(self.sampler)
+        return module
+
+    def facts(self) -> dict[str, Any]:
+        """Path and checksum of the weights, for the protocol of a measurement."""
+        from completesplat.commands.protocol import checkpoint_facts, weights_facts
+
+        return checkpoint_facts(Path(self.ckpt)) if self.ckpt is not None else weights_facts(str(self.weights))
+
+    def _config_of_weights(self, weights: str) -> Any:
+        """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
+        from omegaconf import OmegaConf
+
+        from completesplat.weights import CONFIG_FILE, weights_folder
+
+        folder = weights_folder(weights)
+        model = {
+            "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
+            "completesplat": {
+                "_target_": "completesplat.generation.CompleteSplat.from_pretrained",
+                "path": str(folder),
+            },
+            "rasterizer": self.rasterizer,
+            "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
+            "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
+        }
+        found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
+        found.data.image_size = json.loads((folder / CONFIG_FILE).read_text())["image_size"]
+        return found
 
 
-def open_module(config: Any, found: Any) -> Any:
-    """The model of a `configuration`, with its weights, and the sampler that is asked for.
+def open_run(ckpt: str, overrides: Sequence[str]) -> tuple[Any, Any]:
+    """The module of a run with its trained weights, and the run's data module.
+
+    Args:
+        ckpt: a checkpoint, whose run's directory holds the configuration of model and data.
+        overrides: changes to that configuration, as on the command line.
 
     Raises:
-        WeightsError: the weights do not fit.
-        CompleteSplatError: a sampler for a model that draws nothing.
+        WeightsError: the checkpoint or its run's configuration is missing or does not fit.
     """
     from hydra.utils import instantiate
-    from omegaconf import OmegaConf
 
-    from completesplat.training.checkpoints import load_part
+    from completesplat.commands import quieten
 
-    module = instantiate(found.model, _convert_="all")
-    if config.ckpt is not None:
-        load_part(module, config.ckpt, prefix="")
-    if config.get("sampler") is not None:
-        diffusion_of(module).replace_sampler(OmegaConf.to_container(config.sampler))
-    return module
-
-
-def facts(config: Any) -> dict[str, Any]:
-    """Which weights they are, for the protocol of a measurement."""
-    from completesplat.commands.protocol import checkpoint_facts, weights_facts
-
-    return checkpoint_facts(Path(config.ckpt)) if config.ckpt is not None else weights_facts(config.weights)
+    trained = Trained(ckpt, overrides)
+    configuration = trained.configuration()
+    quieten()
+    return trained.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
 
 def diffusion_of(module: Any) -> Any:
@@ -98,22 +160,3 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
     if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
         config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     return config
-
-
-def _config_of_weights(config: Any) -> Any:
-    """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
-    from omegaconf import OmegaConf
-
-    from completesplat.weights import CONFIG_FILE, weights_folder
-
-    folder = weights_folder(config.weights)
-    model = {
-        "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
-        "completesplat": {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": str(folder)},
-        "rasterizer": config.rasterizer,
-        "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
-        "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
-    }
-    found = OmegaConf.create({"seed": config.seed, "data": config.data, "model": model})
-    found.data.image_size = json.loads((folder / CONFIG_FILE).read_text())["image_size"]
-    return found

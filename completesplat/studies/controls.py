@@ -7,13 +7,13 @@ from typing import Any
 
 import torch
 
-from completesplat.atomic import atomic_path
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.metrics.images import psnr
 from completesplat.metrics.samples import diversity
 from completesplat.scene import SceneBatch
-from completesplat.studies.samples import Artist, Strip, farthest, mean_over_scenes, near, object_psnr
+from completesplat.studies.figures import Strip, written_figure
+from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
 
 # From faithful to diverse (supplement, "Diverse Sampling").
 PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
@@ -33,7 +33,7 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
 
 
 def rows(
-    artist: Artist,
+    renderer: SampleRenderer,
     settings: Sequence[tuple[float, float]],
     scenes: Sequence[SceneBatch],
     near_degrees: float,
@@ -47,7 +47,7 @@ def rows(
     """
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
-        images = artist(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         true = scene.all_views()
         seen = near(scene.reference.cameras[0], scene.targets.cameras[0], near_degrees)
         return {
@@ -78,7 +78,7 @@ def over_settings(
 
 
 def strips(
-    artist: Artist, settings: Sequence[tuple[float, float]], scene: SceneBatch, samples: int
+    renderer: SampleRenderer, settings: Sequence[tuple[float, float]], scene: SceneBatch, samples: int
 ) -> tuple[list[list[Strip | None]], list[str]]:
     """Rows by skip weight, columns by guidance weight: one sample's reference view, and several from far away.
 
@@ -95,7 +95,7 @@ def strips(
             if (skip, weight) not in settings:
                 row.append(None)
                 continue
-            images = artist(scene, skip_weight=skip, guidance_weight=weight)
+            images = renderer(scene, skip_weight=skip, guidance_weight=weight)
             shown = torch.cat([images[:1, 0], images[:samples, far]])
             row.append(Strip(shown, f"guidance {weight:g}", (skip, weight) in PAPER))
         rows.append(row)
@@ -111,28 +111,24 @@ PANELS = [
 def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Write a PNG with a panel for each measure of faithfulness; the paper's three settings are circled and named."""
     from matplotlib import colormaps
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 5.5), layout="constrained")
-    figure.suptitle(title)
-    skips = sorted({row["skip_weight"] for row in rows})
-    for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-        drawn = [row for row in rows if row[key] is not None]
-        for skip in skips:
-            own = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
-            color = colormaps["viridis"](0.9 * skip)
-            panel.plot([p[1] for p in own], [p[2] for p in own], "o-", color=color, label=f"skip weight {skip:g}")
-            for weight, x, y in own:
-                panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
-        for row in drawn:
-            if row["paper"]:
-                x, y = row["diversity"], row[key]
-                panel.plot(x, y, "o", markersize=13, fillstyle="none", color="crimson")
-                name = f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
-                panel.annotate(name, (x, y), (9, 9), textcoords="offset points", color="crimson")
-        panel.set(xlabel="diversity: difference of two samples in novel views (RMS)", ylabel=label)
-        panel.grid(alpha=0.3)
-        panel.margins(0.12)
-    figure.axes[0].legend(title="along a curve: guidance weight")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with written_figure(path, title, (13, 5.5)) as figure:
+        skips = sorted({row["skip_weight"] for row in rows})
+        for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+            drawn = [row for row in rows if row[key] is not None]
+            for skip in skips:
+                own = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
+                color = colormaps["viridis"](0.9 * skip)
+                panel.plot([p[1] for p in own], [p[2] for p in own], "o-", color=color, label=f"skip weight {skip:g}")
+                for weight, x, y in own:
+                    panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
+            for row in drawn:
+                if row["paper"]:
+                    x, y = row["diversity"], row[key]
+                    panel.plot(x, y, "o", markersize=13, fillstyle="none", color="crimson")
+                    name = f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
+                    panel.annotate(name, (x, y), (9, 9), textcoords="offset points", color="crimson")
+            panel.set(xlabel="diversity: difference of two samples in novel views (RMS)", ylabel=label)
+            panel.grid(alpha=0.3)
+            panel.margins(0.12)
+        figure.axes[0].legend(title="along a curve: guidance weight")

@@ -10,7 +10,8 @@ from completesplat.export.pictures import NOTHING, color_depth, color_normals, r
 from completesplat.geometry.normals import normals_from_depth
 from completesplat.scene import SceneBatch
 from completesplat.studies.controls import over_settings
-from completesplat.studies.samples import Artist, Strip, farthest, near
+from completesplat.studies.figures import Strip
+from completesplat.studies.samples import SampleRenderer, farthest, near
 
 
 def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
@@ -26,7 +27,7 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
 
 
 def rows(
-    artist: Artist,
+    renderer: SampleRenderer,
     settings: Sequence[tuple[float, float]],
     scenes: Sequence[SceneBatch],
     far_degrees: float,
@@ -42,7 +43,7 @@ def rows(
     """
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
-        rendering = artist.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         return deviations(surface_depth(rendering), scene, far_degrees)
 
     return over_settings(settings, scenes, measure, tick)
@@ -68,7 +69,7 @@ def _mean(values: Float[Tensor, "..."]) -> float | None:
 
 
 def strips(
-    artist: Artist, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
+    renderer: SampleRenderer, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
 ) -> list[list[Strip]]:
     """A row for each scene: the truth, some samples from far away, and where all samples disagree.
 
@@ -79,9 +80,9 @@ def strips(
     """
     rows = []
     for scene in scenes:
-        rendering = artist.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
+        rendering = renderer.render(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
         far, true = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0]), scene.all_views()
-        depth, images = surface_depth(rendering), artist.over_background(rendering)[:, far]
+        depth, images = surface_depth(rendering), renderer.over_background(rendering)[:, far]
         depths, (nearest, deepest) = color_depth(depth[:shown, far])
         normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))
         row = [Strip(true.images[0, [0, far]], "input, far view")]

@@ -121,7 +121,7 @@ def _most_seen_point(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Float
 FINE = 4  # drawn this much larger, then reduced
 MARGIN = 0.08
 FRUSTUM = 0.14
-# A far plane is drawn up to so many times the extent of what else there is; an arrow stands for the rest.
+# A far plane is drawn up to this multiple of the extent of everything else; an arrow stands for the rest.
 REACH = 2.5
 MOST_FRUSTA = 25
 CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
@@ -198,7 +198,7 @@ def drawings(sequence: PosedSequence, cross: Cross) -> Drawings:
 
 
 def time_color(share: float) -> tuple[int, int, int]:
-    """From dark blue at the beginning of a sequence (0) over red to orange at its end (1)."""
+    """Colours run from dark blue at the beginning of a sequence (0) over red to orange at its end (1)."""
     from matplotlib import colormaps
 
     red, green, blue, _ = colormaps["plasma"](0.85 * share, bytes=True)
@@ -249,7 +249,7 @@ class _Pen:
             self.draw.line([(x1 - y, y1 + x), (x1 + y, y1 - x)], color, 3 * FINE)
 
     def scale_bar(self, length: float) -> None:
-        """At the lower left corner."""
+        """Draw a bar of this length (scene units) in the lower left corner."""
         left, bottom = 4 * FINE, self.side - 4 * FINE
         right = left + length / self.span * self.side * (1 - 2 * MARGIN)
         self.draw.line([(left, bottom), (right, bottom)], FIRST, FINE)

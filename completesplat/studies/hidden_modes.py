@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
@@ -30,10 +29,11 @@ from completesplat.metrics.hidden_modes import (
     spread_and_error,
 )
 from completesplat.scene import SceneBatch
+from completesplat.studies.figures import written_figure
 
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, int], Renders]
-"""Scene (a batch of one) and seed -> renders of all targets, in [0, 1]."""
+"""Gives renders of all targets, in [0, 1], for a scene (a batch of one) and a seed."""
 
 
 def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
@@ -103,7 +103,7 @@ class Shown:
 
 @dataclass
 class Measured:
-    """What was found so far: scores by method and scene, sums of the calibration by method and region."""
+    """The measurements so far: scores by method and scene, sums of the calibration by method and region."""
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
     sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
@@ -137,7 +137,7 @@ def measure(
     shown_scenes: int,
     shown_samples: int,
 ) -> Measured:
-    """Every scene has the seed after that of the last one.
+    """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Raises:
         CompleteSplatError: no scene can be used.
@@ -163,7 +163,7 @@ def measure(
 
 
 def _measure_naive(measured: Measured, scene: HiddenModes, samples: int, seed: int) -> None:
-    """What knows all modes: their mean, as often as there are samples, and draws by their probabilities."""
+    """Add two predictors that know all modes: one repeats their mean, one draws by their probabilities."""
     mean = mean_of(scene.truths, scene.probabilities)
     _add(measured, "true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed), scene)
     _add(measured, "mean_predictor", mean.expand(samples, *mean.shape), scene)
@@ -207,10 +207,10 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> Iterator[HiddenModes 
 
 
 SIDE = 1.0
-"""Inches of a picture."""
+"""Side of a picture, in inches."""
 GAP = 0.06
 CHARTS = 10.0
-"""Inches between pictures, and of the charts' width."""
+"""Width of the charts, in inches; `GAP` is the space between pictures, in inches, too."""
 MEASURES = [
     ("coverage", "coverage\n(best: 1)"),
     ("total_variation", "total variation\n(best: 0)"),
@@ -220,7 +220,7 @@ MEASURES = [
 COLORS = {"hidden": "C3", "visible": "C0"}
 STYLES = ("o-", "s--")
 LOWEST = EDGES[0].item() / 2
-"""Where variances (and errors) below the first edge are drawn."""
+"""Variances and errors below the first edge are drawn here."""
 
 
 def draw(
@@ -231,28 +231,24 @@ def draw(
     path: Path,
 ) -> None:
     """Write a PNG: a row of pictures for each scene, and beside them the scores and the calibration by method."""
-    from matplotlib.figure import Figure
-
     count = 1 + len(shown[0].modes) + len(shown[0].samples)
     height = max(5.4, (SIDE + 0.3) * len(shown) + 0.8)
     width = (SIDE + GAP) * count + 0.3 + CHARTS
-    # Laid out by hand: matplotlib's constrained layout takes seconds for so many panels.
-    figure = Figure(figsize=(width, height))
     split, top = 1 - CHARTS / width, 1 - 0.7 / height
     bottom = max(0.1, height - 0.7 - (SIDE + 0.3) * len(shown)) / height
     places = {"left": 0.3 / width, "right": split, "top": top, "bottom": bottom}
-    grid = figure.add_gridspec(len(shown), count, **places, wspace=GAP / SIDE, hspace=0.3 / SIDE)
-    _draw_pictures(grid.subplots(squeeze=False), shown)
-    charts = {"left": split + 0.6 / width, "right": 1 - 0.2 / width, "top": top, "bottom": 1.4 / height}
-    panels: Any = figure.add_gridspec(1, 2, **charts, wspace=0.22).subplots()
-    bars, curves = panels
-    _draw_bars(bars, results)
-    _draw_calibration(curves, calibration, samples)
     found = next(iter(results.values()))
     title = f"Hidden modes: {found['scenes']} scenes, {found['samples']} samples each"
-    figure.suptitle(f"{title}. Input; then from behind: every mode, the true one in green; samples with the mode found")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    title += ". Input; then from behind: every mode, the true one in green; samples with the mode found"
+    # Laid out by hand: matplotlib's constrained layout takes seconds for so many panels.
+    with written_figure(path, title, (width, height), layout=None) as figure:
+        grid = figure.add_gridspec(len(shown), count, **places, wspace=GAP / SIDE, hspace=0.3 / SIDE)
+        _draw_pictures(grid.subplots(squeeze=False), shown)
+        charts = {"left": split + 0.6 / width, "right": 1 - 0.2 / width, "top": top, "bottom": 1.4 / height}
+        panels: Any = figure.add_gridspec(1, 2, **charts, wspace=0.22).subplots()
+        bars, curves = panels
+        _draw_bars(bars, results)
+        _draw_calibration(curves, calibration, samples)
 
 
 def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:

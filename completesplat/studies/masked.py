@@ -7,8 +7,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.errors import CompleteSplatError
 from completesplat.scene import SceneBatch
-from completesplat.studies.samples import Artist, Strip
+from completesplat.studies.figures import Strip
+from completesplat.studies.samples import SampleRenderer
+
+
+def check_box(box: Sequence[float]) -> None:
+    """Refuse what is no box in shares of a picture.
+
+    Raises:
+        CompleteSplatError: it has no pixels, or it reaches out of the picture.
+    """
+    if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
+        raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
 
 
 def box_visibility(box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
@@ -21,7 +33,11 @@ def box_visibility(box: Sequence[float], size: int) -> Float[Tensor, "1 size siz
 
 
 def strips(
-    artist: Artist, scenes: Sequence[SceneBatch], boxes: Sequence[Sequence[float]], views: int, guidance_weight: float
+    renderer: SampleRenderer,
+    scenes: Sequence[SceneBatch],
+    boxes: Sequence[Sequence[float]],
+    views: int,
+    guidance_weight: float,
 ) -> tuple[list[list[Strip | None]], list[str]]:
     """Rows of three columns for each scene and their names: the truth, then its completions, without skips.
 
@@ -33,7 +49,7 @@ def strips(
     for index, scene in enumerate(scenes):
         size = scene.reference.images.shape[-1]
         visible = box_visibility(boxes[index % len(boxes)], size).to(scene.reference.images)
-        images = artist(scene, visible=visible[None], guidance_weight=guidance_weight)
+        images = renderer(scene, visible=visible[None], guidance_weight=guidance_weight)
         count = images.shape[1] - 1
         shown = [1 + i * count // views for i in range(min(views, count))]
         true = scene.all_views().images[0]

@@ -9,19 +9,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
 from completesplat.metrics.images import psnr, ssim
 from completesplat.metrics.samples import diversity
 from completesplat.scene import SceneBatch
-from completesplat.studies.samples import Artist
+from completesplat.studies.figures import written_figure
+from completesplat.studies.samples import SampleRenderer
 
 REFERENCE = ("ddim", 50)
 CLOSE = 0.1
-"""dB."""
+"""Difference in PSNR, in dB, that does not count."""
 
 
 def rows(
-    artist: Artist,
+    renderer: SampleRenderer,
     samplers: Mapping[str, Mapping[str, Any]],
     steps: Mapping[str, Sequence[int]],
     scenes: Sequence[SceneBatch],
@@ -39,20 +39,22 @@ def rows(
     found = []
     for name, count in [REFERENCE, *others]:
         tick(f"{name}, {count} steps")
-        artist.model.replace_sampler(samplers[name])
-        found.append({"sampler": name, "steps": count} | _row(artist, scenes, {**settings, "steps": count}, settled))
+        renderer.model.replace_sampler(samplers[name])
+        found.append({"sampler": name, "steps": count} | _row(renderer, scenes, {**settings, "steps": count}, settled))
     return found
 
 
-def _row(artist: Artist, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]) -> dict:
-    """Appends the renders to `settled` if these are the first."""
+def _row(
+    renderer: SampleRenderer, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]
+) -> dict:
+    """Measures of one sampler; its renders are appended to `settled` if they are the first."""
     measured: list[dict[str, float]] = []
     times = []
     first = not settled
-    watch = Watch(artist.model)
+    watch = Watch(renderer.model)
     for index, scene in enumerate(scenes):
         with watch:
-            images = artist(scene, **settings)[:, 1:]
+            images = renderer(scene, **settings)[:, 1:]
         times.append(watch.seconds)
         if first:
             settled.append(images)
@@ -67,11 +69,11 @@ def _row(artist: Artist, scenes: Sequence[SceneBatch], settings: dict[str, Any],
             }
         )
     means = {key: sum(row[key] for row in measured) / len(measured) for key in measured[0]}
-    return means | {"calls": watch.calls, "ms": 1000 * min(times) / artist.samples}
+    return means | {"calls": watch.calls, "ms": 1000 * min(times) / renderer.samples}
 
 
 class Watch:
-    """Within its context: calls of the denoiser, and the time from the conditioning to the Gaussians."""
+    """Within its context, counts calls of the denoiser and times the way from the conditioning to the Gaussians."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
@@ -108,7 +110,7 @@ def _now() -> float:
 
 
 def fewest(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Of the rows whose PSNR is within 0.1 dB of the reference's (the first row's) the one with the fewest calls."""
+    """The row with the fewest calls among those whose PSNR is within 0.1 dB of the first row's, the reference's."""
     close = [row for row in rows if abs(row["psnr"] - rows[0]["psnr"]) <= CLOSE]
     return min(close, key=lambda row: (row["calls"], -row["agreement"]))
 
@@ -125,28 +127,24 @@ MARKERS = "osD^v"
 
 def plot_samplers(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
     """Write a PNG with a panel for each measure and a line for each sampler; the grey band is 0.1 dB wide each way."""
-    from matplotlib.figure import Figure
     from matplotlib.ticker import ScalarFormatter
 
-    figure = Figure(figsize=(17, 4), layout="constrained")
-    figure.suptitle(title)
-    names = list(dict.fromkeys(row["sampler"] for row in rows))
-    for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-        # The reference agrees with itself, at the limit of PSNR.
-        shown = rows[1:] if key == "agreement" else rows
-        for index, name in enumerate(names):
-            own = sorted((row["calls"], row[key]) for row in shown if row["sampler"] == name)
-            if own:
-                panel.plot(*zip(*own, strict=True), color=f"C{index}", marker=MARKERS[index % 5], label=name)
-        if key == "psnr":
-            panel.axhspan(rows[0][key] - CLOSE, rows[0][key] + CLOSE, color="0.85", zorder=0)
-        panel.set(xscale="log", xlabel="denoiser calls", title=label)
-        panel.set_xticks(sorted({row["calls"] for row in rows} & {1, 2, 5, 10, 20, 50}))
-        panel.xaxis.set_major_formatter(ScalarFormatter())
-        panel.xaxis.set_minor_formatter("")
-        panel.grid(alpha=0.3)
-        if key in ("diversity", "ms"):
-            panel.set_ylim(bottom=0)
-    figure.axes[0].legend()
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with written_figure(path, title, (17, 4)) as figure:
+        names = list(dict.fromkeys(row["sampler"] for row in rows))
+        for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+            # The reference agrees with itself, at the limit of PSNR.
+            shown = rows[1:] if key == "agreement" else rows
+            for index, name in enumerate(names):
+                own = sorted((row["calls"], row[key]) for row in shown if row["sampler"] == name)
+                if own:
+                    panel.plot(*zip(*own, strict=True), color=f"C{index}", marker=MARKERS[index % 5], label=name)
+            if key == "psnr":
+                panel.axhspan(rows[0][key] - CLOSE, rows[0][key] + CLOSE, color="0.85", zorder=0)
+            panel.set(xscale="log", xlabel="denoiser calls", title=label)
+            panel.set_xticks(sorted({row["calls"] for row in rows} & {1, 2, 5, 10, 20, 50}))
+            panel.xaxis.set_major_formatter(ScalarFormatter())
+            panel.xaxis.set_minor_formatter("")
+            panel.grid(alpha=0.3)
+            if key in ("diversity", "ms"):
+                panel.set_ylim(bottom=0)
+        figure.axes[0].legend()

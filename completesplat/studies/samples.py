@@ -1,18 +1,15 @@
-"""Samples of a trained model, scene by scene: drawn, measured, side by side."""
+"""Samples of a trained model, scene by scene: drawn, rendered and measured."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
 from completesplat.errors import DataError
-from completesplat.export.pictures import to_bytes
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
@@ -21,7 +18,7 @@ from completesplat.scene import SceneBatch
 
 
 @dataclass(frozen=True)
-class Artist:
+class SampleRenderer:
     """Draws samples and renders them, the reference view first and then all targets.
 
     Args:
@@ -95,17 +92,17 @@ def object_psnr(
 
 
 def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
-    """Which targets [view] look in the reference's direction, up to an angle between the optical axes."""
+    """A mask of the targets [view] whose optical axes are at most this far from the reference's."""
     return _cosines(reference, targets) >= math.cos(math.radians(degrees))
 
 
 def farthest(reference: Cameras, targets: Cameras) -> int:
-    """Which of the targets [view] looks in the direction most different from the reference's."""
+    """The index of the target [view] that looks in the direction most different from the reference's."""
     return int(_cosines(reference, targets).argmin())
 
 
 def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:
-    """Of the angles between the optical axes."""
+    """Cosines of the angles between the reference's optical axis and the targets'."""
     return targets.world_to_camera[:, 2, :3] @ reference.world_to_camera[2, :3]
 
 
@@ -116,52 +113,3 @@ def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str
         values = [value for row in measured if (value := row[key]) is not None]
         means[key] = sum(values) / len(values) if values else None
     return means
-
-
-READABLE_SIDE = 0.9
-"""Inches of a picture."""
-GAP = 1
-"""Pixels between the pictures of a strip."""
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Pictures side by side under a label."""
-
-    images: Float[Tensor, "picture 3 height width"]
-    label: str = ""
-    marked: bool = False
-
-
-def draw_strips(rows: Sequence[Sequence[Strip | None]], names: Sequence[str], path: Path, title: str) -> None:
-    """Write a PNG; None leaves a place empty.
-
-    Args:
-        rows: of equal length.
-        names: of the rows.
-    """
-    from matplotlib.figure import Figure
-
-    widths = [max(len(strip.images) for strip in column if strip) for column in zip(*rows, strict=True)]
-    size = (READABLE_SIDE * sum(widths) + 1.2, (READABLE_SIDE + 0.3) * len(rows) + 0.5)
-    figure = Figure(figsize=size, layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(len(rows), len(widths), squeeze=False, width_ratios=widths)
-    for row, name, places in zip(rows, names, panels, strict=True):
-        places[0].set_ylabel(name, fontsize=8)
-        for strip, panel, width in zip(row, places, widths, strict=True):
-            panel.set(xticks=[], yticks=[])
-            panel.spines[:].set_visible(False)
-            if strip is not None:
-                panel.imshow(to_bytes(_side_by_side(strip.images, width)), interpolation="nearest")
-                weight = "bold" if strip.marked else "normal"
-                panel.set_title(strip.label, fontsize=8, fontweight=weight, color="crimson" if strip.marked else "k")
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=130)
-
-
-def _side_by_side(images: Float[Tensor, "picture 3 height width"], count: int) -> Float[Tensor, "3 height _"]:
-    """With white in the place of missing pictures, so that all have one scale."""
-    white = torch.ones_like(images[0])
-    pictures = [*images, *[white] * (count - len(images))]
-    return torch.cat([part for image in pictures for part in (image, white[..., :GAP])], dim=-1)[..., :-GAP]

@@ -75,6 +75,7 @@ def test_fits_help_shows_the_groups(command):
         (["fit", "nonsense=1"], "nonsense"),
         (["fit", "experiment=nonsense"], "nonsense"),
         (["predict"], "image is needed"),
+        (["report", "samplers"], "ckpt is needed: give ckpt=VALUE"),
         (["predict", "image=x.jpg", "weights=no_such_name"], "no_such_name: no such folder"),
         (["test", "ckpt=nowhere/checkpoints/last.ckpt"], "no such checkpoint"),
         (["data", "toy", "kind=nonsense"], "no toy data of kind 'nonsense'"),

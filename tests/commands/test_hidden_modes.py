@@ -4,7 +4,7 @@ import imageio.v3 as imageio
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.commands.evaluate_hidden_modes import run
+from completesplat.commands.jobs import start
 from completesplat.errors import CompleteSplatError
 
 FEW = ["samples=3", "batch=2", "views=1", "spread_views=2", "shown_samples=2"]
@@ -66,4 +66,4 @@ def test_every_method_is_scored(measured, pipeline, tmp_path, stage, methods):
 def test_too_small_numbers_are_refused(setting, reason, tmp_path):
     config = compose_config("test", "evaluation=hidden_modes", "ckpt=none", f"evaluation.{setting}")
     with pytest.raises(CompleteSplatError, match=reason):
-        run(config, tmp_path)
+        start("test", config, tmp_path)

@@ -13,9 +13,8 @@ from support import compose_config
 from torch import Tensor
 
 from completesplat.benchmarks import training_step
-from completesplat.benchmarks.rasterizers import Backend
 from completesplat.benchmarks.training_step import StopWatch, share, synthetic_batch
-from completesplat.benchmarks.workloads import DISTANCE, splatter_scene
+from completesplat.benchmarks.workloads import DISTANCE, Backend, splatter_scene
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, project
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants

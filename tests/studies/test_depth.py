@@ -13,7 +13,7 @@ from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch, Views
 from completesplat.studies.depth import color_deviation, deviation, deviations, rows, strips
-from completesplat.studies.samples import Artist
+from completesplat.studies.samples import SampleRenderer
 from completesplat.tensors import stack
 
 SIZE, AWAY = 16, 3.0
@@ -49,8 +49,8 @@ class Splats(CompleteSplat):
         return replace(splats, means=depth * torch.tensor([0.0, 0, 1]).expand(samples, 2, 3), scales=thin)
 
 
-def artist(shift: float = 0.5, samples: int = 3) -> Artist:
-    return Artist(Splats(shift), ReferenceRasterizer(), 0.5, samples, 0)
+def renderer(shift: float = 0.5, samples: int = 3) -> SampleRenderer:
+    return SampleRenderer(Splats(shift), ReferenceRasterizer(), 0.5, samples, 0)
 
 
 def test_deviation_is_numpys_over_the_samples_that_see_something():
@@ -69,7 +69,7 @@ def test_deviation_is_numpys_over_the_samples_that_see_something():
 
 def test_a_shift_in_depth_is_its_deviation_in_the_reference_view():
     """Depths 3, 3.5 and 4: the deviation is 0.5. With skips of weight 1 these samples are the same."""
-    free, faithful = rows(artist(), SETTINGS, [scene()], 90, lambda _: None)
+    free, faithful = rows(renderer(), SETTINGS, [scene()], 90, lambda _: None)
     for name in ("reference", "reference_object"):
         assert free[f"{name}_deviation"] == pytest.approx(0.5, abs=1e-3)
         assert faithful[f"{name}_deviation"] == pytest.approx(0, abs=1e-5)
@@ -104,13 +104,13 @@ def test_what_is_not_seen_is_not_measured():
 
 
 def test_without_far_views_there_are_no_figures_for_them():
-    found = rows(artist(), SETTINGS, [scene()], 180, lambda _: None)[0]
+    found = rows(renderer(), SETTINGS, [scene()], 180, lambda _: None)[0]
     assert {found[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
 
 
 def test_a_row_shows_the_truth_some_samples_from_behind_and_where_all_disagree():
     own = scene()
-    (row,) = strips(artist(samples=3), [own], 0.0, 0.5, shown=2)
+    (row,) = strips(renderer(samples=3), [own], 0.0, 0.5, shown=2)
     truth, first, second, where = row
     back = own.all_views().images[0, 2]
     assert torch.equal(truth.images, torch.stack([own.reference.images[0], back]))

@@ -9,15 +9,15 @@ import pytest
 import torch
 from rasterizer_scenes import draw_scene
 
-from completesplat.benchmarks.rasterizers import (
+from completesplat.benchmarks.agreement import (
     BAND,
     PIXELS_PER_VIEW,
     STOP_BAND,
     TOLERANCE,
-    Backend,
+    agreement_rows,
     is_decided,
-    rows,
 )
+from completesplat.benchmarks.workloads import Backend
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
@@ -29,7 +29,7 @@ FOCAL, DEPTH, SCALE = 50.0, 2.0, 0.1
 
 
 def compare(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> dict:
-    (row,) = rows([Backend("tiled", rasterizer)], gaussians, cameras, CONSTANTS, lambda _: None)
+    (row,) = agreement_rows([Backend("tiled", rasterizer)], gaussians, cameras, CONSTANTS, lambda _: None)
     json.dumps(row, allow_nan=False)
     return row
 
@@ -88,7 +88,7 @@ def test_each_backend_has_its_row_but_for_the_reference(random_scene) -> None:
     backends = [Backend(name, ReferenceRasterizer()) for name in ("b", "reference", "a")]
     said: list[str] = []
     gaussians, cameras = random_scene
-    found = rows(backends, gaussians, cameras, CONSTANTS, said.append)
+    found = agreement_rows(backends, gaussians, cameras, CONSTANTS, said.append)
     assert [row["backend"] for row in found] == ["b", "a"]
     assert said[-2:] == ["b", "a"]
 

@@ -1,0 +1,366 @@
+"""The backends side by side: which of them work, speed, growth, and how they are shown."""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from rich.console import Console
+from rich.table import Table
+from support import compose_config
+
+from completesplat.benchmarks import rasterizers, workloads
+from completesplat.benchmarks.rasterizers import (
+    AGREEMENT,
+    CLASSES,
+    GROWTH,
+    LONGEST_SECONDS,
+    SPEED,
+    against_tiled,
+    growth_rows,
+    show,
+    side_by_side,
+    speed_rows,
+    working_backends,
+)
+from completesplat.benchmarks.workloads import Backend, splatter_scene
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
+from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.results.tables import table
+
+TILED = "completesplat.rasterizers.tiled.TiledRasterizer"
+
+
+class Broken:
+    def __init__(self, constants: RenderingConstants) -> None: ...
+
+    def __call__(self, gaussians, cameras):
+        raise RuntimeError("no kernel\n  for this [processor]")
+
+
+class NoBackward(ReferenceRasterizer):
+    def __call__(self, gaussians, cameras):
+        return super().__call__(gaussians.detach(), cameras)
+
+
+def test_an_unknown_name_is_refused_before_anything_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TILED, lambda constants: pytest.fail("made"))
+    with pytest.raises(CompleteSplatError, match=r"'nonsense'.* reference, .* tiled, cuda") as refusal:
+        working_backends(["tiled", "nonsense"], RenderingConstants())
+    assert "\n" not in str(refusal.value)
+
+
+def test_one_that_fails_is_absent_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TILED, Broken)
+    found, absent = working_backends(["tiled", "reference"], RenderingConstants())
+    assert [backend.name for backend in found] == ["reference"]
+    assert absent == {"tiled": "no kernel for this [processor]"}
+
+
+def test_one_without_gradients_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TILED, NoBackward)
+    found, absent = working_backends(["tiled"], RenderingConstants())
+    assert found == []
+    assert "grad" in absent["tiled"]
+
+
+def test_an_error_without_a_message_is_told_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(constants: RenderingConstants) -> Rasterizer:
+        raise NotImplementedError
+
+    monkeypatch.setattr(TILED, refuse)
+    assert working_backends(["tiled"], RenderingConstants()) == ([], {"tiled": "NotImplementedError"})
+
+
+def test_a_module_that_cannot_be_imported_is_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(CLASSES, "cuda", "completesplat.nowhere.Rasterizer")
+    _, absent = working_backends(["cuda"], RenderingConstants())
+    assert "completesplat.nowhere" in absent["cuda"]
+
+
+@pytest.mark.parametrize("names", [["tiled", "reference"], ["reference", "tiled"]])
+def test_the_order_is_kept_and_the_constants_arrive(names: list[str]) -> None:
+    constants = RenderingConstants(max_alpha=0.9)
+    found, absent = working_backends(names, constants)
+    assert absent == {}
+    assert [backend.name for backend in found] == names
+    assert all(backend.rasterizer.constants == constants for backend in found)  # type: ignore[attr-defined]
+
+
+def test_only_the_reference_is_spared_large_workloads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workloads, "MOST_REFERENCE_PAIRS", 1000)
+    reference, tiled = (Backend(name, ReferenceRasterizer()) for name in ("reference", "tiled"))
+    assert reference.takes(10, 100)
+    assert not reference.takes(10, 101)
+    assert tiled.takes(10**6, 10**6)
+
+
+def test_every_backend_of_the_configuration_is_known() -> None:
+    config = compose_config("bench")
+    assert set(config.backends) == set(CLASSES)
+    assert set(config.growth.backends) <= set(CLASSES)
+    assert set(config.training_step.backends) <= set(CLASSES)
+
+
+KEYS = {"backend", "size", "gaussians", "views", "opacity", "forward_ms", "forward_backward_ms", "peak_mb"}
+
+
+class Clock:
+    """Stands still, but while a rasterizer draws."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        self.turns: list[str] = []
+        for module in (rasterizers, workloads):
+            monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: self.now))
+
+    def backend(self, name: str, *seconds: float) -> Backend:
+        """Takes these times in turn to draw, then the last of them for ever."""
+        left = list(seconds)
+
+        def draw(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+            self.turns.append(name)
+            self.now += left.pop(0) if len(left) > 1 else left[0]
+            value = sum(tensor.mean() for tensor in vars(gaussians).values())
+            shape = cameras.intrinsics.shape[:2]
+            return Rendering(*(value.expand(*shape, channels, *cameras.image_size) for channels in (3, 1, 1)))
+
+        return Backend(name, draw)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def test_there_is_one_row_for_each_backend_and_workload(clock: Clock) -> None:
+    said: list[str] = []
+    found = speed_rows([clock.backend("tiled", 0.25), clock.backend("other", 0.5)], [8, 12], [1, 3], 2, said.append)
+    workloads = [(size, 2 * size**2, views, o) for size in (8, 12) for views in (1, 3) for o in ("trained", "initial")]
+    seen = [tuple(row[key] for key in ("size", "gaussians", "views", "opacity", "backend")) for row in found]
+    assert seen == [(*workload, name) for workload in workloads for name in ("tiled", "other")]
+    assert all(set(row) == KEYS for row in found)
+    for row in found:
+        assert row["forward_ms"] == row["forward_backward_ms"] == {"tiled": 250, "other": 500}[row["backend"]]
+        assert row["peak_mb"] is None or row["peak_mb"] >= 0
+    assert len(said) == len(workloads)
+
+
+def test_the_backends_take_turns(clock: Clock) -> None:
+    side_by_side([clock.backend(name, 0.1) for name in "abc"], *splatter_scene(4, 1, "trained"), repeats=3)
+    assert clock.turns == list("abc") * 4  # one for the memory, three for the time
+
+
+def test_the_time_is_the_median_without_the_first_run(clock: Clock) -> None:
+    figures = side_by_side([clock.backend("a", 1.0, 0.5, 0.125, 0.25)], *splatter_scene(4, 1, "trained"), repeats=3)
+    assert figures["a"]["forward_ms"] == 250
+
+
+def test_one_that_took_too_long_at_first_is_not_run_again(clock: Clock) -> None:
+    slow, quick = clock.backend("slow", LONGEST_SECONDS + 1, 1.0), clock.backend("quick", 0.25)
+    figures = side_by_side([slow, quick], *splatter_scene(4, 1, "trained"), repeats=3)
+    assert clock.turns == ["slow", *["quick"] * 4]
+    assert figures["slow"]["forward_ms"] == (LONGEST_SECONDS + 1) * 1000
+    assert figures["quick"]["forward_ms"] == 250
+
+
+def test_one_that_has_taken_too_long_by_now_is_not_run_again(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rasterizers, "LONGEST_SECONDS", 4.0)
+    figures = side_by_side([clock.backend("a", 1.5)], *splatter_scene(4, 1, "trained"), repeats=9)
+    assert len(clock.turns) == 3
+    assert figures["a"]["forward_ms"] == 1500
+
+
+def test_the_reference_is_spared_large_workloads(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workloads, "MOST_REFERENCE_PAIRS", 2 * 8**2 * 8**2)  # size 8 in one view, just
+    chosen = [clock.backend("reference", 0.1), clock.backend("tiled", 0.1)]
+    found = speed_rows(chosen, [8, 9], [1, 2], 1, lambda _: None)
+    of_reference = {(row["size"], row["views"]) for row in found if row["backend"] == "reference"}
+    assert of_reference == {(8, 1)}
+    assert {(row["size"], row["views"]) for row in found if row["backend"] == "tiled"} == {
+        (size, views) for size in (8, 9) for views in (1, 2)
+    }
+
+
+BLUE, ORANGE = (31, 119, 180), (255, 127, 14)  # matplotlib's first two colours
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = {"SOURCE_SIZES": (3, 4, 6), "IMAGE_SIZE": 8, "SOURCE_SIZE": 5, "VIEWS": (1, 2, 3), "IMAGE_SIZES": (4, 7)}
+    for name, value in values.items():
+        monkeypatch.setattr(rasterizers, name, value)
+
+
+def named(*names: str) -> list[Backend]:
+    return [Backend(name, ReferenceRasterizer()) for name in names]
+
+
+def points(rows: list[dict[str, Any]], backend: str, axis: str) -> list[int]:
+    return [row[axis] for row in rows if row["backend"] == backend and row["axis"] == axis]
+
+
+def test_every_axis_is_measured_with_the_others_held(small) -> None:
+    seen: list[tuple[int, int, int]] = []
+
+    def draw(gaussians, cameras) -> Rendering:
+        seen.append((gaussians.count, cameras.intrinsics.shape[1], cameras.image_size[0]))
+        return ReferenceRasterizer()(gaussians, cameras)
+
+    said: list[str] = []
+    rows = growth_rows([Backend("tiled", draw)], said.append, most_gaussians=1000)
+    found = [(row["axis"], row["gaussians"], row["views"], row["size"]) for row in rows]
+    assert found == [
+        *(("gaussians", 2 * size**2, 1, 8) for size in (3, 4, 6)),
+        *(("views", 50, views, 5) for views in (1, 2, 3)),
+        *(("size", 50, 1, size) for size in (4, 7)),
+    ]
+    assert list(dict.fromkeys(seen)) == [workload for _, *rest in found if (workload := tuple(rest))]
+    assert all(0 < row["forward_ms"] <= row["forward_backward_ms"] for row in rows)
+    assert said == [
+        f"growth with {axis}: {dict(zip(rasterizers.AXES, rest, strict=True))[axis]}" for axis, *rest in found
+    ]
+
+
+def test_no_more_gaussians_than_asked_for(small) -> None:
+    rows = growth_rows(named("tiled"), lambda _: None, most_gaussians=32)
+    assert points(rows, "tiled", "gaussians") == [18, 32]
+    assert points(rows, "tiled", "views") == [1, 2, 3]
+
+
+def test_one_that_took_too_long_is_spared_the_rest_of_that_axis_only(small, monkeypatch: pytest.MonkeyPatch) -> None:
+    def side_by_side(backends: Sequence[Backend], gaussians, cameras, repeats: int) -> dict[str, dict[str, float]]:
+        weary = gaussians.count == 32 or cameras.intrinsics.shape[1] == 2
+        times = {"slow": rasterizers.PATIENCE_MS + weary, "quick": rasterizers.PATIENCE_MS}
+        return {backend.name: {"forward_backward_ms": times[backend.name]} for backend in backends}
+
+    monkeypatch.setattr(rasterizers, "side_by_side", side_by_side)
+    rows = growth_rows(named("slow", "quick"), lambda _: None, most_gaussians=1000)
+    assert points(rows, "slow", "gaussians") == [18, 32]  # that one still counts
+    assert points(rows, "slow", "views") == [1, 2]
+    assert points(rows, "slow", "size") == [4, 7]
+    assert points(rows, "quick", "gaussians") == [18, 32, 72]
+    assert points(rows, "quick", "views") == [1, 2, 3]
+
+
+def along(axis: str, backend: str, milliseconds: float, *values: int) -> list[dict[str, Any]]:
+    held = {"gaussians": 50, "views": 1, "size": 8}
+    return [
+        {"backend": backend, "axis": axis} | held | {axis: value, "forward_backward_ms": milliseconds * value}
+        for value in values
+    ]
+
+
+def drawn(rows: list[dict[str, Any]], path: Path) -> np.ndarray:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rasterizers.plot(rows, path)
+    return imageio.imread(path)[..., :3]
+
+
+def marks(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    """Rows of pixels, as fractions of the height, in which a colour occurs."""
+    return np.flatnonzero((image == color).all(-1).any(1)) / len(image)
+
+
+def test_the_plot_of_one_backend_shows_a_curve_in_each_panel(tmp_path: Path) -> None:
+    image = drawn([row for axis in rasterizers.AXES for row in along(axis, "tiled", 1.0, 1, 4)], tmp_path / "plot.png")
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+    for panel in np.array_split(image, 3, axis=1):
+        assert np.ptp(marks(panel, BLUE)) > 0.3  # it rises
+
+
+def test_a_backend_has_one_color_in_all_panels(tmp_path: Path) -> None:
+    """Even where one that comes before it was measured along one axis only; below, in each, is the faster one."""
+    slow_then_fast = along("size", "reference", 1e5, 4) + along("size", "tiled", 1.0, 4, 7)
+    rows = slow_then_fast + [row for axis in ("gaussians", "views") for row in along(axis, "tiled", 1.0, 1, 4)]
+    image = drawn(rows, tmp_path / "plot.png")
+    first, second, last = np.array_split(image, 3, axis=1)
+    for panel in (first, second):
+        assert marks(panel, ORANGE).size
+        assert not marks(panel, BLUE).size
+    assert (marks(last, ORANGE) > 0.5).any()
+    assert not (marks(last, BLUE) > 0.5).any()
+    assert (marks(last, BLUE) < 0.5).any()
+
+
+def test_an_axis_without_points_is_left_empty(tmp_path: Path) -> None:
+    rows = [row for axis in ("views", "size") for row in along(axis, "tiled", 1.0, 1, 4)]
+    first, *others = np.array_split(drawn(rows, tmp_path / "plot.png"), 3, axis=1)
+    assert not marks(first, BLUE).size
+    assert all(marks(panel, BLUE).size for panel in others)
+
+
+MACHINE = {"processor": "Some CPU", "threads": 2, "torch": "2.10", "date": "2026-01-31"}
+REASON = 'it needs gsplat: pip install "completesplat[cuda]"'
+
+
+def row(backend: str, milliseconds: float, **workload: Any) -> dict[str, Any]:
+    held = {"size": 64, "gaussians": 8192, "views": 1, "opacity": "trained", "peak_mb": 12.3}
+    return {"backend": backend, "forward_ms": 1.0, "forward_backward_ms": milliseconds} | held | workload
+
+
+def cells(shown: Table, heading: str) -> list[str]:
+    (column,) = (column for column in shown.columns if " ".join(str(column.header).split()) == heading)
+    return [str(cell) for cell in column.cells]
+
+
+@pytest.mark.parametrize(
+    "other", [{"size": 128}, {"gaussians": 99}, {"views": 4}, {"opacity": "initial"}, {"axis": "size"}]
+)
+def test_backends_are_set_against_tiled_on_the_same_workload(other: dict[str, Any]) -> None:
+    rows = [row("reference", 50.0), row("tiled", 10.0), row("tiled", 20.0, **other), row("torch_tiled", 50.0, **other)]
+    assert [found["times_tiled"] for found in against_tiled(rows)] == [5, 1, 1, 2.5]
+    alone = [row("reference", 50.0), row("tiled", 20.0, **other)]
+    assert [found["times_tiled"] for found in against_tiled(alone)] == [None, 1]
+
+
+def test_missing_figures_stay_empty() -> None:
+    rows = [row("tiled", 1234.56, peak_mb=None), row("reference", 0.04)]
+    shown = table("Speed", SPEED, rows)
+    assert shown.row_count == 2
+    assert cells(shown, "peak MB") == ["", "12"]
+    assert cells(shown, "times tiled") == ["", ""]
+    assert cells(shown, "with backward ms") == ["1,234.6", "0.0"]
+    assert cells(shown, "Gaussians") == ["8,192", "8,192"]
+
+
+def test_what_does_not_agree_is_told() -> None:
+    figures = {"backend": "tiled", "color": 1.5e-6, "depth": None, "alpha": 0.0, "pixels": 380, "undecided": 4}
+    shown = table("Agreement", AGREEMENT, [figures | {"agrees": False}])
+    assert [cells(shown, heading) for heading in ("agrees", "colour", "depth")] == [["False"], ["1.5e-06"], [""]]
+
+
+def test_all_that_was_measured_is_shown_with_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [row("tiled", 10.0), row("torch_tiled", 70.0)]
+    step = {"backend": "tiled", "size": 64, "batch": 8, "views": 4, "step_ms": 500.0, "rasterizer_ms": 30.0}
+    results = {
+        "machine": MACHINE,
+        "not_measured": {"cuda": REASON},
+        "rows": rows,
+        "growth": [row("tiled", 10.0, axis="views")],
+        "training_step": [step | {"share": 0.06}],
+    }
+    show(results)
+    said = capsys.readouterr().out
+    assert "Some CPU, 2 threads, torch 2.10, 2026-01-31" in said
+    assert "6.0%" in said
+    assert all(title in said for title in ("Speed", "Growth", "Share of a training step"))
+    assert "Largest differences" not in said
+    (line,) = (line for line in said.splitlines() if "torch_tiled" in line)
+    assert "7.0" in line
+    assert f"cuda: not measured, because {REASON}" in said
+
+
+def test_the_tables_of_speed_fit_a_page() -> None:
+    largest = row("gsplat_torch", 123_456.7, axis="gaussians", gaussians=1_048_352, forward_ms=123_456.7)
+    for columns in (SPEED, GROWTH):
+        shown = table("Title", columns, [largest | {"peak_mb": 123_456.7, "times_tiled": 1234.5}])
+        assert Console(width=1000).measure(shown).maximum <= 120
