@@ -1,12 +1,12 @@
 """What a packed store says of itself: `manifest.json`, written last."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from completesplat.atomic import atomic_path
 from completesplat.data.validation import (
     BadAnnotation,
     UnreadableFile,
@@ -127,12 +127,8 @@ def check_format(content: object, readable: int, remedy: str) -> None:
 
 def write_json(path: Path, content: object) -> None:
     """A JSON file that is there as a whole or not at all."""
-    unfinished = path.with_name(f"{path.name}.unfinished")
-    with unfinished.open("w") as file:
-        file.write(json.dumps(content, indent=1, allow_nan=False) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.rename(path)
+    with atomic_path(path) as unfinished:
+        unfinished.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def settings_must_match(manifest: PackedManifest, settings: Mapping[str, Scalar]) -> None:
