@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 
 from completesplat.data.importing import import_capture
+from completesplat.data.importing.capture import make_cloud
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -95,6 +96,12 @@ def test_a_bad_transforms_file_is_refused(captures, tmp_path, change, kind, mess
     with pytest.raises(kind, match=message):
         import_capture(tmp_path / "out", "desk", path, progress=False)
     assert not list(tmp_path.glob("out/*"))
+
+
+def test_points_that_are_not_finite_are_refused(tmp_path):
+    for value in (float("nan"), float("inf")):
+        with pytest.raises(BadAnnotation, match=r"x\.ply: points that are not finite"):
+            make_cloud([[0, 0, 0], [0, value, 1]], [[0, 0, 0]] * 2, tmp_path / "x.ply")
 
 
 def cut(path):
