@@ -213,8 +213,8 @@ def test_evaluation_of_nothing_but_a_bad_sequence_is_no_evaluation(category):
 @pytest.mark.parametrize("workers", [0, 2])
 def test_too_large_a_share_of_bad_pictures_ends_training(category, workers):
     (category / "a/images/frame000002.png").write_text("picture")
-    data = module(category.parent, "skip", most_bad=0.1, workers=workers)
-    with pytest.raises(DataError, match=r"data\.most_bad=0\.1"):
+    data = module(category.parent, "skip", max_bad_fraction=0.1, workers=workers)
+    with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
         list(data.train_dataloader())
 
 
