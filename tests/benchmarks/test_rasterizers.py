@@ -10,7 +10,6 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 from rich.console import Console
-from rich.table import Table
 from support import compose_config
 
 from completesplat.benchmarks import rasterizers, workloads
@@ -33,7 +32,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
-from completesplat.results.tables import table
+from completesplat.results.tables import Table, table
 
 TILED = "completesplat.rasterizers.tiled.TiledRasterizer"
 
@@ -308,8 +307,8 @@ def row(backend: str, milliseconds: float, **workload: Any) -> dict[str, Any]:
 
 
 def cells(shown: Table, heading: str) -> list[str]:
-    (column,) = (column for column in shown.columns if " ".join(str(column.header).split()) == heading)
-    return [str(cell) for cell in column.cells]
+    (index,) = (index for index, found in enumerate(shown.headings) if " ".join(found.text.split()) == heading)
+    return [row.cells[index].text for row in shown.rows]
 
 
 @pytest.mark.parametrize(
@@ -325,7 +324,7 @@ def test_backends_are_set_against_tiled_on_the_same_workload(other: dict[str, An
 def test_missing_figures_stay_empty() -> None:
     rows = [row("tiled", 1234.56, peak_mb=None), row("reference", 0.04)]
     shown = table("Speed", SPEED, rows)
-    assert shown.row_count == 2
+    assert len(shown.rows) == 2
     assert cells(shown, "peak MB") == ["", "12"]
     assert cells(shown, "times tiled") == ["", ""]
     assert cells(shown, "with backward ms") == ["1,234.6", "0.0"]

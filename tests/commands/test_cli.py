@@ -8,7 +8,8 @@ from support import compose_config
 
 from completesplat import __version__
 from completesplat.cli import VERBS
-from completesplat.commands.predict import check_settings
+from completesplat.commands.generator import check_settings
+from completesplat.commands.predict import RANGES
 from completesplat.errors import CompleteSplatError
 
 
@@ -100,7 +101,7 @@ def test_refusals_are_one_line_and_status_two(command, arguments, said):
 )
 def test_settings_of_predict_outside_of_their_range_are_refused(setting, said):
     with pytest.raises(CompleteSplatError, match=said):
-        check_settings(compose_config("predict", setting))
+        check_settings(compose_config("predict", setting), RANGES)
 
 
 def test_two_launches_in_one_second_do_not_share_a_directory():

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
 from completesplat.commands.evaluate import scored_data
-from completesplat.commands.trained import configuration
+from completesplat.commands.trained import Trained
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
@@ -195,14 +195,14 @@ def test_weights_score_as_the_checkpoint_they_were_saved_with(command, pipeline,
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("given", "said"),
     [
-        ([], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
-        (["ckpt=a", "weights=b"], "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
-        (["weights=b"], "weights know no data"),
-        (["ckpt=a", "data=toy_objects"], "a checkpoint's data are its run's"),
+        ({"ckpt": None}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
+        ({"ckpt": "a", "weights": "b"}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
+        ({"ckpt": None, "weights": "b"}, "weights know no data"),
+        ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
     ],
 )
-def test_what_is_to_be_scored_is_said_once(arguments, said):
+def test_what_is_to_be_scored_is_said_once(given, said):
     with pytest.raises(CompleteSplatError, match=said):
-        configuration(compose_config("test", *arguments))
+        Trained(**given).configuration()

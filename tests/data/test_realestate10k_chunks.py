@@ -10,8 +10,9 @@ import pytest
 import torch
 from realestate10k_trees import assert_refusal, chunk_entry, make_clip, write_chunk_form
 
+from completesplat.data.realestate10k import chunks
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
-from completesplat.data.realestate10k.module import RE10KDataModule, chunks
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import BadAnnotation, OutsidePath, UnreadableFile
 from completesplat.errors import DataError
 
