@@ -95,7 +95,7 @@ def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter)
 
 
 def test_spz_files_are_version_4_in_its_plain_header(written):
-    """As completesplat/export/README.md says. nianticlabs/spz, README, "Header (version 4)": magic number NGSP, version."""
+    """As completesplat/export/README.md says; by nianticlabs/spz, README: magic number NGSP, then the version."""
     assert (written / "a.spz").read_bytes()[:8] == b"NGSP\x04\0\0\0"
 
 
