@@ -47,18 +47,6 @@ FLOORS = [
 LATENTS_ONLY = {"gaussians", "splatter_image", "rasterizers"}
 DATASETS = ("co3d", "realestate", "toy", "hydrant", "teddybear")
 LONGEST_FILE, LONGEST_FUNCTION, MOST_FILES = 400, 50, 200
-# Names that more than one class has today.
-SHARED_CLASS_NAMES = {
-    "Drawing",  # a rasterizer's kernels at work; what the viewer completes a photograph with
-    "Figure",  # a duration that the paper prints; a cell of its tables
-    "Found",  # pictures of a sequence for the latent cache; results below a folder
-    "Framing",  # of CO3D's pictures; of RealEstate10K's; of the viewer's samples
-    "Manifest",  # of packed data; of a latent cache
-    "Picture",  # one that was read; one that is to be encoded
-    "Room",  # of the toy data; for pictures in the page
-    "Row",  # of a sheet of samples; of a table
-    "Splats",  # of a benchmark's opponent; in the viewer
-}
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal"}
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "os.system", "os.popen"}
 
@@ -247,8 +235,7 @@ def test_functions_stay_short() -> None:
 
 
 def test_no_two_classes_have_one_name() -> None:
-    shared = shared_class_names(TREES)
-    assert {name: paths for name, paths in shared.items() if name not in SHARED_CLASS_NAMES} == {}
+    assert shared_class_names(TREES) == {}
 
 
 def test_the_command_line_starts_without_the_heavy_libraries() -> None:
