@@ -292,8 +292,8 @@ def test_everything_is_measured_written_and_shown(in_this_process, command, tmp_
         assert set(row) == {"name", "a", "b", "a_ms", "b_ms", "ratio"}
         assert min(row["a_ms"], row["b_ms"]) > 0
         assert row["ratio"] == pytest.approx(row["b_ms"] / row["a_ms"])
-    assert (results["rows"][3]["a"], results["rows"][3]["b"]) == ("DDIM, 1 step", "DDIM, 50 steps")
-    for said in ("one by one", "DDIM, 1 step", "32 x 32 pixels, batch 2", results["machine"]["processor"]):
+    assert (results["rows"][3]["a"], results["rows"][3]["b"]) == ("UniPC, 1 step", "DDIM, 50 steps")
+    for said in ("one by one", "UniPC, 1 step", "32 x 32 pixels, batch 2", results["machine"]["processor"]):
         assert said in finished.out
     assert not list((tmp_path / "out").glob("bench_diffusion_*"))
 
