@@ -1,0 +1,401 @@
+"""Damaged CO3D trees: each damage is told once with its place, takes no more than it must, and meets the policy."""
+
+import math
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
+from PIL import Image
+
+from completesplat.data.audit import check
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
+from completesplat.data.sequences import SPLITS
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    BadPicture,
+    BadPlacement,
+    MissingFile,
+    OutsidePath,
+    UnreadableFile,
+)
+from completesplat.errors import CompleteSplatError, DataError
+
+POLICIES = pytest.mark.parametrize("policy", ["raise", "skip"])
+NAN, INFINITY = float("nan"), float("inf")
+ITEMS = 4  # of a sequence in an epoch
+Edit = Callable[[Any], object]
+Seen = tuple[str, int]  # sequence, number of the frame
+
+
+@pytest.fixture(scope="module")
+def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Training sequences a and b, c for validation, d for testing, of four frames each."""
+    splits = {"train": "ab", "val": "c", "test": "d"}
+    return write_tree(tmp_path_factory.mktemp("intact"), dict.fromkeys("abcd", 4), splits)
+
+
+@pytest.fixture
+def category(intact: Path, tmp_path: Path) -> Path:
+    """A category that a test may damage."""
+    shutil.copytree(intact, tmp_path / "root" / CATEGORY)
+    return tmp_path / "root" / CATEGORY
+
+
+def read(category: Path) -> Category:
+    return read_category(category.parent, category.name, SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
+
+
+def place(error: DataError) -> tuple[type[DataError], str | None, str | None, int | None]:
+    assert "\n" not in str(error)
+    return type(error), error.file, error.sequence, error.frame
+
+
+def put(*keys: str, value: object, entry: int = 2) -> Edit:
+    """Set a value in an entry, or remove it (...)."""
+
+    def edit(entries: Any) -> None:
+        part = entries[entry]
+        for key in keys[:-1]:
+            part = part[key]
+        if value is ...:
+            del part[keys[-1]]
+        else:
+            part[keys[-1]] = value
+
+    return edit
+
+
+def turned(angle: float, stretch: float = 1.0) -> list[list[float]]:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return [[cosine, -sine, 0], [sine, cosine, 0], [0, 0, stretch]]
+
+
+CAMERA, SCALE = "viewpoint", ("depth", "scale_adjustment")
+R, T, FOCAL, CENTER = ((CAMERA, key) for key in ("R", "T", "focal_length", "principal_point"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "kind", "part"),
+    [
+        ((CAMERA,), ..., BadAnnotation, "no viewpoint"),
+        ((CAMERA,), None, BadAnnotation, "viewpoint must be of type dict"),
+        (R, ..., BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, [["1", "0", "0"]] * 3, BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, [[True] * 3] * 3, BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, [1, 0, 0, 0, 1, 0, 0, 0, 1], BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, [[1, 0, 0], [0, 1], [0, 0, 1]], BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, [[10**400] * 3] * 3, BadAnnotation, "R must be 3 x 3 numbers"),
+        (R, turned(0.3, 1.001), BadCamera, "R is not orthonormal"),
+        (R, turned(0.3, -1.0), BadCamera, "R is a reflection"),
+        (R, turned(0.3, NAN), BadAnnotation, "R is not finite"),
+        (T, [0, 0, INFINITY], BadAnnotation, "T is not finite"),
+        (FOCAL, [0, 2], BadCamera, "focal_length must be positive"),
+        (FOCAL, [2, -2], BadCamera, "focal_length must be positive"),
+        (FOCAL, 2.0, BadAnnotation, "focal_length must be 2 numbers"),
+        (CENTER, [0, 1.2], BadCamera, "lies outside of the 32 x 24 image"),
+        ((CAMERA, "intrinsics_format"), "screen", BadAnnotation, "unknown intrinsics format 'screen'"),
+        ((CAMERA, "intrinsics_format"), [], BadAnnotation, "unknown intrinsics format"),
+        (("image", "size"), ..., BadAnnotation, "no size"),
+        (("image", "size"), [0, 32], BadAnnotation, "two positive integers"),
+        (("image", "size"), [32.0, 32.0], BadAnnotation, "two positive integers"),
+        (("image", "size"), [32, 32, 3], BadAnnotation, "two positive integers"),
+        (("image",), ..., BadAnnotation, "no image"),
+        (("mask",), None, BadAnnotation, "mask must be of type dict"),
+        (("depth",), 7, BadAnnotation, "no path"),
+        (SCALE, NAN, BadAnnotation, "scale_adjustment is not finite"),
+        (SCALE, "2", BadAnnotation, "scale_adjustment must be a number"),
+        (SCALE, ..., BadAnnotation, "scale_adjustment must be a number"),
+        (("image", "path"), 7, BadAnnotation, "path must be of type str"),
+        (("image", "path"), "things/../../x.jpg", OutsidePath, "outside"),
+        (("mask", "path"), "/etc/passwd", OutsidePath, "outside"),
+        (("depth", "path"), "../x.png", OutsidePath, "outside"),
+        (("image", "path"), "things/\ud800.jpg", OutsidePath, "no file name has"),
+    ],
+)
+def test_a_bad_frame_is_refused_with_its_place(category, keys, value, kind, part):
+    change(category / FRAMES, put(*keys, value=value))
+    found = read(category)
+    (error,) = found.refused
+    assert place(error) == (kind, str(category / FRAMES), "a", 2)
+    assert part in error.reason
+    assert str(error) == f"{category / FRAMES}, a, frame 2: {error.reason}"
+    left = {name: [frame.number for frame in frames] for name, frames in found.splits["train"].frames.items()}
+    assert left == {"a": [0, 1, 3], "b": [0, 1, 2, 3]}
+
+
+# (file, change, kind, sequence, frame, part of the reason, frames of sequence a that are gone, refusals in all: who an
+# entry without a name was of is not known, so that what is missing without it is one more)
+BAD_ENTRIES: dict[str, tuple[str, Edit, type[DataError], str | None, int | None, str, list[int], int]] = {
+    "null": (FRAMES, lambda e: [None, *e], BadAnnotation, None, None, "entry 0: no sequence_name", [], 1),
+    "no_number": (FRAMES, put("frame_number", value=...), BadAnnotation, "a", None, "no frame_number", [2], 1),
+    "number_is_true": (FRAMES, put("frame_number", value=True), BadAnnotation, "a", None, "of type int", [2], 1),
+    "name_is_a_number": (FRAMES, put("sequence_name", value=0), BadAnnotation, None, None, "entry 2: seq", [2], 2),
+    "frame_twice": (FRAMES, lambda e: e.append(e[2]), BadAnnotation, "a", 2, "annotated twice", [], 1),
+    "sequence_without_name": (
+        SEQUENCES, put("sequence_name", value=..., entry=0), BadAnnotation, None, None, "entry 0: no", [0, 1, 2, 3], 2,
+    ),
+    "sequence_twice": (SEQUENCES, lambda e: e.append(e[0]), BadAnnotation, "a", None, "annotated twice", [], 1),
+    "cloud_is_text": (
+        SEQUENCES, put("point_cloud", value="x.ply", entry=0), BadAnnotation, "a", None, "no path", [0, 1, 2, 3], 1,
+    ),
+    "cloud_outside": (
+        SEQUENCES, put("point_cloud", "path", value="../x", entry=0), OutsidePath, "a", None, "outside",
+        [0, 1, 2, 3], 1,
+    ),
+    "infinite_cloud_quality": (
+        SEQUENCES, put("point_cloud", "quality_score", value=INFINITY, entry=0), BadAnnotation, "a", None,
+        "not finite", [0, 1, 2, 3], 1,
+    ),
+    "quality_is_text": (
+        SEQUENCES, put("viewpoint_quality_score", value="1", entry=0), BadAnnotation, "a", None, "must be a number",
+        [0, 1, 2, 3], 1,
+    ),
+    "sequence_not_annotated": (
+        SEQUENCES, lambda e: e[1:], BadAnnotation, "a", None, "not annotated", [0, 1, 2, 3], 1,
+    ),
+    "member_is_short": (SET_LIST, lambda s: s["train"].append(["a"]), BadAnnotation, None, None, "expected", [], 1),
+    "member_of_text": (SET_LIST, lambda s: s["val"].append(["c", "1"]), BadAnnotation, None, None, "expected", [], 1),
+    "unknown_frame": (SET_LIST, lambda s: s["train"].append(["a", 99]), BadAnnotation, "a", 99, "not annotated", [], 1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_ENTRIES)
+def test_a_bad_entry_takes_away_no_more_than_what_it_is_of(name, category):
+    file, edit, kind, sequence, frame, part, gone, count = BAD_ENTRIES[name]
+    change(category / file, edit)
+    found = read(category)
+    assert place(found.refused[0]) == (kind, str(category / file), sequence, frame)
+    assert part in found.refused[0].reason
+    assert len(found.refused) == count
+    left = {(name, frame.number) for name, frames in found.splits["train"].frames.items() for frame in frames}
+    assert left == {(name, number) for name in "ab" for number in range(4)} - {("a", number) for number in gone}
+
+
+@POLICIES
+@pytest.mark.parametrize(
+    ("file", "edit", "part"),
+    [
+        (FRAMES, lambda entries: {"frames": entries}, "must hold a list"),
+        (SEQUENCES, lambda entries: {"a": 1}, "must hold a list"),
+        (SET_LIST, lambda splits: [splits], "no train"),
+        (SET_LIST, lambda splits: {"train": [], "val": []}, "no test"),
+        (SET_LIST, lambda splits: splits.update(val=None), "val must be of type list"),
+    ],
+)
+def test_a_file_that_says_nothing_is_raised_under_either_policy(policy, category, file, edit, part):
+    change(category / file, edit)
+    with pytest.raises(BadAnnotation, match=part) as caught:
+        module(category.parent, policy).setup("fit")
+    assert caught.value.file == str(category / file)
+
+
+@pytest.mark.parametrize("file", [FRAMES, SEQUENCES, SET_LIST])
+def test_a_truncated_or_missing_file_is_refused_as_a_whole(category, file):
+    (category / file).write_bytes((category / file).read_bytes()[:100])
+    with pytest.raises(UnreadableFile) as caught:
+        read(category)
+    assert caught.value.file == str(category / file)
+    (category / file).unlink()
+    with pytest.raises(MissingFile if file != SET_LIST else DataError):
+        read(category)
+
+
+def test_pictures_behind_links_that_leave_the_root_are_refused(category, tmp_path):
+    folder = category / "a" / "images"
+    folder.rename(tmp_path / "elsewhere")
+    folder.symlink_to(tmp_path / "elsewhere")
+    refused = read(category).refused
+    assert [place(error) for error in refused] == [(OutsidePath, str(category / FRAMES), "a", n) for n in range(4)]
+    assert all("a link leads outside" in error.reason for error in refused)
+
+
+def test_what_nobody_reads_may_be_broken(category):
+    """NaN in a number that is not used (Python's `json`, which wrote CO3D, writes it); frames that no list names."""
+    change(category / FRAMES, put("mask", "mass", value=NAN))
+    change(category / FRAMES, put(*SCALE, value=2))
+    found = read(category)
+    assert found.refused == []
+    assert found.splits["train"].frames["a"][2].depth.scale_adjustment == 2.0
+    change(category / SET_LIST, lambda splits: splits["train"].remove(next(m for m in splits["train"] if m[1] == 2)))
+    change(category / FRAMES, put(CAMERA, value=None))
+    found = read(category)
+    assert [frame.number for frame in found.splits["train"].frames["a"]] == [0, 1, 3]
+    assert found.refused == []
+
+
+IMAGE, MASK, DEPTH = (f"a/{part}/frame000002.png" for part in ("images", "masks", "depths"))
+CLOUD = "a/pointcloud.ply"
+
+
+def replaced(file: str, make: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda category: ((category / file).unlink(), make(category / file))
+
+
+def sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(10**12)
+
+
+def without_cloud(damage: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda category: (change(category / SEQUENCES, lambda e: e[0].update(point_cloud=None)), damage(category))
+
+
+def unknown_depth(category: Path) -> None:
+    for number in range(1, 5):
+        Image.fromarray(depth_bits(np.zeros((24, 32)))).save(category / f"a/depths/frame00000{number}.png")
+
+
+# name: (damage, kind, file, frame), of sequence a.
+DAMAGES: dict[str, tuple[Callable[[Path], object], type[DataError], str | None, int | None]] = {
+    "picture_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadPicture, IMAGE, 1),
+    "missing_mask": (lambda category: (category / MASK).unlink(), MissingFile, MASK, 1),
+    "picture_is_a_folder": (replaced(IMAGE, Path.mkdir), MissingFile, IMAGE, 1),
+    "picture_is_a_pipe": (replaced(IMAGE, os.mkfifo), MissingFile, IMAGE, 1),
+    "mask_is_a_ring_of_links": (replaced(MASK, lambda path: path.symlink_to(path.name)), MissingFile, MASK, 1),
+    "picture_is_a_dead_link": (replaced(IMAGE, lambda path: path.symlink_to("none.png")), MissingFile, IMAGE, 1),
+    "picture_of_a_terabyte": (replaced(IMAGE, sparse), BadPicture, IMAGE, 1),
+    "name_too_long": (
+        lambda c: change(c / FRAMES, put("image", "path", value=f"{CATEGORY}/{'n' * 300}.png", entry=1)),
+        MissingFile, f"{'n' * 300}.png", 1,
+    ),
+    "missing_cloud": (lambda category: (category / CLOUD).unlink(), MissingFile, CLOUD, None),
+    "missing_depth_map": (without_cloud(lambda category: (category / DEPTH).unlink()), MissingFile, DEPTH, 1),
+    "missing_mask_of_a_depth_map": (without_cloud(lambda category: (category / MASK).unlink()), MissingFile, MASK, 1),
+    "zero_scale_of_a_depth_map": (
+        without_cloud(lambda c: change(c / FRAMES, put(*SCALE, value=0, entry=1))), BadPicture, DEPTH, 1,
+    ),
+    "no_depth_is_known": (without_cloud(unknown_depth), BadPlacement, None, None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_what_is_broken_is_refused_by_the_source_with_its_place(name, category):
+    damage, kind, file, frame = DAMAGES[name]
+    damage(category)
+    source = module(category.parent, "raise").open("train")["train"]
+    assert source.refused == []
+    (error,) = check({"train": source}, workers=1, progress=False).refused
+    assert place(error) == (kind, file and str(category / file), "a", frame)
+
+
+def module(root: Path, policy: str, **settings: Any) -> CO3DDataModule:
+    """Small pictures, one scene in a batch that shows all frames, and no limit on what is skipped."""
+    defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "references_per_sequence": ITEMS, "subset": SUBSET}
+    return CO3DDataModule(str(root), CATEGORY, **{**defaults, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
+
+
+@pytest.fixture(scope="module")
+def pictures(intact: Path) -> dict[bytes, Seen]:
+    """All pictures of the tree that nothing is wrong with; no two are alike."""
+    data, found = module(intact.parent, "raise"), {}
+    for split in SPLITS:
+        for name in data.source(split).names:
+            sequence = data.source(split).read(name)
+            for index, number in enumerate(sequence.frames):
+                found[sequence.read(index).image.numpy().tobytes()] = name, number
+    return found
+
+
+def epoch(loader: Any, pictures: dict[bytes, Seen], number: int = 0) -> set[Seen]:
+    """The frames that an epoch of training shows, exactly as they are. It has all of its scenes, whatever is broken."""
+    loader.sampler.set_epoch(number)
+    batches, seen = list(loader), set()
+    assert len(batches) == len(loader) == len(loader.dataset)
+    for batch in batches:
+        views = batch.all_views()
+        assert all(t.isfinite().all() for t in (views.masks, views.cameras.world_to_camera, batch.depth_range))
+        found = {pictures[(255 * image).round().to(torch.uint8).numpy().tobytes()] for image in views.images[0]}
+        assert {(sequence,) for sequence, _ in found} == {batch.names}
+        seen |= found
+    return seen
+
+
+@POLICIES
+@pytest.mark.parametrize("name", ["picture_is_text", "missing_cloud"])
+def test_what_is_broken_never_gets_into_a_batch(name, policy, category, pictures, monkeypatch):
+    damage, kind, file, frame = DAMAGES[name]
+    damage(category)
+    data = module(category.parent, policy)
+    data.setup("fit")
+    loader, source, readings = data.train_dataloader(), data.source("train"), Counter[str]()
+    whole = source.read
+    monkeypatch.setattr(source, "read", lambda name: (readings.update([name]), whole(name))[1])
+    if policy == "raise":
+        with pytest.raises(DataError) as caught:
+            list(loader)
+        assert place(caught.value) == (kind, str(category / file), "a", frame)
+        return
+    for number in (0, 1):
+        readings.clear()
+        assert {name for name, _ in epoch(loader, pictures, number)} == {"b"}
+        # Its own items come every epoch; what is drawn in their place may be others of them.
+        assert len(loader.refused) == readings["a"] >= ITEMS
+        assert {place(error) for error in loader.refused} == {(kind, str(category / file), "a", frame)}
+
+
+@POLICIES
+def test_what_is_annotated_badly_is_raised_or_left_out_before_training(policy, category, pictures):
+    change(category / FRAMES, put(CAMERA, value=None))
+    data = module(category.parent, policy, targets=2)
+    if policy == "raise":
+        with pytest.raises(BadAnnotation) as caught:
+            data.setup("fit")
+        refused = [caught.value]
+    else:
+        data.setup("fit")
+        loader = data.train_dataloader()
+        assert epoch(loader, pictures) == {(name, number) for name in "ab" for number in range(4)} - {("a", 2)}
+        assert loader.refused == []
+        refused = data.source("train").refused
+    assert [place(error) for error in refused] == [(BadAnnotation, str(category / FRAMES), "a", 2)]
+
+
+def test_a_bad_depth_map_is_not_looked_at_where_there_is_a_point_cloud(category, pictures):
+    (category / DEPTH).write_text("depth")
+    assert len(epoch(module(category.parent, "raise").train_dataloader(), pictures)) == 8
+
+
+@POLICIES
+def test_sequences_of_one_frame_are_left_out_under_either_policy(policy, category):
+    change(category / SET_LIST, lambda splits: splits.update(train=splits["train"][3:]))
+    data = module(category.parent, policy)
+    assert {name for batch in data.train_dataloader() for name in batch.names} == {"b"}
+    assert (data.source("train").left_out, data.source("train").refused) == ({"fewer than 2 frames": ["a"]}, [])
+    change(category / SET_LIST, lambda splits: splits.update(train=splits["train"][:2]))
+    with pytest.raises(DataError, match="no train sequences"):
+        module(category.parent, policy).setup("fit")
+
+
+def test_evaluation_of_nothing_but_a_bad_sequence_is_no_evaluation(category):
+    (category / "c/images/frame000002.png").write_text("picture")
+    with pytest.raises(BadPicture):
+        list(module(category.parent, "raise").val_dataloader())
+    loader = module(category.parent, "skip").val_dataloader()
+    with pytest.raises(DataError, match="1 of 1 items cannot be read"):
+        list(loader)
+    assert [(error.sequence, error.frame) for error in loader.refused] == [("c", 1)]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_too_large_a_share_of_bad_pictures_ends_training(category, workers):
+    (category / IMAGE).write_text("picture")
+    data = module(category.parent, "skip", max_bad_fraction=0.1, workers=workers)
+    with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
+        list(data.train_dataloader())
+
+
+def test_settings_without_meaning_are_refused(category):
+    for threshold in (0, 1.5, float("nan")):
+        with pytest.raises(CompleteSplatError, match=r"data\.mask_threshold"):
+            module(category.parent, "skip", mask_threshold=threshold)
+    with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
+        module(category.parent, "ignore").train_dataloader()
