@@ -6,7 +6,7 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """Something of a data set that is missing, broken or not in the expected layout; its kinds: `data/checks.py`.
+    """Something of a data set that is missing, broken or not in the expected layout; its kinds: `data/validation.py`.
 
     Args:
         reason: what is wrong, without the place.
@@ -16,6 +16,9 @@ class DataError(CompleteSplatError):
     """
 
     kind = "not as expected"
+
+    def __init_subclass__(cls, kind: str) -> None:
+        cls.kind = kind
 
     def __init__(
         self, reason: str, file: str | None = None, sequence: str | None = None, frame: int | None = None

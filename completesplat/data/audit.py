@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import TooFewFrames, at
+from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
 
 FEWEST_FRAMES = 2
@@ -28,10 +28,8 @@ Sources = Mapping[str, SequenceSource]
 _Batch = list[tuple[str, list[str]]]
 
 
-class LeftOut(DataError):
+class LeftOut(DataError, kind="left out"):
     """A sequence in which nothing is broken, but which the settings leave out."""
-
-    kind = "left out"
 
 
 @runtime_checkable
@@ -45,11 +43,9 @@ class Verifiable(Protocol):
 
 @dataclass(frozen=True)
 class Findings:
-    """What reading everything showed.
+    """What reading everything showed: the numbers of usable sequences (of two usable frames or more) and their frames.
 
     Attributes:
-        sequences: usable ones, those with at least two usable frames.
-        frames: usable ones of these sequences.
         refused: each thing once, in the order of the data set.
         splits: the same two numbers for each split alone.
     """
@@ -69,12 +65,10 @@ class Findings:
 
     def json(self) -> dict[str, Any]:
         """The contents of `check.json`."""
+        parts = ("sequence", "frame", "file", "reason")
         return {
             "usable": {"sequences": self.sequences, "frames": self.frames},
-            "refused": [
-                {"sequence": error.sequence, "frame": error.frame, "file": error.file, "reason": error.reason}
-                for error in self.refused
-            ],
+            "refused": [{part: getattr(error, part) for part in parts} for error in self.refused],
             "counts": {kind: len(errors) for kind, errors in self.by_kind().items()},
             "splits": self.splits,
         }
@@ -92,11 +86,9 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
     Args:
         sources: by split; with more than one worker they must be picklable.
         workers: processes, by default one a core.
-        progress: show a progress bar.
     """
     refused = [error for source in sources.values() for error in _before_reading(source)]
-    sequences: list[_Sequence] = []
-    batches = _batches(sources)
+    sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
         for batch in _read_batches(sources, batches, workers):
@@ -192,24 +184,15 @@ def _read_in_worker(batch: _Batch) -> list[_Sequence]:
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
     sequence, seen = _Sequence(name), set[int]()
     for split in splits:
-        try:
-            with at(sequence=name):
-                posed = sources[split].read(name)
-        except DataError as error:
-            sequence.refused.append(error)
-            continue
-        sequence.frames[split] = set(posed.frames)
-        for index, frame in enumerate(posed.frames):
-            if frame in seen:
-                continue
-            seen.add(frame)
-            try:
-                with at(sequence=name, frame=frame):
-                    posed.read(index)
-            except DataError as error:
-                sequence.refused.append(error)
-            else:
-                sequence.usable.add(frame)
+        with refused_to(sequence.refused.append), at(sequence=name):
+            posed = sources[split].read(name)
+            sequence.frames[split] = set(posed.frames)
+            for index, frame in enumerate(posed.frames):
+                if frame not in seen:
+                    seen.add(frame)
+                    with refused_to(sequence.refused.append), at(sequence=name, frame=frame):
+                        posed.read(index)
+                        sequence.usable.add(frame)
     return sequence
 
 

@@ -75,6 +75,11 @@ class SequenceSource(Protocol):
         ...
 
 
+def shortened(names: Sequence[str], most: int = 5) -> str:
+    """The first few names, for a message."""
+    return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
+
+
 def spread_places(count: int, most: int | None) -> list[int]:
     """At most `most` of `count` places: the middles of equal parts; None: all."""
     if most is None or most >= count:

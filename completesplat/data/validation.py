@@ -10,6 +10,7 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
+from plyfile import PlyData, PlyElement
 
 from completesplat.errors import DataError
 
@@ -17,71 +18,51 @@ MOST_BYTES = 2**32
 # Beyond this size a gzipped file may be smaller than its content by no more than this factor. Deflate gets up to 1032,
 # annotations stay far below.
 BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**26, 200
-CHUNK = 2**20
+CHUNK = 2**20  # of a file that is read
 ROTATION_TOLERANCE = 1e-3
 
 T = TypeVar("T")
 Refuse = Callable[[DataError], None]
 
 
-class MissingFile(DataError):
+class MissingFile(DataError, kind="missing file"):
     """A file that an annotation or a layout promises is not there."""
 
-    kind = "missing file"
 
-
-class OutsidePath(DataError):
+class OutsidePath(DataError, kind="path outside of the data"):
     """A path in an annotation that leads out of the data's folder, or nowhere."""
 
-    kind = "path outside of the data"
 
-
-class UnreadableFile(DataError):
+class UnreadableFile(DataError, kind="unreadable file"):
     """A file other than a picture that is damaged, too large, unsafe to read or of another format."""
 
-    kind = "unreadable file"
 
-
-class BadAnnotation(DataError):
+class BadAnnotation(DataError, kind="malformed annotation"):
     """An annotation without a key that is needed, or with a value of another type or shape."""
 
-    kind = "malformed annotation"
 
-
-class BadCamera(DataError):
+class BadCamera(DataError, kind="impossible camera"):
     """A pose or intrinsics that no camera has."""
 
-    kind = "impossible camera"
 
-
-class BadPicture(DataError):
+class BadPicture(DataError, kind="unusable picture"):
     """A picture, mask or depth map that is damaged, too large, of another size or without a plain meaning."""
 
-    kind = "unusable picture"
 
-
-class BadPlacement(DataError):
+class BadPlacement(DataError, kind="object without a place"):
     """Nothing shows where a sequence's object is and how large."""
 
-    kind = "object without a place"
 
-
-class TooFewFrames(DataError):
+class TooFewFrames(DataError, kind="too few frames"):
     """A sequence with too few (usable) frames."""
 
-    kind = "too few frames"
 
-
-class SharedSequences(DataError):
+class SharedSequences(DataError, kind="shared sequence"):
     """A list of sequences to train on that names some to test on."""
 
-    kind = "shared sequence"
 
-
-class ChangedFile(DataError):
+class ChangedFile(DataError, kind="changed file"):
     """A file that is no longer what its checksum was taken of."""
-
-    kind = "changed file"
 
 
 @contextmanager
@@ -136,22 +117,49 @@ def inside(root: Path, relative: str) -> Path:
     return root / path
 
 
-def read_json(path: Path, allow_nan: bool = False, most_bytes: int = MOST_BYTES) -> Any:
+def read_json(path: Path, allow_nan: bool = False) -> Any:
     """The content of a JSON file, gzipped if its name ends in `.jgz`.
 
     Args:
         allow_nan: take NaN and Infinity, which are no JSON but written by Python, as numbers.
-        most_bytes: of the JSON text.
 
     Raises:
         MissingFile: no such file.
         UnreadableFile: no (gzipped) JSON in UTF-8, or too large, unpacked or not.
     """
     try:
-        raw = _unpack(path, most_bytes) if path.suffix == ".jgz" else _read(path, most_bytes)
+        raw = _read(path, MOST_BYTES)
         return json.loads(raw.decode("utf-8"), parse_constant=float if allow_nan else _refuse_constant)
     except (OSError, EOFError, ValueError, zlib.error, RecursionError, MemoryError) as error:
         raise UnreadableFile(f"not a JSON file ({str(error) or type(error).__name__})", str(path)) from None
+
+
+def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
+    """The content of a text file in UTF-8.
+
+    Raises:
+        MissingFile: no such file.
+        UnreadableFile: no text, or too large.
+    """
+    try:
+        return _read(path, most_bytes).decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadableFile(f"not a text file ({type(error).__name__})", str(path)) from None
+
+
+def read_vertices(path: Path) -> tuple[PlyElement, np.ndarray]:
+    """The vertices of a PLY file, and their places [n 3] in float64.
+
+    Raises:
+        MissingFile: no such file.
+        UnreadableFile: no PLY with vertices.
+    """
+    require_file(path)
+    try:
+        vertices = PlyData.read(str(path))["vertex"]
+        return vertices, np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
+    except Exception as error:  # The parser raises nearly anything on a damaged file.
+        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
@@ -181,8 +189,7 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
         array = np.array(None)
     # Strings that look like numbers, truth values and None become arrays of other kinds.
     if array.shape != shape or array.dtype.kind not in "iuf":
-        sides = " x ".join(map(str, shape))
-        numbers = f"{sides} numbers" if shape else "a number"
+        numbers = f"{' x '.join(map(str, shape))} numbers" if shape else "a number"
         raise BadAnnotation(f"{what} must be {numbers}, not {_shortened(value)}")
     if not np.isfinite(array).all():
         raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
@@ -227,22 +234,15 @@ def _shortened(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _read(path: Path, most_bytes: int) -> bytes:
-    with require_file(path).open("rb") as file:
-        raw = file.read(most_bytes + 1)
-    if len(raw) > most_bytes:
-        raise UnreadableFile(f"more than {most_bytes:,} bytes", str(path))
-    return raw
-
-
-def _unpack(path: Path, most_bytes: int) -> bytearray:
-    raw, packed = bytearray(), require_file(path).stat().st_size
-    limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * packed))
-    with GzipFile(path) as file:
+def _read(path: Path, most_bytes: int) -> bytearray:
+    """The bytes of a file, unpacked if its name ends in `.jgz`."""
+    raw, size, packed = bytearray(), require_file(path).stat().st_size, path.suffix == ".jgz"
+    limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * size)) if packed else most_bytes
+    with GzipFile(path) if packed else path.open("rb") as file:
         while chunk := file.read(CHUNK):
             raw += chunk
             if len(raw) > limit:
-                raise UnreadableFile(f"unpacks to more than {limit:,} bytes from {packed:,}", str(path))
+                raise UnreadableFile(f"{size:,} bytes hold more than {limit:,} bytes", str(path))
     return raw
 
 

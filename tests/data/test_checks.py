@@ -2,65 +2,63 @@
 
 import gzip
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from completesplat.data.validation import field, finite_array, inside, read_json, require_rotation
-from completesplat.errors import DataError
+from completesplat.data import validation
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    MissingFile,
+    OutsidePath,
+    UnreadableFile,
+    field,
+    finite_array,
+    inside,
+    read_json,
+    require_rotation,
+)
 
 CONTENT = [{"name": "Bär", "numbers": [1, 2.5, None]}] * 50
 TEXT = json.dumps(CONTENT, ensure_ascii=False).encode()
 
 
-def broken_deflate() -> bytes:
+def flipped(position: int) -> bytes:
+    """Gzipped, with a byte changed: the first one behind gzip's header is a type of block, the last are checksums."""
     packed = bytearray(gzip.compress(TEXT))
-    packed[10] = 7  # The first byte behind gzip's header: a block type that deflate does not have.
-    return bytes(packed)
-
-
-def wrong_checksum() -> bytes:
-    packed = bytearray(gzip.compress(TEXT))
-    packed[-6] ^= 1
+    packed[position] ^= 7 ^ packed[10] if position == 10 else 1
     return bytes(packed)
 
 
 # name: (file name, content, part of the message)
-BAD: dict[str, tuple[str, Callable[[], bytes], str]] = {
-    "empty": ("a.json", lambda: b"", "Expecting value"),
-    "text": ("a.json", lambda: b"hello", "Expecting value"),
-    "cut": ("a.json", lambda: TEXT[:-5], "not a JSON file"),
-    "two_values": ("a.json", lambda: b"[1][2]", "Extra data"),
-    "nan": ("a.json", lambda: b'{"x": NaN}', "NaN is no JSON"),
-    "infinity": ("a.json", lambda: b"[-Infinity]", "-Infinity is no JSON"),
-    "latin_1": ("a.json", lambda: TEXT.decode().encode("latin-1"), "utf-8"),
-    "utf_16": ("a.json", lambda: TEXT.decode().encode("utf-16"), "utf-8"),
-    "deep_lists": ("a.json", lambda: b"[" * 10**5 + b"]" * 10**5, "recursion"),
-    "deep_objects": ("a.json", lambda: b'{"a":' * 10**5, "recursion"),
-    "huge_integer": ("a.json", lambda: b"1" * 10**4, "not a JSON file"),
-    "empty_gzip": ("a.jgz", lambda: b"", "not a JSON file"),
-    "not_gzipped": ("a.jgz", lambda: TEXT, "Not a gzipped file"),
-    "cut_gzip": ("a.jgz", lambda: gzip.compress(TEXT)[:-12], "not a JSON file"),
-    "gzip_without_checksum": ("a.jgz", lambda: gzip.compress(TEXT)[:-8], "not a JSON file"),
-    "gzip_with_wrong_checksum": ("a.jgz", wrong_checksum, "CRC check failed"),
-    "broken_deflate": ("a.jgz", broken_deflate, "invalid block type"),
-    "trailing_garbage": ("a.jgz", lambda: gzip.compress(TEXT) + b"garbage", "Not a gzipped file"),
-    "two_gzipped_values": ("a.jgz", lambda: gzip.compress(TEXT) * 2, "Extra data"),
-    "gzipped_nan": ("a.jgz", lambda: gzip.compress(b"[NaN]"), "NaN is no JSON"),
-    "gzip_bomb": ("a.jgz", lambda: gzip.compress(b"[" + b" " * 2**27 + b"]"), "unpacks to more than"),
+BAD: dict[str, tuple[str, bytes, str]] = {
+    "empty": ("a.json", b"", "Expecting value"),
+    "two_values": ("a.json", b"[1][2]", "Extra data"),
+    "nan": ("a.json", b'{"x": NaN}', "NaN is no JSON"),
+    "latin_1": ("a.json", TEXT.decode().encode("latin-1"), "utf-8"),
+    "deep_lists": ("a.json", b"[" * 10**5 + b"]" * 10**5, "recursion"),
+    "huge_integer": ("a.json", b"1" * 10**4, "not a JSON file"),
+    "empty_gzip": ("a.jgz", b"", "not a JSON file"),
+    "not_gzipped": ("a.jgz", TEXT, "Not a gzipped file"),
+    "cut_gzip": ("a.jgz", gzip.compress(TEXT)[:-12], "not a JSON file"),
+    "gzip_with_wrong_checksum": ("a.jgz", flipped(-6), "CRC check failed"),
+    "broken_deflate": ("a.jgz", flipped(10), "invalid block type"),
+    "trailing_garbage": ("a.jgz", gzip.compress(TEXT) + b"garbage", "Not a gzipped file"),
+    "gzipped_nan": ("a.jgz", gzip.compress(b"[NaN]"), "NaN is no JSON"),
+    "gzip_bomb": ("a.jgz", gzip.compress(b"[" + b" " * 2**27 + b"]"), "hold more than"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_refused_by_name(name, tmp_path):
-    file, make, part = BAD[name]
-    (tmp_path / file).write_bytes(make())
-    with pytest.raises(DataError) as caught:
+    file, content, part = BAD[name]
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(UnreadableFile) as caught:
         read_json(tmp_path / file)
-    assert str(tmp_path / file) in str(caught.value)
-    assert part in str(caught.value)
+    assert caught.value.file == str(tmp_path / file)
+    assert part in caught.value.reason
 
 
 def test_good_files_are_read(tmp_path):
@@ -72,38 +70,26 @@ def test_good_files_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["a.json", "a.jgz"])
-def test_the_limit_on_bytes_is_on_the_text(tmp_path, file):
+def test_the_limit_on_bytes_is_on_the_text(tmp_path, file, monkeypatch):
     (tmp_path / file).write_bytes(gzip.compress(TEXT) if file == "a.jgz" else TEXT)
-    assert read_json(tmp_path / file, most_bytes=len(TEXT)) == CONTENT
-    with pytest.raises(DataError, match=f"more than {len(TEXT) - 1:,} bytes"):
-        read_json(tmp_path / file, most_bytes=len(TEXT) - 1)
+    monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT))
+    assert read_json(tmp_path / file) == CONTENT
+    monkeypatch.setattr(validation, "MOST_BYTES", len(TEXT) - 1)
+    with pytest.raises(UnreadableFile, match=f"more than {len(TEXT) - 1:,} bytes"):
+        read_json(tmp_path / file)
 
 
 def test_missing_files_are_refused(tmp_path):
     for path in (tmp_path / "a.json", tmp_path / "a.jgz", tmp_path):
-        with pytest.raises(DataError, match="no such file"):
+        with pytest.raises(MissingFile):
             read_json(path)
 
 
-LEADING_OUT = [
-    "../a",
-    "a/../../b",
-    "/a",
-    "//a/b",
-    "C:/a",
-    "C:a",
-    "\\\\server\\a",
-    "a\\..\\b",
-    "file:///a",
-    "a\0",
-    "",
-    ".",
-]
-
-
-@pytest.mark.parametrize("relative", LEADING_OUT)
+@pytest.mark.parametrize(
+    "relative", ["../a", "a/../../b", "/a", "C:/a", "\\\\server\\a", "a\\..\\b", "file:///a", "a\0", "", "."]
+)
 def test_paths_that_are_not_plainly_below_the_root_are_refused(tmp_path, relative):
-    with pytest.raises(DataError, match="outside"):
+    with pytest.raises(OutsidePath):
         inside(tmp_path, relative)
 
 
@@ -121,9 +107,9 @@ def linked(tmp_path: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("relative", ["out", "out/x.png", "sibling/x.png", "hop/x.png", "within/../out/x"])
+@pytest.mark.parametrize("relative", ["out", "sibling/x.png", "hop/x.png", "within/../out/x"])
 def test_links_that_leave_the_root_are_refused(linked, relative):
-    with pytest.raises(DataError, match="outside"):
+    with pytest.raises(OutsidePath):
         inside(linked, relative)
 
 
@@ -136,14 +122,14 @@ def test_paths_below_the_root_are_taken_also_where_the_root_is_a_link(linked, re
 def test_fields_have_exactly_the_asked_type():
     assert field({"n": 3}, "n", int) == 3
     for entry in ({"n": True}, {"n": 3.0}, {"n": None}, {}, None, [3]):
-        with pytest.raises(DataError, match="n"):
+        with pytest.raises(BadAnnotation, match="n"):
             field(entry, "n", int)
 
 
 def test_arrays_are_finite_numbers_of_the_asked_shape():
     assert finite_array([[1, 2.5]], (1, 2), "x").tolist() == [[1.0, 2.5]]
     for value in ([1, 2.5], [[1, "2"]], [[1, None]], [[1, float("nan")]], [[1, float("inf")]], [[1], [2, 3]], None, {}):
-        with pytest.raises(DataError, match="x"):
+        with pytest.raises(BadAnnotation, match="x"):
             finite_array(value, (1, 2), "x")
 
 
@@ -153,5 +139,5 @@ def test_rotations_may_be_off_by_rounding_only():
     require_rotation(rotation.astype(np.float32).astype(np.float64), "R")
     require_rotation(rotation * 1.0004, "R")
     for matrix, part in ((rotation * 1.0006, "orthonormal"), (-rotation, "reflection"), (rotation * 0, "orthonormal")):
-        with pytest.raises(DataError, match=part):
+        with pytest.raises(BadCamera, match=part):
             require_rotation(matrix, "R")

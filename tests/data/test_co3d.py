@@ -9,6 +9,7 @@ from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, change, write_tree
 from lightning import LightningModule, Trainer
 from PIL import Image
 from plyfile import PlyData
+from realestate10k_trees import epoch, equal
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.selection import Filters, SeededSplit, SplitMembers, read_category
@@ -35,22 +36,6 @@ def members(root: Path, split: str) -> SplitMembers:
 def scene(data: CO3DDataModule, split: str, index: int, reference: int, targets: list[int]) -> SceneBatch:
     store = data.store(split)
     return store.scene(store.source.read(store.names[index]), reference, targets)
-
-
-def epoch(loader, number: int) -> list[SceneBatch]:
-    loader.sampler.set_epoch(number)
-    return list(loader)
-
-
-def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:
-    def tensors(batch: SceneBatch) -> list[torch.Tensor]:
-        views = batch.all_views()
-        return [views.images, views.masks, views.cameras.world_to_camera, views.cameras.intrinsics, batch.depth_range]
-
-    return len(one) == len(other) and all(
-        a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
-        for a, b in zip(one, other, strict=True)
-    )
 
 
 def test_training_batches_have_the_stated_shapes(toy_root):

@@ -19,8 +19,10 @@ from co3d_trees import (
 from PIL import Image
 from torch import Tensor
 
+from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.geometry.cameras import project
+from completesplat.data.pictures.crop import principal_square
+from completesplat.geometry.cameras import crop_resize, project
 from completesplat.scene import SceneBatch
 
 CENTER = np.array([5.0, -3.0, 2.0])
@@ -111,3 +113,50 @@ def test_a_known_point_stays_on_its_pixel(tmp_path, size, layout, principal_poin
         for seen in (views.images[0, :, 0], views.masks[0, :, 0]):
             assert max((centroid(one) - pixel).norm() for one, pixel in zip(seen, pixels[:, 0], strict=True)) < 0.1
         assert batch.depth_range[0, 0] < depth[0] < batch.depth_range[0, 1]
+
+
+def random_viewpoint(rng: np.random.Generator, layout: str) -> dict:
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    return {
+        "R": rotation.tolist(),
+        "T": [0.2, -0.1, 4.0],
+        "focal_length": [2.3, 2.9],
+        "principal_point": [0.13, -0.21],
+        "intrinsics_format": layout,
+    }
+
+
+@pytest.mark.parametrize("size", [(300, 400), (500, 320), (256, 256)])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_points_land_where_pytorch3d_puts_them(layout, size):
+    rng = np.random.default_rng(0)
+    viewpoint, points = random_viewpoint(rng, layout), rng.normal(size=(50, 3))
+    expected, expected_depth = pytorch3d_pixels(viewpoint, size, points)
+    camera = camera_from_viewpoint(viewpoint, size)
+    pixels, depth = project(camera, torch.from_numpy(points))
+    np.testing.assert_allclose(pixels.numpy(), expected, atol=1e-9)
+    np.testing.assert_allclose(depth.numpy(), expected_depth, atol=1e-12)
+    assert torch.linalg.det(camera.world_to_camera[:3, :3]).item() == pytest.approx(1)
+
+
+def test_annotations_older_than_the_format_are_normalised_by_the_bounds():
+    viewpoint = random_viewpoint(np.random.default_rng(0), LAYOUTS[0])
+    old = {key: value for key, value in viewpoint.items() if key != "intrinsics_format"}
+    explicit, default = (camera_from_viewpoint(given, (300, 400)).intrinsics for given in (viewpoint, old))
+    assert torch.equal(explicit, default)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_crop_is_centred_touches_a_border_and_moves_points_linearly(layout):
+    rng, size = np.random.default_rng(1), (300, 400)
+    viewpoint, points = random_viewpoint(rng, layout), rng.normal(size=(50, 3))
+    camera = camera_from_viewpoint(viewpoint, size)
+    center = camera.intrinsics[:2, 2].tolist()
+    square = principal_square(tuple(center), size)
+    borders = [square.left, square.top, 400 - square.left - square.side, 300 - square.top - square.side]
+    assert min(borders) == pytest.approx(0, abs=1e-9)
+    cropped = crop_resize(camera, square.left, square.top, square.side, 64)
+    assert cropped.intrinsics[:2, 2].tolist() == pytest.approx([32, 32])
+    expected = (pytorch3d_pixels(viewpoint, size, points)[0] - [square.left, square.top]) * 64 / square.side
+    np.testing.assert_allclose(project(cropped, torch.from_numpy(points))[0].numpy(), expected, atol=1e-9)

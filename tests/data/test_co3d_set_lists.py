@@ -34,7 +34,7 @@ def test_few_views_of_sequences_never_seen_are_the_default(tmp_path):
 def test_a_list_that_tests_on_training_sequences_is_refused_unless_asked_for(tmp_path, on_bad):
     category = write_tree(tmp_path, COUNTS, SHARED)
     for stage in ("fit", "test"):
-        with pytest.raises(DataError, match=r"6 sequences .* a, b, c, d, e .*allow_shared_sequences=true") as caught:
+        with pytest.raises(DataError, match=r"6 sequences .* a, b, c, d, e, .*allow_shared_sequences=true") as caught:
             module(tmp_path, on_bad=on_bad).setup(stage)
         assert caught.value.file == str(category / SET_LIST)
     allowed = module(tmp_path, allow_shared_sequences=True)

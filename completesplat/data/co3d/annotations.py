@@ -69,16 +69,10 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
             with at(sequence=name):
                 if name in videos:
                     raise BadAnnotation("the sequence is annotated twice")
-                videos[name] = _video(root, entry)
+                quality, cloud = _optional_number(entry, "viewpoint_quality_score"), entry.get("point_cloud")
+                file = None if cloud is None else inside(root, field(cloud, "path", str))
+                videos[name] = CO3DVideo(file, cloud and _optional_number(cloud, "quality_score"), quality)
     return videos
-
-
-def _video(root: Path, entry: dict[str, Any]) -> CO3DVideo:
-    quality = _optional_number(entry, "viewpoint_quality_score")
-    cloud = entry.get("point_cloud")
-    if cloud is None:
-        return CO3DVideo(None, None, quality)
-    return CO3DVideo(inside(root, field(cloud, "path", str)), _optional_number(cloud, "quality_score"), quality)
 
 
 def _optional_number(entry: dict[str, Any], key: str) -> float | None:
@@ -92,10 +86,7 @@ def _optional_number(entry: dict[str, Any], key: str) -> float | None:
 def read_frames(
     root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
 ) -> dict[str, dict[int, CO3DFrame]]:
-    """The frames in `frame_annotations.jgz` by sequence and number. Entries that are none are handed to `refuse`.
-
-    Args:
-        wanted: (sequence, number) -> whether the frame is looked at.
+    """The frames in `frame_annotations.jgz` by sequence and number, as far as they are `wanted`.
 
     Raises:
         DataError: the file is missing, unreadable or no list.
@@ -136,14 +127,11 @@ def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
         raise BadAnnotation(f"the image's size must be two positive integers, not {size}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
     image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
-    return CO3DFrame(number, image_path, mask_path, None if depth is None else _depth(root, depth), camera)
-
-
-def _depth(root: Path, entry: object) -> DepthMap:
-    path = inside(root, field(entry, "path", str))
-    # Some writers leave out the fraction of a whole number.
-    scale = entry.get("scale_adjustment") if isinstance(entry, dict) else None
-    return DepthMap(path, float(finite_array(scale, (), "scale_adjustment")))
+    if depth is not None:
+        path = inside(root, field(depth, "path", str))
+        # Some writers leave out the fraction of a whole number.
+        depth = DepthMap(path, float(finite_array(depth.get("scale_adjustment"), (), "scale_adjustment")))
+    return CO3DFrame(number, image_path, mask_path, depth, camera)
 
 
 def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) -> Cameras:
@@ -171,9 +159,7 @@ def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) 
         raise BadCamera(f"focal_length must be positive and finite, not {viewpoint['focal_length']}")
     if not ((center > 0) & (center < 2 * half)).all():
         raise BadCamera(f"principal point ({center[0]:g}, {center[1]:g}) lies outside of the {width} x {height} image")
-    flip = np.diag([-1.0, -1.0, 1.0])
-    world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = flip @ numbers["R"].T
-    world_to_camera[:3, 3] = flip @ numbers["T"]
+    flip, world_to_camera = np.diag([-1.0, -1.0, 1.0]), np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = flip @ numbers["R"].T, flip @ numbers["T"]
     intrinsics = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
     return Cameras(torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics), (height, width))

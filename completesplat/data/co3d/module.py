@@ -89,25 +89,15 @@ class CO3DDataModule(SceneDataModule):
 
     def packed_settings(self) -> dict[str, Any]:
         """See `SceneDataModule`."""
-        parts = vars(self.filters) | vars(self.framing)
-        seeded = {"val_fraction": self.seeded.val_fraction, "test_fraction": self.seeded.test_fraction}
-        return {
-            "category": self.category,
-            "subset": self.subset,
-            "allow_shared_sequences": self.allow_shared_sequences,
-            **seeded,
-            "split_seed": self.seeded.seed,
-            **parts,
-        }
+        given = ("category", "subset", "allow_shared_sequences")
+        seeded = dict(zip(("val_fraction", "test_fraction", "split_seed"), self.seeded, strict=True))
+        return {name: getattr(self, name) for name in given} | seeded | vars(self.filters) | vars(self.framing)
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
         """All splits: the annotations are read once."""
         which = self.root, self.category, self.subset
-        category = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
-        return {
-            name: CO3DSource(members, self.framing, category.files, category.refused)
-            for name, members in category.splits.items()
-        }
+        splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
+        return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
         """A random reference and random targets."""

@@ -1,6 +1,5 @@
 """Which sequences and frames of a CO3D category belong to which split, and which are left out."""
 
-import dataclasses
 import logging
 import os
 from collections.abc import Iterable, Mapping
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
-from completesplat.data.sequences import SPLITS, split_by_hash
+from completesplat.data.sequences import SPLITS, shortened, split_by_hash
 from completesplat.data.validation import (
     BadAnnotation,
     Refuse,
@@ -23,7 +22,6 @@ from completesplat.data.validation import (
 from completesplat.errors import DataError
 
 FEWEST_SEQUENCES = 3
-NAMED = 5
 
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -48,17 +46,13 @@ def set_list_path(category: Path, subset: str | None) -> Path | None:
     Raises:
         DataError: there is no such set list.
     """
-    folder = category / "set_lists"
     if subset is None:
         return None
+    folder = category / "set_lists"
     there = sorted(path.stem.removeprefix("set_lists_") for path in folder.glob("set_lists_*.json"))
-    if not there:
-        raise DataError("no set lists there; data.subset=null splits the sequences by seed", str(folder))
     if subset not in there:
-        raise DataError(
-            f"no set list {subset!r} there; choose data.subset among {', '.join(there)}, or null for a split by seed",
-            str(folder),
-        )
+        advice = f"choose data.subset among {', '.join([*there, 'null'])}; data.subset=null splits by seed"
+        raise DataError(f"no set list {subset!r} there; {advice}", str(folder))
     return folder / f"set_lists_{subset}.json"
 
 
@@ -77,9 +71,7 @@ def read_set_list(path: Path, refuse: Refuse) -> Listed:
         for member in members:
             with refused_to(refuse), at(path):
                 if type(member) is not list or [type(part) for part in member[:2]] != [str, int]:
-                    raise BadAnnotation(
-                        f"{split} has {str(member)[:80]} where [sequence name, frame number, path] is expected"
-                    )
+                    raise BadAnnotation(f"{split} has {str(member)[:80]}, [sequence name, number, path] is expected")
                 splits[split].add((member[0], member[1]))
     return splits
 
@@ -91,8 +83,7 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
     `fewview_dev` (`data_preprocessing/preprocess_co3d.py`). Validation loses what is in training too. Where it then
     has nothing, a seeded share of the training sequences is its.
 
-    Returns:
-        The lists, and the names that validation lost.
+    Returns the lists, and the names that validation lost.
 
     Raises:
         SharedSequences: some sequences are trained on and tested.
@@ -100,10 +91,9 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
     names = {split: {name for name, _ in listed[split]} for split in SPLITS}
     shared = sorted(names["train"] & names["test"])
     if shared:
-        said = f"{len(shared)} sequences are trained on and tested: {', '.join(shared[:NAMED])}"
-        more = " and others" if len(shared) > NAMED else ""
+        said = f"{len(shared)} sequences are trained on and tested: {shortened(shared)}"
         advice = "choose another data.subset, or set data.allow_shared_sequences=true"
-        raise SharedSequences(f"{said}{more}; {advice}", str(path))
+        raise SharedSequences(f"{said}; {advice}", str(path))
     lost = names["train"] & names["val"]
     train, val = listed["train"], {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
@@ -129,9 +119,8 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Lis
     # The rest's hashes lie above the test fraction, so the next share of them is validation's.
     train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.seed)
     if not train:
-        raise DataError(
-            f"no training sequences with val_fraction={rule.val_fraction}, test_fraction={rule.test_fraction}"
-        )
+        fractions = f"val_fraction={rule.val_fraction}, test_fraction={rule.test_fraction}"
+        raise DataError(f"no training sequences with {fractions}")
     names = {"train": train, "val": val, "test": test}
     return {split: {(name, number) for name in names[split] for number in frames[name]} for split in SPLITS}
 
@@ -155,20 +144,18 @@ class Filters:
 
 @dataclass(frozen=True)
 class SplitMembers:
-    """What one split is made of, by sequence.
+    """What one split is made of, by sequence, and what is left out of it, by reason.
 
     Attributes:
         listed: how many sequences the split has by its list, usable or not.
-        frames: those of the split, in order.
         captured: all frames of the same sequences, also those of other splits: they tell which way is up.
-        left_out: names of sequences, by reason.
     """
 
-    listed: int = 0
-    frames: dict[str, list[CO3DFrame]] = dataclasses.field(default_factory=dict)
-    captured: dict[str, list[CO3DFrame]] = dataclasses.field(default_factory=dict)
-    point_clouds: dict[str, Path | None] = dataclasses.field(default_factory=dict)
-    left_out: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    listed: int
+    frames: dict[str, list[CO3DFrame]]
+    captured: dict[str, list[CO3DFrame]]
+    point_clouds: dict[str, Path | None]
+    left_out: dict[str, list[str]]
 
 
 class Category(NamedTuple):
@@ -184,11 +171,7 @@ def read_category(
 ) -> Category:
     """The sequences of a category, their frames divided as the set list `subset` says, or else by seed.
 
-    Frames that the set list does not name are not looked at.
-
-    Args:
-        allow_shared: take the set list as it is, also where a sequence is in several of its parts; else see
-            `kept_apart`.
+    Frames that the set list does not name are not looked at. `allow_shared` takes the list without `kept_apart`.
 
     Raises:
         DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
@@ -212,12 +195,10 @@ def read_category(
             refuse(BadAnnotation("the sequence is not annotated", str(videos_file), name))
             places.add((name, None))
         del frames[name]
-    if listed is None:
-        listed = split_by_seed(frames, seeded)
-    else:
-        for name, number in sorted(wanted or ()):
-            if number not in frames.get(name, ()) and not {(name, None), (name, number)} & places:
-                refuse(BadAnnotation("the frame is listed, but not annotated", str(set_list), name, number))
+    for name, number in sorted(wanted or ()):
+        if number not in frames.get(name, ()) and not {(name, None), (name, number)} & places:
+            refuse(BadAnnotation("the frame is listed, but not annotated", str(set_list), name, number))
+    listed = split_by_seed(frames, seeded) if listed is None else listed
     splits = {split: _members(split, listed[split], frames, videos, filters) for split in SPLITS}
     if lost:
         splits["val"].left_out["in training too"] = lost
@@ -232,25 +213,23 @@ def _members(
     videos: dict[str, CO3DVideo],
     filters: Filters,
 ) -> SplitMembers:
-    members = SplitMembers(listed=len({name for name, _ in listed}))
+    found: dict[str, list[CO3DFrame]] = {}
     for name, number in sorted(listed):
         if number in frames.get(name, ()):
-            members.frames.setdefault(name, []).append(frames[name][number])
-    for name in list(members.frames):
-        reason = _reason_to_leave_out(len(members.frames[name]), videos[name], filters)
-        if reason:
-            members.left_out.setdefault(reason, []).append(name)
-            del members.frames[name]
+            found.setdefault(name, []).append(frames[name][number])
+    out = {n: why for n in found if (why := _reason_to_leave_out(len(found[n]), videos[n], filters))}
     most = filters.most_training_sequences
     if split == "train" and most is not None:
-        best = sorted(members.frames, key=lambda name: -(videos[name].viewpoint_quality or 0.0))
-        for name in best[most:]:
-            members.left_out.setdefault(f"not among the {most} with the best viewpoint quality", []).append(name)
-            del members.frames[name]
-    for name in members.frames:
-        members.captured[name] = list(frames[name].values())
-        members.point_clouds[name] = videos[name].point_cloud
-    return members
+        best = sorted(found.keys() - out.keys(), key=lambda name: (-(videos[name].viewpoint_quality or 0.0), name))
+        out |= dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality")
+    kept = [name for name in found if name not in out]
+    return SplitMembers(
+        listed=len({name for name, _ in listed}),
+        frames={name: found[name] for name in kept},
+        captured={name: list(frames[name].values()) for name in kept},
+        point_clouds={name: videos[name].point_cloud for name in kept},
+        left_out={why: [name for name in out if out[name] == why] for why in dict.fromkeys(out.values())},
+    )
 
 
 def _reason_to_leave_out(frames: int, video: CO3DVideo, filters: Filters) -> str | None:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
-from plyfile import PlyData
 from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
@@ -18,16 +17,9 @@ from completesplat.data.co3d.selection import SplitMembers
 from completesplat.data.pictures.crop import Square, principal_square, read_square
 from completesplat.data.pictures.files import decode, read_depth
 from completesplat.data.sequences import Picture, PosedSequence
-from completesplat.data.validation import BadCamera, BadPlacement, UnreadableFile, at, require_file
+from completesplat.data.validation import BadCamera, BadPlacement, at, read_vertices
 from completesplat.errors import DataError
-from completesplat.geometry.cameras import (
-    Cameras,
-    crop_resize,
-    invert_rigid,
-    pixel_centers,
-    transform_points,
-    unproject,
-)
+from completesplat.geometry.cameras import crop_resize, invert_rigid, pixel_centers, transform_points, unproject
 from completesplat.tensors import stack
 
 DEPTH_MAPS = 8
@@ -43,32 +35,28 @@ SMALLEST_NEAR = 0.1
 SMALLEST_BASELINE = 0.01
 
 
+Axes = Float[np.ndarray, "3 3"]
+
+
 def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> Float[Tensor, "1 size size"]:
     """Depth along the optical axis at the centre of each pixel of the square picture; 0 where it is unknown.
 
     The nearest pixel of the map counts: a mean across an edge would be the depth of nothing. The map may have another
-    size than the picture that it belongs to.
-
-    Args:
-        factor: from the sequence's units to the common scale.
+    size than the picture that it belongs to. `factor` leads from the sequence's units to the common scale.
 
     Raises:
-        DataError: the frame has no depth map, or it cannot be read.
+        DataError: the depth map cannot be read.
     """
     if frame.depth is None:
         return torch.zeros(1, size, size)
     with at(frame=frame.number):
         depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
     places = []
-    ends = zip(depth.shape, frame.camera.image_size, (square.top, square.left), strict=True)
-    for count, side, start in ends:
+    for count, side, start in zip(depth.shape, frame.camera.image_size, (square.top, square.left), strict=True):
         centers = start + (torch.arange(size, dtype=torch.float64) + 0.5) * square.side / size
         places.append((centers * count / side).long().clamp(0, count - 1))
     rows, columns = places
     return factor * depth[rows[:, None], columns][None]
-
-
-Axes = Float[np.ndarray, "3 3"]
 
 
 class Placement(NamedTuple):
@@ -79,11 +67,9 @@ class Placement(NamedTuple):
 
 
 def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], captured: Sequence[CO3DFrame]) -> Placement:
-    """From the point cloud; without one from the depth maps; without those from the cameras alone.
+    """From the point cloud; without one from the frames' depth maps; without those from their cameras alone.
 
-    Args:
-        frames: whose depth maps and cameras count.
-        captured: all frames of the sequence, which tell the axes.
+    All frames of the sequence, `captured`, tell the axes.
 
     Raises:
         DataError: what would tell is unreadable, empty, without extent or not finite.
@@ -117,12 +103,7 @@ def from_point_cloud(path: Path, axes: Axes) -> Placement:
         UnreadableFile: no PLY.
         BadPlacement: no points, points in one place, or points that are not finite.
     """
-    require_file(path)
-    try:
-        vertices = PlyData.read(str(path))["vertex"]
-        points = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
-    except Exception as error:  # The parser raises nearly anything on a damaged file.
-        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
+    _, points = read_vertices(path)
     with at(path):
         return _placement(points, axes, 1.0, "the point cloud")
 
@@ -137,9 +118,8 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
         DataError: a depth map or a mask is missing or unreadable.
         BadPlacement: no foreground with a known depth.
     """
-    chosen = [frames[i * len(frames) // DEPTH_MAPS] for i in range(DEPTH_MAPS)] if len(frames) > DEPTH_MAPS else frames
-    points = []
-    for frame in chosen:
+    count, points = min(len(frames), DEPTH_MAPS), []
+    for frame in (frames[i * len(frames) // count] for i in range(count)):
         with at(frame=frame.number):
             points.append(_foreground(frame))
     return _placement(np.concatenate(points), axes, DEPTH_QUANTILE, "the depth maps' foreground")
@@ -159,17 +139,12 @@ def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
         raise BadPlacement("no point cloud, no depth maps, and optical axes that do not meet")
     center = torch.linalg.solve(across.sum(dim=0), (across @ eyes[:, :, None]).sum(dim=0)).squeeze(-1)
     depths = transform_points(world_to_camera, center[None])[:, 0, 2]
-    half_size = (depths * torch.tensor([_half_extent(frame) for frame in frames], dtype=depths.dtype)).median().item()
+    # Half the side of each frame's square, at depth 1.
+    extents = [0.5 * _square(frame).side / frame.camera.intrinsics.diagonal()[:2].max().item() for frame in frames]
+    half_size = (depths * torch.tensor(extents, dtype=depths.dtype)).median().item()
     if not (half_size > 0 and np.isfinite(half_size)):
         raise BadPlacement("no point cloud, no depth maps, and optical axes that meet behind the cameras")
     return Placement(center, half_size)
-
-
-def _half_extent(frame: CO3DFrame) -> float:
-    """Half the side of the largest square around the principal point, at depth 1."""
-    (x, y), focal = frame.camera.intrinsics[:2, 2].tolist(), frame.camera.intrinsics.diagonal()[:2].max().item()
-    side = principal_square((x, y), frame.camera.image_size).side
-    return 0.5 * side / focal
 
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
@@ -200,12 +175,7 @@ def _placement(points: np.ndarray, axes: Axes, quantile: float, what: str) -> Pl
 
 @dataclass(frozen=True)
 class ObjectFraming:
-    """How pictures and cameras are made from files.
-
-    Attributes:
-        image_size: side of the square pictures.
-        depth_before, depth_after: the depth range reaches this far in front of and behind the object's centre.
-    """
+    """How pictures and cameras are made from files; see `CO3DDataModule`."""
 
     image_size: int
     depth_before: float
@@ -223,9 +193,7 @@ class CO3DSource:
         self.listed = members.listed
         self.refused = refused
         self.framing = framing
-        self._frames = members.frames
-        self._captured = members.captured
-        self._point_clouds = members.point_clouds
+        self._members = members
         self._files = files
         self._sequences: dict[str, PosedSequence] = {}
 
@@ -235,50 +203,36 @@ class CO3DSource:
 
     def fingerprint(self) -> str:
         """SHA-256 of the annotations; pictures are not looked at."""
-        digest = hashlib.sha256()
-        for file in self._files:
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
-        return digest.hexdigest()
+        return hashlib.sha256(b"".join(hashlib.sha256(f.read_bytes()).digest() for f in self._files)).hexdigest()
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence; its cameras are made on first use.
-
-        Raises:
-            DataError: nothing shows where the object is, or the cameras do not move.
-        """
+        """One sequence; its cameras are made on first use."""
         if name not in self._sequences:
             with at(sequence=name):
                 self._sequences[name] = self._make(name)
         return self._sequences[name]
 
     def _make(self, name: str) -> PosedSequence:
-        frames, size = self._frames[name], self.framing.image_size
-        placement = object_placement(self._point_clouds[name], frames, self._captured[name])
+        members, size = self._members, self.framing.image_size
+        frames = members.frames[name]
+        placement = object_placement(members.point_clouds[name], frames, members.captured[name])
         factor = OBJECT_HALF_SIZE / placement.half_size
-        cameras = stack([_cropped(frame, size) for frame in frames])
+        cameras = stack([crop_resize(frame.camera, *_square(frame), size) for frame in frames])
         cameras = cameras.scale_world(torch.tensor(factor, dtype=torch.float64))
         depths = transform_points(cameras.world_to_camera, factor * placement.center[None])[..., 0, 2]
         baseline = (cameras.centers - cameras.centers[0]).norm(dim=-1).max()
         if not baseline > SMALLEST_BASELINE * depths.abs().mean():
             raise BadCamera("the cameras do not move", str(self._files[0]))
+        near = (depths - self.framing.depth_before).clamp(min=SMALLEST_NEAR)
+        # An object behind the camera (a broken pose) still gets a range of positive length.
         return PosedSequence(
             name,
             tuple(frame.number for frame in frames),
             cameras,
-            self._depth_ranges(depths).to(torch.float32),
+            torch.stack([near, torch.maximum(depths, near) + self.framing.depth_after], dim=-1).to(torch.float32),
             partial(_read, name, frames, size),
             partial(_read_depth, name, frames, size, factor) if any(frame.depth for frame in frames) else None,
         )
-
-    def _depth_ranges(self, depths: Float[Tensor, " view"]) -> Float[Tensor, "view 2"]:
-        near = (depths - self.framing.depth_before).clamp(min=SMALLEST_NEAR)
-        # An object behind the camera (a broken pose) still gets a range of positive length.
-        return torch.stack([near, torch.maximum(depths, near) + self.framing.depth_after], dim=-1)
-
-
-def _cropped(frame: CO3DFrame, size: int) -> Cameras:
-    square = _square(frame)
-    return crop_resize(frame.camera, square.left, square.top, square.side, size)
 
 
 def _square(frame: CO3DFrame) -> Square:

@@ -14,12 +14,14 @@ from completesplat.data.pictures.exif import ORIENTATION, read_exif
 from completesplat.data.pictures.files import (
     EIGHT_BIT_MODES,
     FORMATS,
-    MOST_PIXELS,
-    check_pixels,
-    damage_refused,
+    check_annotated_size,
+    check_sums,
     decode,
+    opened,
+    over_white,
+    refused_as_bad,
 )
-from completesplat.data.validation import BadAnnotation, BadCamera, BadPicture, TooFewFrames, at, require_file
+from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, require_file
 from completesplat.errors import ImageError
 
 FEWEST_FRAMES = 6
@@ -28,34 +30,17 @@ PNG_BIT_DEPTH = 24  # byte of the file
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels with OpenCV's distortion; (0, 0) is the corner of the top left pixel, its centre (0.5, 0.5).
+    """Intrinsics in pixels with OpenCV's distortion; the top left pixel has its corner at (0, 0)."""
 
-    Attributes:
-        focal: along x and y.
-        center: the principal point (x, y).
-        image_size: (height, width).
-        distortion: k1, k2, p1, p2, k3 (OpenCV's order).
-    """
-
-    focal: tuple[float, float]
-    center: tuple[float, float]
-    image_size: tuple[int, int]
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The intrinsics as a matrix, without the distortion."""
-        (fx, fy), (cx, cy) = self.focal, self.center
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    focal: tuple[float, float]  # along x and y
+    center: tuple[float, float]  # the principal point (x, y)
+    image_size: tuple[int, int]  # (height, width)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
 
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One picture of a capture, with OpenCV's pose (+x right, +y down, +z forward).
-
-    Attributes:
-        number: what the capture's own file calls it; for refusals.
-    """
+    """One picture of a capture, with its number in the capture's own file and OpenCV's pose."""
 
     number: int
     image: Path
@@ -74,12 +59,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Capture:
-    """The frames of one capture, in the order of their file names (numbers in them by value).
-
-    Attributes:
-        name: of the folder it lies in.
-        file: where its cameras come from; for refusals.
-    """
+    """The frames of one capture, in the order of their file names; its folder's name, and the file of its cameras."""
 
     name: str
     file: Path
@@ -129,9 +109,8 @@ def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
     """
     if not len(points):
         return None
-    with at(file):
-        if not np.isfinite(points).all():
-            raise BadAnnotation("points that are not finite")
+    if not np.isfinite(points).all():
+        raise BadAnnotation("points that are not finite", str(file))
     return PointCloud(np.asarray(points, dtype=np.float64), np.asarray(colors, dtype=np.uint8))
 
 
@@ -141,11 +120,9 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 class CapturedPicture(NamedTuple):
-    """A decoded picture.
+    """A decoded picture in RGB, transparency laid over white, and its opacity (grey), if it has transparency data.
 
     Attributes:
-        image: RGB; transparency is laid over white.
-        alpha: its opacity (grey), if it has transparency data.
         lossy: it was a JPEG.
         plain: the file is a JPEG or PNG of just these 8-bit RGB pixels.
     """
@@ -165,55 +142,22 @@ def read_picture(path: Path, image_size: tuple[int, int]) -> CapturedPicture:
             estimate poses look at the pixels as they are stored, so that pose and upright picture do not agree.
     """
     require_file(path)
-    try:
-        with damage_refused(FORMATS, MOST_PIXELS), Image.open(path, formats=FORMATS) as picture:
-            check_pixels(picture, MOST_PIXELS)
-            orientations = {read_exif(picture).get(ORIENTATION)}  # A TIFF loses its own when it is decoded.
-            if picture.format == "PNG":
-                _check_sums(path)
-            picture.load()
-            orientations.add(read_exif(picture).get(ORIENTATION))
-            if turned := orientations - {None, 0, 1}:
-                raise ImageError(
-                    f"is to be turned (EXIF orientation {turned.pop()}), its camera's pose is not: save the pixels "
-                    "as the pose sees them, without that tag"
-                )
-            lossy, plain = picture.format in ("JPEG", "MPO"), _is_plain(path, picture)
-            if picture.has_transparency_data and picture.mode in EIGHT_BIT_MODES:
-                _check_size(picture.size, image_size)
-                return CapturedPicture(*_over_white(picture.convert("RGBA")), lossy, plain=False)
-    except ImageError as error:
-        raise BadPicture(str(error), str(path)) from error.__cause__
+    with refused_as_bad(str(path)), opened(path, FORMATS) as picture:
+        orientations = {read_exif(picture).get(ORIENTATION)}  # A TIFF loses its own when it is decoded.
+        check_sums(picture, path)
+        picture.load()
+        orientations.add(read_exif(picture).get(ORIENTATION))
+        if turned := orientations - {None, 0, 1}:
+            raise ImageError(
+                f"is to be turned (EXIF orientation {turned.pop()}), its camera's pose is not: save the pixels "
+                "as the pose sees them, without that tag"
+            )
+        lossy, plain = picture.format in ("JPEG", "MPO"), _is_plain(path, picture)
+        if picture.has_transparency_data and picture.mode in EIGHT_BIT_MODES:
+            check_annotated_size(picture, image_size)
+            alpha = picture.convert("RGBA").getchannel("A")
+            return CapturedPicture(over_white(picture), alpha, lossy, plain=False)
     return CapturedPicture(decode(path, str(path), "RGB", image_size), None, lossy, plain)
-
-
-def picture_size(path: Path) -> tuple[int, int]:
-    """(height, width) of a picture file, by its header.
-
-    Raises:
-        MissingFile: no such file.
-        BadPicture: no picture.
-    """
-    try:
-        with damage_refused(FORMATS, MOST_PIXELS), Image.open(require_file(path), formats=FORMATS) as picture:
-            return picture.height, picture.width
-    except ImageError as error:
-        raise BadPicture(str(error), str(path)) from error.__cause__
-
-
-def _over_white(picture: Image.Image) -> tuple[Image.Image, Image.Image]:
-    white = Image.new("RGBA", picture.size, "white")
-    return Image.alpha_composite(white, picture).convert("RGB"), picture.getchannel("A")
-
-
-def _check_sums(path: Path) -> None:
-    with Image.open(path, formats=FORMATS) as again:
-        again.verify()
-
-
-def _check_size(size: tuple[int, int], image_size: tuple[int, int]) -> None:
-    if size != image_size[::-1]:
-        raise ImageError(f"has {size[1]} x {size[0]} pixels, its annotation says {image_size[0]} x {image_size[1]}")
 
 
 def _is_plain(path: Path, picture: Image.Image) -> bool:

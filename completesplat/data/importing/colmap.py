@@ -2,7 +2,6 @@
 
 import struct
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,10 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
         CompleteSplatError: pycolmap is not installed.
         DataError: whatever is missing, damaged or impossible, with the file and COLMAP's number of the picture.
     """
-    pycolmap = _require_pycolmap()
+    try:
+        import pycolmap
+    except ImportError:
+        raise CompleteSplatError("COLMAP models need pycolmap: pip install completesplat[colmap]") from None
     for folder in (model, images, masks):
         if folder is not None and not folder.is_dir():
             raise MissingFile("no such folder", str(folder))
@@ -50,14 +52,6 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     return Capture(images.resolve().parent.name, model, ordered, make_cloud(positions, colors, model))
 
 
-def _require_pycolmap() -> ModuleType:
-    try:
-        import pycolmap
-    except ImportError:
-        raise CompleteSplatError("COLMAP models need pycolmap: pip install completesplat[colmap]") from None
-    return pycolmap
-
-
 def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | None) -> CapturedFrame:
     image = reconstruction.images[number]
     path = require_file(inside(images, image.name))
@@ -68,11 +62,10 @@ def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | No
 
 
 def _find_mask(masks: Path, name: str) -> Path:
-    candidates = [inside(masks, f"{name}.png"), inside(masks, str(Path(name).with_suffix(".png")))]
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise MissingFile(f"no such file, nor {candidates[1].name}", str(candidates[0]))
+    appended, replaced = (inside(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
+    if not (appended.is_file() or replaced.is_file()):
+        raise MissingFile(f"no such file, nor {replaced.name}", str(appended))
+    return appended if appended.is_file() else replaced
 
 
 def _lens_of(camera: Any) -> Lens:
@@ -116,10 +109,8 @@ def _after_camera(content: bytes, offset: int) -> int:
 
 def _after_image(content: bytes, offset: int) -> int:
     end_of_name = content.index(b"\0", offset + 64)  # after id, pose and camera
-    (points,) = struct.unpack_from("<Q", content, end_of_name + 1)
-    return end_of_name + 9 + 24 * points
+    return end_of_name + 9 + 24 * int(struct.unpack_from("<Q", content, end_of_name + 1)[0])
 
 
 def _after_point(content: bytes, offset: int) -> int:
-    (track,) = struct.unpack_from("<Q", content, offset + 43)  # after id, place, colour and error
-    return offset + 51 + 8 * track
+    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, place, colour, error

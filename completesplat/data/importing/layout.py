@@ -23,10 +23,8 @@ from completesplat.data.validation import BadCamera, at
 from completesplat.geometry.cameras import pixel_centers
 
 ROWS_AT_ONCE = 64
-# A lens whose picture keeps less than this share of its area is not what its coefficients say.
-SMALLEST_SHARE = 0.5
+SMALLEST_SHARE = 0.5  # A lens whose picture keeps less of its area is not what its coefficients say.
 
-Box = tuple[int, int, int, int]
 SUBSET = "imported"
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
 TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
@@ -40,8 +38,7 @@ class Undistortion:
     """Resamples the pictures of one lens.
 
     Focal lengths stay as they are. Pixels that the source does not show, and those where the model folds the picture
-    over, are cut off at the borders, so that every pixel that is left is one that was seen. The principal point is the
-    same on the scene, and moves in pixels by what is cut off on the left and at the top.
+    over, are cut off at the borders, which moves the principal point in pixels.
 
     Attributes:
         pinhole: the lens of the results.
@@ -58,9 +55,8 @@ class Undistortion:
         size = bottom - top, right - left
         inside = 0 < center[0] < size[1] and 0 < center[1] < size[0]
         if not inside or size[0] * size[1] < SMALLEST_SHARE * height * width:
-            raise BadCamera(
-                f"distortion {lens.distortion} leaves {size[1]} x {size[0]} of {width} x {height} pixels usable"
-            )
+            kept = f"{size[1]} x {size[0]} of {width} x {height} pixels"
+            raise BadCamera(f"distortion {lens.distortion} leaves {kept} usable")
         self.pinhole = replace(lens, center=center, image_size=size, distortion=(0.0,) * 5)
         # Where `grid_sample` finds the picture's borders: at -1 and 1.
         scale = torch.tensor([2 / width, 2 / height], dtype=positions.dtype)
@@ -78,9 +74,10 @@ class Undistortion:
 
 def _source_positions(lens: Lens) -> Float[Tensor, "height width 2"]:
     """Where the distorted picture shows what the pinhole sees in each of its pixel centres."""
-    matrix = torch.from_numpy(lens.matrix)
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     distortion = torch.tensor(lens.distortion, dtype=torch.float64)
-    rows = pixel_centers(*lens.image_size, dtype=torch.float64).split(ROWS_AT_ONCE)
+    rows = torch.split(pixel_centers(*lens.image_size, dtype=torch.float64), ROWS_AT_ONCE)
     return torch.cat([distort_points(part.flatten(0, 1), matrix, distortion).view_as(part).float() for part in rows])
 
 
@@ -96,29 +93,24 @@ def _seen(positions: Float[Tensor, "height width 2"], image_size: tuple[int, int
     return seen.numpy()
 
 
-def _largest_box(seen: Bool[np.ndarray, "height width"]) -> Box:
+def _largest_box(seen: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
     """A large (left, top, right, bottom) of seen pixels only: sides are cut, worst first, until there are no others."""
-    height, width = seen.shape
-    sums = np.zeros((height + 1, width + 1), dtype=np.int64)
-    sums[1:, 1:] = (~seen).cumsum(axis=0).cumsum(axis=1)
+    sums = np.pad((~seen).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
-    def unseen(box: Box) -> int:
-        left, top, right, bottom = box
-        return int(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+    def unseen(left: int, top: int, right: int, bottom: int) -> float:
+        """The share of pixels in a box that are not seen."""
+        count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+        return float(count / ((right - left) * (bottom - top)))
 
-    def share(box: Box) -> float:
-        left, top, right, bottom = box
-        return unseen(box) / ((right - left) * (bottom - top))
-
-    left, top, right, bottom = 0, 0, width, height
-    while unseen((left, top, right, bottom)) and right - left > 1 and bottom - top > 1:
+    left, top, (bottom, right) = 0, 0, seen.shape
+    while unseen(left, top, right, bottom) and right - left > 1 and bottom - top > 1:
         strips = [
-            (left, top, left + 1, bottom),
-            (left, top, right, top + 1),
-            (right - 1, top, right, bottom),
-            (left, bottom - 1, right, bottom),
+            unseen(left, top, left + 1, bottom),
+            unseen(left, top, right, top + 1),
+            unseen(right - 1, top, right, bottom),
+            unseen(left, bottom - 1, right, bottom),
         ]
-        worst = max(range(4), key=lambda side: share(strips[side]))
+        worst = strips.index(max(strips))
         left, top = left + (worst == 0), top + (worst == 1)
         right, bottom = right - (worst == 2), bottom - (worst == 3)
     return left, top, right, bottom
@@ -139,15 +131,11 @@ class CaptureWriter:
     Args:
         folder: the category's, for now; it exists and is empty.
         category: its final name, with which the paths in annotations start.
-        sequence: name of the only sequence.
         quality: of JPEG files that are written anew.
     """
 
     def __init__(self, folder: Path, category: str, sequence: str, quality: int) -> None:
-        self.folder = folder
-        self.category = category
-        self.sequence = sequence
-        self.quality = quality
+        self.folder, self.category, self.sequence, self.quality = folder, category, sequence, quality
         self._undistortions: dict[Lens, Undistortion] = {}
         self._copied = 0
 
@@ -180,7 +168,10 @@ class CaptureWriter:
             mask = decode(frame.mask, str(frame.mask), "L", size)
         mask = mask or Image.new("L", image.size, 255)
         if any(lens.distortion):
-            undistort = self._undistortion(lens)
+            # Captures have one lens, or one for each frame: keeping more than the last would fill the memory.
+            if lens not in self._undistortions:
+                self._undistortions = {lens: Undistortion(lens)}
+            undistort = self._undistortions[lens]
             image, mask, lens = undistort(image), undistort(mask), undistort.pinhole
         stem = f"frame{number + 1:06d}"
         path = f"{self.sequence}/images/{stem}{'.jpg' if picture.lossy else '.png'}"
@@ -197,30 +188,17 @@ class CaptureWriter:
             "frame_number": number,
             "frame_timestamp": float(number),
             "image": {"path": f"{self.category}/{path}", "size": list(lens.image_size)},
-            "mask": {
-                "path": f"{self.category}/{mask_path}",
-                "mass": float(np.asarray(mask, dtype=np.float64).sum() / 255),
-            },
+            "mask": {"path": f"{self.category}/{mask_path}", "mass": float(np.asarray(mask, dtype=float).sum() / 255)},
             "depth": None,
             "viewpoint": viewpoint(lens, frame.world_to_camera),
             "meta": {"frame_type": "test_unseen" if held_out else "train_known", "imported_from": frame.image.name},
         }
 
-    def _undistortion(self, lens: Lens) -> Undistortion:
-        if lens not in self._undistortions:
-            # Captures have one lens, or one for each frame: keeping more than the last would fill the memory.
-            self._undistortions = {lens: Undistortion(lens)}
-        return self._undistortions[lens]
-
     def _write_cloud(self, cloud: PointCloud) -> int:
         distance = np.linalg.norm(cloud.points - np.median(cloud.points, axis=0), axis=-1)
         kept = distance <= FARTHEST * np.median(distance)
         types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-        vertices = np.empty(int(kept.sum()), dtype=types)
-        for axis, column in zip("xyz", cloud.points[kept].T, strict=True):
-            vertices[axis] = column
-        for channel, column in zip(("red", "green", "blue"), cloud.colors[kept].T, strict=True):
-            vertices[channel] = column
+        vertices = np.rec.fromarrays([*cloud.points[kept].T, *cloud.colors[kept].T], dtype=types)
         path = self.folder / self.sequence / "pointcloud.ply"
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
         return len(vertices)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from plyfile import PlyData
 
 from completesplat.data.importing.capture import (
     Capture,
@@ -20,38 +19,32 @@ from completesplat.data.importing.capture import (
     check_lens,
     in_order,
     make_cloud,
-    picture_size,
 )
+from completesplat.data.pictures.files import picture_size
+from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
     MissingFile,
-    UnreadableFile,
     at,
     field,
     finite_array,
     inside,
     read_json,
+    read_vertices,
     require_file,
     require_rotation,
 )
-from completesplat.errors import DataError
 
 logger = logging.getLogger(__name__)
 
 # Which coefficients a model has, of OpenCV's; `k4` means other things in other programs.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-USED = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": COEFFICIENTS,
-}
+RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
+USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 SCALE_TOLERANCE = 1e-3
-MOST_NAMED = 5
 
 
 def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
@@ -64,11 +57,8 @@ def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
     `process_data/colmap_utils.py`). `mask_path` is the foreground. `ply_file_path` is in the world of the poses
     (`create_ply_from_colmap`, ibid.). Paths are relative to the file's folder and stay in it.
 
-    Frames without a picture are left out, as instant-ngp leaves them out where frames have a `sharpness`
-    (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 pictures.
-
-    Args:
-        most_missing: largest share of the frames that may have no picture.
+    Frames without a picture are left out (up to the share `most_missing`), as instant-ngp leaves them out where frames
+    have a `sharpness` (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 pictures.
 
     Raises:
         DataError: whatever is missing, malformed or impossible, with the file and the number of the frame in it.
@@ -95,14 +85,13 @@ def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> d
             name = field(entry, "file_path", str)
             candidates = [inside(path.parent, name + suffix) for suffix in SUFFIXES]
         # `Path.is_file` raises where a name is too long.
-        picture = next((candidate for candidate in candidates if isfile(candidate)), None)
-        if picture is None:
-            missing.append(name)
+        if there := [candidate for candidate in candidates if isfile(candidate)]:
+            found[number] = there[0]
         else:
-            found[number] = picture
+            missing.append(name)
     if missing:
         counted = f"{len(missing)} of {len(entries)} frames have no picture"
-        named = ", ".join(missing[:MOST_NAMED]) + (", ..." if len(missing) > MOST_NAMED else "")
+        named = shortened(missing)
         if len(missing) > most_missing * len(entries):
             raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
         logger.warning("%s: %s and are left out: %s", path, counted, named)
@@ -126,8 +115,7 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     require_rotation(pose[:3, :3], "the rotation of transform_matrix")
     pose[:3, 1:3] *= -1
     world_to_camera = np.eye(4)
-    world_to_camera[:3, :3] = pose[:3, :3].T
-    world_to_camera[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
     return world_to_camera
 
 
@@ -137,7 +125,7 @@ def _read_lens(values: dict[str, Any], image: Path) -> Lens:
     if model not in USED or others:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
     number = partial(_number, values)
-    stored = None if {"w", "h"} <= values.keys() else picture_size(image)
+    stored = None if {"w", "h"} <= values.keys() else picture_size(image, str(image))
     height, width = stored or (_whole(values, "h"), _whole(values, "w"))
     if "fl_x" in values:
         fx = number("fl_x")
@@ -174,14 +162,8 @@ def _focal(angle: float, side: int) -> float:
 
 
 def _read_cloud(path: Path) -> PointCloud | None:
-    try:
-        vertices = PlyData.read(str(require_file(path)))["vertex"]
-        points = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
-        names = [name for name in ("red", "green", "blue") if name in vertices.data.dtype.names]
-        colors = [np.asarray(vertices[name]) for name in names]
-    except DataError:
-        raise
-    except Exception as error:  # The parser raises nearly anything on a damaged file.
-        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
+    vertices, points = read_vertices(path)
+    names = [name for name in ("red", "green", "blue") if name in vertices.data.dtype.names]
+    colors = [np.asarray(vertices[name]) for name in names]
     usable = len(colors) == 3 and all(color.dtype == np.uint8 for color in colors)
     return make_cloud(points, np.stack(colors, axis=-1) if usable else np.full(points.shape, 128), path)

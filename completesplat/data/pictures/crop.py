@@ -39,16 +39,7 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
 def read_square(
     path: Path, image_size: tuple[int, int], square: Square, size: int, mode: Literal["RGB", "L"]
 ) -> UInt8[Tensor, "channel size size"]:
-    """A square part of an image file, resized to `size`.
-
-    Args:
-        image_size: (height, width) that the upright picture must have.
-        mode: "RGB" (resized with Lanczos' filter) or "L" (bilinearly, for masks).
-
-    Raises:
-        MissingFile: no such file.
-        BadPicture: a file that `decode` refuses, as damaged or of another size, for instance.
-    """
+    """A square part of an image file, resized to `size`; see `decode` and `cut_square`."""
     return cut_square(decode(path, str(path), mode, image_size), square, size)
 
 

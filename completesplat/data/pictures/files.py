@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, ImageFile
+from PIL import Image, ImageFile, UnidentifiedImageError
 from torch import Tensor
 
 from completesplat.data.pictures.exif import ORIENTATION, TRANSPOSITIONS, read_exif
@@ -30,12 +30,7 @@ LARGEST_SCALE = 2.0**112  # times the largest float16 it is still a float32
 
 
 def decode(
-    source: Path | bytes,
-    file: str,
-    mode: Literal["RGB", "L"],
-    image_size: tuple[int, int] | None = None,
-    most_pixels: int = MOST_PIXELS,
-    most_bytes: int = MOST_BYTES,
+    source: Path | bytes, file: str, mode: Literal["RGB", "L"], image_size: tuple[int, int] | None = None
 ) -> Image.Image:
     """One picture of a data set, of 8 bits, turned upright as its EXIF orientation says.
 
@@ -49,26 +44,29 @@ def decode(
         source: the file, or its content.
         file: what refusals name.
         image_size: (height, width) that the upright picture must have, if that is known.
-        most_pixels: checked before anything is decoded.
-        most_bytes: checked before a file is read.
 
     Raises:
         MissingFile: no such file.
         BadPicture: too large, damaged, in another format than JPEG, PNG, WebP, TIFF and BMP, of another size than
             annotated, or with pixels that have no plain meaning in this mode.
     """
-    if isinstance(source, Path):
-        require_file(source)
-    try:
-        with damage_refused(FORMATS, most_pixels):
-            picture, exif = _load(_content(source, most_bytes), FORMATS, most_pixels)
-            orientation = exif.get(ORIENTATION)
-            image = upright(picture, orientation)
-            if image_size is not None:
-                _check_annotated_size(image, image_size, orientation)
-            return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
-    except ImageError as error:
-        raise BadPicture(str(error), file) from error.__cause__
+    with _loaded(source, file, FORMATS) as (picture, exif):
+        orientation = exif.get(ORIENTATION)
+        image = upright(picture, orientation)
+        if image_size is not None:
+            check_annotated_size(image, image_size, orientation)
+        return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
+
+
+def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+    """(height, width) of an image file or its content, from its header.
+
+    Raises:
+        MissingFile: no such file.
+        BadPicture: no image in one of these formats, or one of more than 50 million pixels.
+    """
+    with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
+        return image.height, image.width
 
 
 def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
@@ -83,56 +81,69 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
     """
     if not 0 < scale_adjustment < LARGEST_SCALE:
         raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
-    require_file(path)
-    try:
-        with damage_refused(("PNG",), MOST_PIXELS):
-            picture, _ = _load(_content(path, MOST_BYTES), ("PNG",), MOST_PIXELS)
-            if picture.mode not in SIXTEEN_BIT_MODES:
-                raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
-            bits = np.asarray(picture).astype(np.uint16)
-    except ImageError as error:
-        raise BadPicture(str(error), str(path)) from error.__cause__
-    depth = bits.view(np.float16).astype(np.float32)
-    finite = np.isfinite(depth)
-    if not finite.any():
-        raise BadPicture("no finite depth in it", str(path))
-    depth[~finite] = 0
-    if depth.min() < 0:
-        raise BadPicture("negative depths; its bits are no float16", str(path))
-    if 0 < depth.max() < SMALLEST_NORMAL:
-        raise BadPicture("its values are integers, where the bits of float16 are expected", str(path))
+    with _loaded(path, str(path), ("PNG",)) as (picture, _):
+        if picture.mode not in SIXTEEN_BIT_MODES:
+            raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
+        depth = np.asarray(picture).astype(np.uint16).view(np.float16).astype(np.float32)
+        finite = np.isfinite(depth)
+        if not finite.any():
+            raise ImageError("no finite depth in it")
+        depth[~finite] = 0
+        if depth.min() < 0:
+            raise ImageError("negative depths; its bits are no float16")
+        if 0 < depth.max() < SMALLEST_NORMAL:
+            raise ImageError("its values are integers, where the bits of float16 are expected")
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 
 @contextmanager
-def damage_refused(formats: tuple[str, ...], most_pixels: int) -> Iterator[None]:
-    """Whatever Pillow raises on a bad file becomes an `ImageError`; its warnings are silenced."""
+def refused_as_bad(file: str) -> Iterator[None]:
+    """An `ImageError` from within becomes a `BadPicture` that names the file."""
+    try:
+        yield
+    except ImageError as error:
+        raise BadPicture(str(error), file) from error.__cause__
+
+
+@contextmanager
+def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+    """A picture whose header is read and pixels are not; whatever Pillow raises on it becomes an `ImageError`.
+
+    Raises:
+        ImageError: damaged, of another format, or of more than 50 million pixels.
+    """
     # Pillow only warns of images between 89 and 179 million pixels; the limit here is lower and an error.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            yield
+            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats) as picture:
+                width, height = picture.size
+                if width * height > MOST_PIXELS:
+                    raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels")
+                yield picture
         except ImageError:
             raise
-        except Image.UnidentifiedImageError:
+        except UnidentifiedImageError:
             raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
         except Image.DecompressionBombError:
-            raise ImageError(f"more than {most_pixels:,} pixels") from None
+            raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
         # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ImageError(f"cannot be decoded: {reason}") from error
 
 
-def check_pixels(picture: Image.Image, most_pixels: int) -> None:
-    """Refuse a picture of too many pixels, by its header.
+def check_sums(picture: Image.Image, source: str | Path | io.BytesIO) -> None:
+    """Check all checksums of a PNG, from its file; decoding leaves out those of the pixels."""
+    if picture.format == "PNG":
+        with Image.open(source, formats=("PNG",)) as again:
+            again.verify()
 
-    Raises:
-        ImageError: it has more than `most_pixels`.
-    """
-    width, height = picture.size
-    if width * height > most_pixels:
-        raise ImageError(f"{width} x {height} are more than {most_pixels:,} pixels")
+
+def over_white(picture: Image.Image) -> Image.Image:
+    """The picture in RGB, with its transparency laid over white."""
+    white = Image.new("RGBA", picture.size, "white")
+    return Image.alpha_composite(white, picture.convert("RGBA")).convert("RGB")
 
 
 def upright(picture: Image.Image, orientation: object) -> Image.Image:
@@ -144,8 +155,7 @@ def upright(picture: Image.Image, orientation: object) -> Image.Image:
 def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
     """Grey values of more than 8 bits as float32 in [0, 1]. Pillow's own conversion would clip them at 255.
 
-    Args:
-        tiff_tags: of the opened file, as pictures derived from it have none; empty for other formats.
+    The TIFF tags are those of the opened file, as pictures derived from it have none; empty for other formats.
 
     Raises:
         ImageError: values outside the range from black to white.
@@ -165,47 +175,36 @@ def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def _content(source: Path | bytes, most_bytes: int) -> bytes:
-    if isinstance(source, Path):
-        if not source.is_file():
-            raise ImageError("no such file")
-        with source.open("rb") as file:
-            size, content = source.stat().st_size, b""
-            if size <= most_bytes:
-                content = file.read(most_bytes + 1)
-    else:
-        size, content = len(source), source
-    if max(size, len(content)) > most_bytes:
-        raise ImageError(f"more than {most_bytes:,} bytes")
-    if not content:
-        raise ImageError("the file is empty")
-    return content
+@contextmanager
+def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
+    """A picture, decoded completely, and its EXIF record; what is wrong with it becomes a `BadPicture`."""
+    with refused_as_bad(file):
+        if ImageFile.LOAD_TRUNCATED_IMAGES:
+            raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
+        size = require_file(source).stat().st_size if isinstance(source, Path) else len(source)
+        if not 0 < size <= MOST_BYTES:
+            raise ImageError(f"more than {MOST_BYTES:,} bytes" if size else "the file is empty")
+        content = source.read_bytes() if isinstance(source, Path) else source
+        with opened(content, formats) as picture:
+            frames = getattr(picture, "n_frames", 1)
+            if frames > 1 and picture.format != "MPO":
+                raise ImageError(f"has {frames} frames; one picture is expected")
+            picture.load()
+            check_sums(picture, io.BytesIO(content))
+            yield picture, read_exif(picture)
 
 
-def _load(content: bytes, formats: tuple[str, ...], most_pixels: int) -> tuple[Image.Image, dict[int, Any]]:
-    """The picture, decoded completely, and its EXIF record."""
-    if ImageFile.LOAD_TRUNCATED_IMAGES:
-        raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
-    with Image.open(io.BytesIO(content), formats=formats) as picture:
-        check_pixels(picture, most_pixels)
-        frames = getattr(picture, "n_frames", 1)
-        if frames > 1 and picture.format != "MPO":
-            raise ImageError(f"has {frames} frames; one picture is expected")
-        picture.load()
-        exif = read_exif(picture)
-    if picture.format == "PNG":
-        with Image.open(io.BytesIO(content), formats=formats) as again:
-            again.verify()  # All checksums; decoding leaves out those of the pixels.
-    return picture, exif
+def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
+    """Refuse a picture that has not the (height, width) it should have.
 
-
-def _check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object) -> None:
-    if image.size == annotated[::-1]:
-        return
-    actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
-    if orientation in QUARTER_TURNS and image.size == annotated:
-        actual += f": its size before it is turned as its EXIF orientation {orientation} says; save it upright"
-    raise ImageError(actual)
+    Raises:
+        ImageError: another size.
+    """
+    if image.size != annotated[::-1]:
+        actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
+        if orientation in QUARTER_TURNS and image.size == annotated:
+            actual += f": its size before it is turned as its EXIF orientation {orientation} says; save it upright"
+        raise ImageError(actual)
 
 
 def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, Any], mode: Literal["RGB", "L"]) -> Image.Image:

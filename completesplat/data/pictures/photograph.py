@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,11 +16,10 @@ from torch import Tensor
 from completesplat.data.pictures.exif import ORIENTATION, crop_fov, read_exif
 from completesplat.data.pictures.files import (
     EIGHT_BIT_MODES,
-    MOST_PIXELS,
     SIXTEEN_BIT_MODES,
-    check_pixels,
-    damage_refused,
     deep_grey,
+    opened,
+    over_white,
     upright,
 )
 from completesplat.errors import CompleteSplatError, ImageError
@@ -29,7 +28,7 @@ from completesplat.tensors import TensorDataclass
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
-LANCZOS_REACH = 3
+LANCZOS_REACH = 3  # of the filter, in pixels of the coarser picture
 
 
 @dataclass(frozen=True)
@@ -51,10 +50,8 @@ def read_photograph(
 
     Args:
         path: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content.
-        size: side of the result in pixels.
         fov_degrees: field of view of the square crop, if it is known.
-        default_fov_degrees: the same for files without usable EXIF focal length (not stated by the paper; 50 is
-            close to a phone's main camera).
+        default_fov_degrees: the same for files without usable EXIF focal length (50 is close to a phone's main camera).
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
@@ -65,42 +62,27 @@ def read_photograph(
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        picture, exif = _decode(path)
-        square = _central_square(upright(picture, exif.get(ORIENTATION)))
+        if not Path(path).is_file():
+            raise ImageError("no such file")
+        if Path(path).stat().st_size == 0:
+            raise ImageError("the file is empty")
+        with opened(path, FORMATS) as picture:
+            if min(picture.size) < SMALLEST_SIDE:
+                raise ImageError(f"{picture.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
+            picture.load()
+            exif = read_exif(picture)
+        turned = upright(picture, exif.get(ORIENTATION))
+        side = min(turned.size)
+        left, top = (turned.width - side) // 2, (turned.height - side) // 2
+        square = turned.crop((left, top, left + side, top + side))
         image = _to_tensor(square, picture, size)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from error.__cause__
     if fov_degrees is not None:
         return Photograph(image, float(fov_degrees), "given")
-    recorded = crop_fov(exif, picture.size)
-    if recorded is not None:
+    if (recorded := crop_fov(exif, picture.size)) is not None:
         return Photograph(image, recorded, "exif")
     return Photograph(image, float(default_fov_degrees), "default")
-
-
-def _decode(path: str | Path) -> tuple[Image.Image, dict[int, Any]]:
-    """The first frame, decoded completely, and its EXIF record."""
-    if not Path(path).is_file():
-        raise ImageError("no such file")
-    if Path(path).stat().st_size == 0:
-        raise ImageError("the file is empty")
-    with damage_refused(FORMATS, MOST_PIXELS), Image.open(path, formats=FORMATS) as picture:
-        _check_size(picture)
-        picture.load()
-        return picture, read_exif(picture)
-
-
-def _check_size(picture: Image.Image) -> None:
-    check_pixels(picture, MOST_PIXELS)
-    width, height = picture.size
-    if min(width, height) < SMALLEST_SIDE:
-        raise ImageError(f"{width} x {height} pixels; at least {SMALLEST_SIDE} on a side are needed")
-
-
-def _central_square(picture: Image.Image) -> Image.Image:
-    side = min(picture.size)
-    left, top = (picture.width - side) // 2, (picture.height - side) // 2
-    return picture.crop((left, top, left + side, top + side))
 
 
 def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Tensor, "3 size size"]:
@@ -119,8 +101,7 @@ def _to_srgb(square: Image.Image) -> Image.Image:
     """An RGB image, transparency laid over white, converted from its own colour profile where it has one."""
     profile = square.info.get("icc_profile")
     if square.has_transparency_data:
-        white = Image.new("RGBA", square.size, "white")
-        square = Image.alpha_composite(white, square.convert("RGBA")).convert("RGB")
+        square = over_white(square)
     if profile:
         try:
             embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
@@ -131,9 +112,6 @@ def _to_srgb(square: Image.Image) -> Image.Image:
             # A damaged profile, or one of another colour model than the pixels: viewers ignore it as well.
             pass
     return square.convert("RGB")
-
-
-"""Of Lanczos' filter, in pixels of the coarser picture."""
 
 
 def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
@@ -152,8 +130,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
         raise CompleteSplatError(f"box={list(box)}: needs 0 <= x0 < x1 <= 1 and 0 <= y0 < y1 <= 1")
     side = square_side(photograph)
     hidden = np.zeros((side, side), dtype=bool)
-    rows, columns = (slice(math.floor(a * side), math.ceil(b * side)) for a, b in ((upper, lower), (left, right)))
-    hidden[rows, columns] = True
+    hidden[math.floor(upper * side) : math.ceil(lower * side), math.floor(left * side) : math.ceil(right * side)] = True
     return visible(hidden, size)
 
 
@@ -196,4 +173,5 @@ def _touched(hidden: Bool[np.ndarray, "side _"], size: int) -> Bool[np.ndarray, 
     first = np.clip(np.floor(centers - reach), 0, side).astype(int)
     last = np.clip(np.ceil(centers + reach), 0, side).astype(int)
     counts = np.concatenate([np.zeros((1, hidden.shape[1]), dtype=int), hidden.cumsum(axis=0)])
-    return counts[last] > counts[first]
+    touched: np.ndarray = counts[last] > counts[first]
+    return touched

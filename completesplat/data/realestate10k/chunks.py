@@ -17,8 +17,8 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from completesplat.data.pictures.crop import Square, cut_square
-from completesplat.data.pictures.files import decode
-from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, Clip, clip_cameras, picture_size
+from completesplat.data.pictures.files import decode, picture_size
+from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError
 
@@ -34,9 +34,6 @@ class ChunkedClips:
         keys: names of the clips, in the order of their files.
         missing: the clips of chunks that are not there.
         refused: entries of the index that lead elsewhere.
-
-    Raises:
-        DataError: the index is missing or no table.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,11 +61,7 @@ class ChunkedClips:
         return list(members.values())
 
     def clip(self, key: str) -> Clip:
-        """A clip, from the chunk in memory or on disk.
-
-        Raises:
-            DataError: the chunk cannot be read, does not hold the clip, or holds a malformed one.
-        """
+        """A clip, from the chunk in memory or on disk; `DataError` where that is unreadable or the clip malformed."""
         path = self._files[key]
         with at(path, key):
             chunk = self._chunk(path)
@@ -83,14 +76,11 @@ class ChunkedClips:
         return hashlib.sha256(json.dumps([index, sizes]).encode()).hexdigest()
 
     def _chunk(self, path: Path) -> Chunk:
-        chunk = self._loaded.pop(path, None)
-        if chunk is None:
+        if path not in self._loaded and len(self._loaded) >= CHUNKS_IN_MEMORY:
             # The least recently used one goes before the next one comes, so that there are never three.
-            while len(self._loaded) >= CHUNKS_IN_MEMORY:
-                del self._loaded[next(iter(self._loaded))]
-            chunk = read_chunk(path)
-        self._loaded[path] = chunk
-        return chunk
+            del self._loaded[next(iter(self._loaded))]
+        self._loaded[path] = self._loaded.pop(path) if path in self._loaded else read_chunk(path)
+        return self._loaded[path]
 
 
 def read_chunk(path: Path) -> Chunk:
@@ -132,7 +122,7 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
     if not len(images) == len(rows) == len(times):
         raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
     with at(frame=0):
-        size = picture_size(images[0].numpy().tobytes(), str(path)) if images else (1, 1)
+        size = picture_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
     timestamps = tuple(times.tolist())
     return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), partial(_read, images, size, str(path)))
 

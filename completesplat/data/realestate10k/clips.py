@@ -7,28 +7,24 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
 from torch import Tensor
 
 from completesplat.data.pictures.crop import Square, read_square
-from completesplat.data.pictures.files import MOST_PIXELS, check_pixels, damage_refused
+from completesplat.data.pictures.files import picture_size
 from completesplat.data.validation import (
     ROTATION_TOLERANCE,
     BadAnnotation,
     BadCamera,
-    BadPicture,
     MissingFile,
     TooFewFrames,
-    UnreadableFile,
     at,
-    require_file,
+    read_text,
 )
-from completesplat.errors import DataError, ImageError
+from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
 CAMERA_NUMBERS = 18
@@ -65,62 +61,29 @@ def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], imag
     """
     if len(rows) < 2:
         raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
-    count = Counter(timestamps)
-    repeated = [f for f, time in enumerate(timestamps) if count[time] > 1]
-    _refuse(repeated, BadAnnotation, "another frame has its timestamp")
-    rows = rows.double()
-    rotation = rows[:, 6:].unflatten(1, (3, 4))[:, :, :3]
+    rows, count = rows.double(), Counter(timestamps)
+    world_to_camera = rows[:, 6:].reshape(-1, 3, 4)
+    rotation = world_to_camera[:, :, :3]
     deviation = (rotation @ rotation.mT - torch.eye(3, dtype=rows.dtype)).abs().amax(dim=(1, 2))
     rigid = (deviation <= ROTATION_TOLERANCE) & (torch.linalg.det(rotation) > 0)
-    _refuse(_frames(~rows.isfinite().all(dim=1)), BadAnnotation, "camera with numbers that are not finite")
-    _refuse(_frames((rows[:, :2] <= 0).any(dim=1)), BadCamera, "focal length is not positive")
-    _refuse(_frames((rows[:, 4:6] != 0).any(dim=1)), BadCamera, "lens distortion is not supported")
-    _refuse(_frames(~rigid), BadCamera, "pose is not a rotation and translation")
-    height, width = image_size
+    for bad, kind, reason in (
+        (torch.tensor([count[time] > 1 for time in timestamps]), BadAnnotation, "another frame has its timestamp"),
+        (~rows.isfinite().all(dim=1), BadAnnotation, "camera with numbers that are not finite"),
+        ((rows[:, :2] <= 0).any(dim=1), BadCamera, "focal length is not positive"),
+        ((rows[:, 4:6] != 0).any(dim=1), BadCamera, "lens distortion is not supported"),
+        (~rigid, BadCamera, "pose is not a rotation and translation"),
+    ):
+        if bad.any():
+            raise kind(reason, frame=int(bad.nonzero()[0]))
     intrinsics, pose = (torch.eye(n, dtype=rows.dtype).repeat(len(rows), 1, 1) for n in (3, 4))
-    intrinsics[:, 0, 0], intrinsics[:, 1, 1] = rows[:, 0] * width, rows[:, 1] * height
-    intrinsics[:, 0, 2], intrinsics[:, 1, 2] = rows[:, 2] * width, rows[:, 3] * height
-    pose[:, :3] = rows[:, 6:].unflatten(1, (3, 4))
+    sides = rows.new_tensor(image_size[::-1])
+    intrinsics[:, [0, 1], [0, 1]], intrinsics[:, :2, 2] = rows[:, :2] * sides, rows[:, 2:4] * sides
+    pose[:, :3] = world_to_camera
     return Cameras(pose, intrinsics, image_size)
 
 
-def _frames(bad: Tensor) -> list[int]:
-    return bad.nonzero().flatten().tolist()
-
-
-def _refuse(frames: list[int], kind: type[BadAnnotation | BadCamera], reason: str) -> None:
-    if frames:
-        raise kind(reason, frame=frames[0])
-
-
-def picture_size(source: Path | bytes, file: str) -> tuple[int, int]:
-    """(height, width) of an image file, from its header.
-
-    Args:
-        source: the file, or its content.
-        file: what refusals name.
-
-    Raises:
-        MissingFile: no such file.
-        BadPicture: no JPEG or PNG image, or one of more than 50 million pixels.
-    """
-    opened = BytesIO(source) if isinstance(source, bytes) else require_file(source)
-    try:
-        with damage_refused(FORMATS, MOST_PIXELS), Image.open(opened, formats=FORMATS) as image:
-            check_pixels(image, MOST_PIXELS)
-            return image.height, image.width
-    except ImageError as error:
-        raise BadPicture(str(error), file) from None
-
-
 class TextClips:
-    """The clips of one folder whose frames are there.
-
-    Attributes:
-        keys: names of the clips, sorted.
-        missing: the clips without a folder of frames.
-        refused: nothing, as clips are looked at when they are read.
-    """
+    """The clips of one folder whose frames are there, and the names of those (`missing`) without a folder of frames."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -136,30 +99,24 @@ class TextClips:
         return [list(range(len(keys)))]
 
     def clip(self, key: str) -> Clip:
-        """Read a clip's text and list its frames.
-
-        Raises:
-            DataError: it is malformed, or a frame is missing.
-        """
+        """Read a clip's text and list its frames; `DataError` where it is malformed, or a frame is missing."""
         path = self.folder / f"{key}.txt"
         with at(path, key):
             timestamps, rows = _read_text(path)
             pictures = _pictures(self.folder / key)
             for frame, time in enumerate(timestamps):
                 if time not in pictures:
-                    raise MissingFile(
-                        "no picture with this timestamp", str(self.folder / key / f"{time}.jpg"), key, frame
-                    )
+                    raise MissingFile("no such picture", str(self.folder / key / f"{time}.jpg"), key, frame)
             paths = [pictures[time] for time in timestamps]
             with at(frame=0):
-                size = picture_size(paths[0], str(paths[0])) if paths else (1, 1)
+                size = picture_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
             numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
             return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
 
     def fingerprint(self) -> str:
         """SHA-256 of the texts' names and sizes (there are tens of thousands)."""
-        texts = {key: self.folder / f"{key}.txt" for key in self.keys}
-        sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts.items()]
+        texts = [(key, self.folder / f"{key}.txt") for key in self.keys]
+        sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts]
         return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
 
 
@@ -173,14 +130,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     """Timestamps and camera rows."""
     timestamps, rows = [], []
-    try:
-        with require_file(path).open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-        if len(content) > MOST_BYTES:
-            raise UnreadableFile(f"more than {MOST_BYTES:,} bytes")
-        lines = content.decode("utf-8").splitlines()[1:]
-    except (OSError, UnicodeDecodeError) as error:
-        raise UnreadableFile(f"not a text file ({type(error).__name__})") from None
+    lines = read_text(path, MOST_BYTES).splitlines()[1:]
     for frame, columns in enumerate(line.split() for line in lines if line.strip()):
         with at(frame=frame):
             if len(columns) != 1 + CAMERA_NUMBERS:

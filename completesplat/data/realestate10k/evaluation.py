@@ -7,39 +7,30 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from completesplat.data.loading.scenes import Choice
-from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import BadAnnotation, UnreadableFile, at, read_json, require_file
+from completesplat.data.sequences import PosedSequence, SequenceSource, shortened
+from completesplat.data.validation import BadAnnotation, at, read_json, read_text
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
 FORMS = {frozenset((CONTEXT, TARGET)): "pixelSplat", frozenset((CONTEXT, TARGET, SCORED)): "MVSplat360"}
 LINE = "KEY source target target target"
-NAMED = 5
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class EvaluationIndex:
-    """A list of test views.
-
-    Attributes:
-        form: the work whose format it has.
-        views: reference and targets, as places in the clip's list of frames, of every test of a clip; a clip that the
-            file leaves out by name has no tests.
-    """
+    """A list of test views in the format of a work: reference and targets of each test of a clip, as places in it."""
 
     form: str
     views: dict[str, list[Choice]]
 
 
 class ChosenClips(NamedTuple):
-    """What is tested.
+    """What is tested, and which clips are not, by reason.
 
     Attributes:
-        clips: the clip of each test by the test's name, which is the clip's, or `KEY#1`, `KEY#2` ... where a clip has
-            several; in the order of the data.
+        clips: the clip of each test by the test's name: the clip's, or `KEY#1`, `KEY#2` ... where a clip has several.
         views: reference and targets by name, where an index gives them.
-        left_out: clips that are not tested, by reason.
     """
 
     clips: dict[str, str]
@@ -66,11 +57,7 @@ class ChosenSource:
         self._clips = clips
 
     def read(self, name: str) -> PosedSequence:
-        """The clip of a test.
-
-        Raises:
-            DataError: it cannot be used as a whole.
-        """
+        """The clip of a test."""
         return replace(self._source.read(self._clips[name]), name=name)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
@@ -96,7 +83,7 @@ def read_index(path: Path) -> EvaluationIndex:
     Raises:
         DataError: missing, unreadable, or with anything else in it.
     """
-    text = _text(path)
+    text = read_text(path)
     with at(file=path):
         return _from_table(read_json(path)) if text.lstrip().startswith(("{", "[")) else _from_lines(text)
 
@@ -108,7 +95,7 @@ def read_keys(path: Path) -> list[str]:
         DataError: missing, unreadable, or with several columns.
     """
     keys = []
-    for number, line in enumerate(_text(path).splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         columns = line.split()
         if len(columns) > 1:
             reason = f"line {number}: {len(columns)} columns instead of a key (lists of views: data.evaluation_index)"
@@ -122,9 +109,7 @@ def choose_clips(keys: list[str], index: EvaluationIndex | None, listed: list[st
     there, left_out = set(keys), dict[str, list[str]]()
     if index is not None:
         left_out["null in the index"] = [key for key, tests in index.views.items() if not tests]
-        left_out["in the index, not in the data"] = [
-            key for key, tests in index.views.items() if tests and key not in there
-        ]
+        left_out["in the index, not in the data"] = [k for k, tests in index.views.items() if tests and k not in there]
         left_out["not in the index"] = [key for key in keys if key not in index.views]
         keys = [key for key in keys if index.views.get(key)]
     if listed is not None:
@@ -133,18 +118,17 @@ def choose_clips(keys: list[str], index: EvaluationIndex | None, listed: list[st
         keys = [key for key in keys if key in set(listed)]
     if index is None:
         return ChosenClips({key: key for key in keys}, None, left_out)
-    tests = [(key, number, views) for key in keys for number, views in enumerate(index.views[key], 1)]
-    names = [f"{key}#{number}" if len(index.views[key]) > 1 else key for key, number, _ in tests]
-    clips = {name: key for name, (key, _, _) in zip(names, tests, strict=True)}
-    return ChosenClips(clips, {name: views for name, (_, _, views) in zip(names, tests, strict=True)}, left_out)
+    clips, chosen = dict[str, str](), dict[str, Choice]()
+    for key in keys:
+        for number, views in enumerate(index.views[key], 1):
+            name = f"{key}#{number}" if len(index.views[key]) > 1 else key
+            clips[name], chosen[name] = key, views
+    return ChosenClips(clips, chosen, left_out)
 
 
 def log_choice(chosen: ChosenClips) -> None:
     """Say how many tests there are and which clips were left out: as a warning if some are not in the data."""
-    parts = []
-    for reason, keys in chosen.left_out.items():
-        named = ", ".join([*keys[:NAMED], *(["..."] if len(keys) > NAMED else [])])
-        parts.append(f"{len(keys)} {reason}" + (f" ({named})" if keys else ""))
+    parts = [f"{len(keys)} {why}" + (f" ({shortened(keys)})" if keys else "") for why, keys in chosen.left_out.items()]
     lacking = any(keys for reason, keys in chosen.left_out.items() if reason.endswith("not in the data"))
     left_out = f"; left out: {', '.join(parts)}" if parts else ""
     clips = len(set(chosen.clips.values()))
@@ -189,8 +173,7 @@ def _choice(entry: dict[str, Any]) -> Choice:
 
 def _from_lines(text: str) -> EvaluationIndex:
     views: dict[str, list[Choice]] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        columns = line.split()
+    for number, columns in enumerate(map(str.split, text.splitlines()), 1):
         if not columns:
             continue
         if len(columns) != len(LINE.split()) or not all(c.isascii() and c.isdecimal() for c in columns[1:]):
@@ -201,10 +184,3 @@ def _from_lines(text: str) -> EvaluationIndex:
     if not views:
         raise BadAnnotation("no clip with views")
     return EvaluationIndex("Flash3D", views)
-
-
-def _text(path: Path) -> str:
-    try:
-        return require_file(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        raise UnreadableFile("not a text file", str(path)) from None

@@ -26,7 +26,7 @@ from completesplat.data.realestate10k.evaluation import (
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.geometry.cameras import crop_resize
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -37,14 +37,7 @@ Clips = TextClips | ChunkedClips
 
 @dataclass(frozen=True)
 class ClipFraming:
-    """How pictures and cameras are made from files.
-
-    Attributes:
-        image_size: side of the square pictures.
-        crop: "center": the largest central square; "principal": the largest square around the principal point.
-        scale: all lengths are multiplied by this, near and far included.
-        near, far: the depth range of every scene, in the clips' own units.
-    """
+    """How pictures and cameras are made from files; see `RE10KDataModule`."""
 
     image_size: int
     crop: str
@@ -86,15 +79,14 @@ class RE10KSource:
         return self._clips.fingerprint()
 
     def read(self, name: str) -> PosedSequence:
-        """One clip: its cameras now, its pictures when `PosedSequence.read` is called.
-
-        Raises:
-            DataError: it is missing, unreadable or malformed.
-        """
+        """One clip: its cameras now, its pictures when `PosedSequence.read` is called."""
         clip, framing = self._clips.clip(name), self.framing
         count = len(clip.timestamps)
         squares = [_square(clip, framing.crop, frame) for frame in range(count)]
-        cameras = _cropped(clip.cameras, squares, framing.image_size)
+        if len(set(squares)) == 1:
+            cameras = crop_resize(clip.cameras, *squares[0], framing.image_size)
+        else:
+            cameras = stack([crop_resize(clip.cameras[i], *squares[i], framing.image_size) for i in range(count)])
         cameras = cameras.scale_world(torch.tensor(framing.scale, dtype=torch.float64))
         depth_range = torch.tensor([framing.near * framing.scale, framing.far * framing.scale])
         read = partial(_read, clip, squares, framing.image_size)
@@ -106,12 +98,6 @@ def _square(clip: Clip, crop: str, frame: int) -> Square:
     with at(clip.source, clip.key, frame):
         x, y = clip.cameras.intrinsics[frame, :2, 2].tolist() if crop == "principal" else (width / 2, height / 2)
         return principal_square((x, y), (height, width))
-
-
-def _cropped(cameras: Cameras, squares: list[Square], size: int) -> Cameras:
-    if len(set(squares)) == 1:
-        return crop_resize(cameras, *squares[0], size)
-    return stack([crop_resize(cameras[i], *square, size) for i, square in enumerate(squares)])
 
 
 def _read(clip: Clip, squares: list[Square], size: int, index: int) -> Picture:
@@ -175,17 +161,12 @@ class RE10KDataModule(SceneDataModule):
 
     @cached_property
     def index(self) -> EvaluationIndex | None:
-        """The content of `evaluation_index`.
-
-        Raises:
-            DataError: it is missing or malformed.
-        """
+        """The content of `evaluation_index`."""
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
         """See `SceneDataModule`; a list that decides is named, with the work whose format it has and its checksum."""
-        count, gap = self.evaluation
-        views = f"reference: first frame; {count} targets within {gap} frames"
+        views = "reference: first frame; {} targets within {} frames".format(*self.evaluation)
         if self.index is not None:
             views = f"those of {_identity(self.evaluation_index, self.index.form)}"
         listed = "" if self.scene_list is None else f"; scenes of {_identity(self.scene_list)}"

