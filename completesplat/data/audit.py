@@ -83,9 +83,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
 
     A sequence that is not usable although nothing of it was refused counts as refused: it has too few frames.
 
-    Args:
-        sources: by split; with more than one worker they must be picklable.
-        workers: processes, by default one a core.
+    The sources, by split, must be picklable where there are several `workers`: processes, by default one a core.
     """
     refused = [error for source in sources.values() for error in _before_reading(source)]
     sequences, batches = list[_Sequence](), _batches(sources)

@@ -218,11 +218,7 @@ def list_field(entry: object, key: str, kind: type) -> tuple[Any, ...]:
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
-    """Refuse a 3 x 3 matrix that is no rotation, within 1e-3 for each entry of R R^T.
-
-    Raises:
-        BadCamera: it is not orthonormal, or a reflection.
-    """
+    """Raise `BadCamera` for a 3 x 3 matrix that is no rotation, within 1e-3 for each entry of R R^T."""
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise BadCamera(f"{what} is not orthonormal")
     if np.linalg.det(matrix) < 0:
