@@ -12,16 +12,12 @@ from PIL import Image
 EMPTY = {"img", "meta", "link", "br"}
 """Elements that have no end tag."""
 
-WIDEST = 1600
-"""Pixels of the widest picture; wider ones are made smaller."""
-MOST_PIXELS = 50_000_000
-AS_THEY_ARE = 300_000
-"""Bytes up to which a picture of that width is not encoded again."""
-QUALITY = 85
-SIDE = 256
-"""Pixels of a frame's longer side, at most."""
-LONGEST = 60_000
-"""Pixels of the widest strip of frames; JPEG ends at 65,535."""
+WIDEST, MOST_PIXELS = 1600, 50_000_000
+"""Pixels of the widest picture shown, wider ones are made smaller; and of the largest read."""
+AS_THEY_ARE, QUALITY = 300_000, 85
+"""Bytes up to which a picture of that width is not encoded again; and quality of JPEG."""
+SIDE, LONGEST = 256, 60_000
+"""Pixels of a frame's longer side; and of the widest strip of frames (JPEG ends at 65,535)."""
 
 
 class Html(str):
@@ -29,12 +25,9 @@ class Html(str):
 
 
 def element(name: str, /, *children: str, **attributes: str | int | bool) -> Html:
-    """`<name attribute="value">children</name>`.
+    """`<name attribute="value">children</name>`; children are elements, or plain text.
 
-    Args:
-        name: of the element.
-        children: elements, or plain text.
-        attributes: `class_` for `class`, `aria_label` for `aria-label`; True for one without a value, False for none.
+    Attributes are `class_` for `class`, `aria_label` for `aria-label`; True for one without a value, False for none.
     """
     given = [(key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not False]
     opened = "".join(f" {key}" if value is True else f' {key}="{escape(str(value))}"' for key, value in given)
@@ -49,12 +42,7 @@ def joined(*children: str) -> Html:
 
 
 def scrollable(name: str, *children: str) -> Html:
-    """A box that scrolls sideways by itself, also by keyboard, when its content is wider than the page.
-
-    Args:
-        name: what it holds, for those who do not see it.
-        children: its content.
-    """
+    """A box that scrolls sideways by itself, also by keyboard; `name` says what it holds to those who do not see it."""
     return element("div", *children, class_="scroll", tabindex="0", role="region", aria_label=name)
 
 
@@ -75,11 +63,7 @@ def left_out(text: str) -> Html:
 
 
 class ByteBudget:
-    """The bytes that pictures may take in one page.
-
-    Args:
-        megabytes: how much it holds; data URIs take four characters for three bytes.
-    """
+    """The bytes that pictures may take in one page; data URIs take four characters for three bytes."""
 
     def __init__(self, megabytes: float) -> None:
         self.left = megabytes * 1e6
@@ -99,8 +83,7 @@ def picture(path: Path, caption: str, budget: ByteBudget) -> Html:
         data, kind, width, height = _encoded(path)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         return left_out(f"{caption}: cannot be shown ({' '.join(str(error).split())})")
-    uri = budget.uri(data, kind)
-    if uri is None:
+    if (uri := budget.uri(data, kind)) is None:
         return left_out(f"{caption}: left out, the page is full")
     image = element("img", src=uri, alt=caption, width=width, height=height, loading="lazy")
     return element("figure", scrollable(caption, image), element("figcaption", caption), class_="picture")
@@ -131,11 +114,7 @@ def as_jpeg(image: Image.Image) -> bytes:
 
 
 def strip(video: Path, count: int) -> tuple[Image.Image, int]:
-    """Frames of a video from left to right, evenly spread over all of it, and how many they are.
-
-    Args:
-        video: the file.
-        count: how many at most; a shorter video gives all that it has.
+    """At most `count` frames from left to right, evenly spread over all of a video, and how many they are.
 
     Raises:
         OSError, RuntimeError, ValueError, IndexError: no readable video (imageio's; it depends on what is wrong).
@@ -154,24 +133,12 @@ def strip(video: Path, count: int) -> tuple[Image.Image, int]:
                 frames.append(image)
     if not frames:
         raise ValueError("it has no frames")
-    width, height = frames[0].size
-    frames = frames[: LONGEST // width]
-    joined = Image.new("RGB", (width * len(frames), height))
-    for index, image in enumerate(frames):
-        joined.paste(image, (index * width, 0))
-    return joined, len(frames)
+    shown = [np.asarray(image) for image in frames[: LONGEST // frames[0].width]]
+    return Image.fromarray(np.concatenate(shown, axis=1)), len(shown)
 
 
 def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudget) -> Html:
-    """A figure of one sample; without scripts the strip can be scrolled. Or why it is not shown.
-
-    Args:
-        video: an orbit, one full turn.
-        image: the photograph's name.
-        sample: the sample's.
-        count: of the frames.
-        budget: bytes that are left in the page.
-    """
+    """A figure of an orbit of one sample; without scripts the strip can be scrolled. Or why it is not shown."""
     try:
         joined, frames = strip(video, count)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
@@ -187,9 +154,7 @@ def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudg
         tabindex="0",
         role="slider",
         aria_label=f"{name}: turn it",
-        aria_valuemin="0",
-        aria_valuemax=str(frames - 1),
-        aria_valuenow="0",
+        **{"aria_valuemin": "0", "aria_valuemax": str(frames - 1), "aria_valuenow": "0"},
         aria_valuetext="0 degrees",
         data_frames=str(frames),
         style=f"aspect-ratio:{joined.width // frames}/{joined.height}",

@@ -26,6 +26,7 @@ from completesplat.results.scores import entries
 from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table, TableRow
 
 MARKED = {BEST: "strong", SECOND: "u"}
+PLAIN = (type(None), str, int, float)
 PUBLISHED = "paper"
 """The source of rows that are no results of ours."""
 
@@ -37,17 +38,8 @@ CAPTIONS = {
 }
 LONGEST = 20_000
 """Characters of a configuration that are shown."""
-NAMED = {
-    "image": "photograph",
-    "mask": "mask",
-    "box": "box",
-    "fov_degrees": "degrees of view",
-    "seed": "seed",
-    "skip_weight": "skip weight",
-    "guidance_weight": "guidance",
-    "sampler": "sampler",
-    "steps": "steps",
-}
+NAMED = {"image": "photograph", "mask": "mask", "box": "box", "fov_degrees": "degrees of view", "seed": "seed"}
+NAMED |= {"skip_weight": "skip weight", "guidance_weight": "guidance", "sampler": "sampler", "steps": "steps"}
 """Settings of a prediction, and what they are called here."""
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """What the browser enforces: this page asks for nothing, whatever is in it."""
@@ -74,9 +66,9 @@ class Limits:
 
 def comparison(table: Table) -> Html:
     """A table with what stands below it; without a result of ours it is folded."""
-    if is_published(table):
-        return folded(f"{table.title}: the published figures, none of ours", _whole(table))
-    return _whole(table)
+    below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
+    whole = element("div", _grid(table), folded("What this table says, and how it was measured", below))
+    return folded(f"{table.title}: the published figures, none of ours", whole) if is_published(table) else whole
 
 
 def is_published(table: Table) -> bool:
@@ -87,14 +79,9 @@ def is_published(table: Table) -> bool:
 def rows_of(title: str, rows: Sequence[Any]) -> Html:
     """Records with the same keys, such as `completesplat report samplers` writes."""
     records = [row for row in rows if isinstance(row, Mapping)]
-    keys = list(dict.fromkeys(str(key) for row in records for key, value in row.items() if _is_plain(value)))
+    keys = list(dict.fromkeys(str(key) for row in records for key, x in row.items() if isinstance(x, PLAIN)))
     body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
     return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body, gaps=True))
-
-
-def _whole(table: Table) -> Html:
-    below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
-    return element("div", _grid(table), folded("What this table says, and how it was measured", below))
 
 
 def _grid(table: Table) -> Html:
@@ -107,23 +94,15 @@ def _grid(table: Table) -> Html:
 
 
 def _head(table: Table) -> list[Html]:
-    spans = table.groups()
-    above = [element("th", name, scope="colgroup", colspan=count, class_="group") for name, count in spans]
-    names = [element("th", heading.text, scope="col", class_=_kind(heading)) for heading in table.headings]
-    return [element("tr", *above), element("tr", *names)] if above else [element("tr", *names)]
+    above = [element("th", name, scope="colgroup", colspan=count, class_="group") for name, count in table.groups()]
+    words = [False if heading.figures else "words" for heading in table.headings]
+    names = [element("th", h.text, scope="col", class_=kind) for h, kind in zip(table.headings, words, strict=True)]
+    return [element("tr", *cells) for cells in (above, names) if cells]
 
 
 def _cell(heading: Heading, cell: Cell) -> Html:
     text = element(MARKED[cell.mark], cell.text) if cell.mark in MARKED else cell.text
-    return element("td", text, class_=_kind(heading))
-
-
-def _kind(heading: Heading) -> str | bool:
-    return False if heading.figures else "words"
-
-
-def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, str | int | float)
+    return element("td", text, class_=False if heading.figures else "words")
 
 
 def _said(value: Any) -> str:
@@ -141,13 +120,9 @@ class ShownRun:
 
 
 def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bool) -> Html:
-    """A section of one run.
+    """A section of one run, unfolded at first if `open_`.
 
-    Args:
-        run: the run.
-        most_pictures: how many are shown of each subfolder, the latest; the section says how many others there are.
-        budget: bytes that are left in the page.
-        open_: whether it is unfolded at first.
+    Of each subfolder `most_pictures` are shown, the latest; the section says how many others there are.
     """
     parts = [described(origin(run.path, levels=0)), *map(comparison, run.tables)]
     for name in ROWS:
@@ -180,7 +155,8 @@ def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget
         turntable(video, image, video.stem.replace("orbit_", "sample "), limits.frames, budget)
         for video in videos[: limits.samples]
     ]
-    parts = [element("h3", name), described({"settings": _settings(settings), **origin(path)})]
+    said = [f"{told} {_said(settings[key])}" for key, told in NAMED.items() if settings.get(key) is not None]
+    parts = [element("h3", name), described({"settings": ", ".join(said), **origin(path)})]
     if turning:
         parts.append(element("div", *turning, class_="samples"))
     parts += _more(len(videos) - limits.samples, "more samples")
@@ -190,19 +166,10 @@ def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget
     return element("section", *parts, aria_label=f"Prediction {name}")
 
 
-def _settings(settings: dict[str, Any]) -> str:
-    """The settings that matter, in one line."""
-    return ", ".join(f"{name} {_said(settings[key])}" for key, name in NAMED.items() if settings.get(key) is not None)
-
-
 def page(folder: Path, out: Path, limits: Limits, made: Mapping[str, str]) -> tuple[str, list[str]]:
-    """The page, and a line for each file of results that could not be used.
+    """The page on all below a folder but what lies in `out`, and a line for each file of results that is of no use.
 
-    Args:
-        folder: searched for runs and predictions.
-        out: where the page goes; what lies there is not shown.
-        limits: how much is shown.
-        made: command, date and commit of the page itself.
+    `made` are command, date and commit of the page itself.
 
     Raises:
         CompleteSplatError: there is no such folder, or nothing to show in it.
@@ -243,8 +210,8 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
         tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
     shown = []
     for path in tree.runs:
-        figures = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
-        figures = {part: paths for part, paths in figures.items() if paths}
+        found = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
+        figures = {part: paths for part, paths in found.items() if paths}
         shows = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
         if shows and path.resolve() != out.resolve():
             shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
@@ -254,14 +221,10 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
 def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str, str]) -> str:
     style, script = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     identities = {name: name.lower().replace(" ", "-") for name in sections}
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=POLICY),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("title", title),
-        element("style", Html(style)),
-    )
+    meta: list[dict[str, Any]] = [{"charset": "utf-8"}, {"http_equiv": "Content-Security-Policy", "content": POLICY}]
+    meta.append({"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    heads = [*(element("meta", **attributes) for attributes in meta), element("title", title)]
+    head = element("head", *heads, element("style", Html(style)))
     links = [element("li", element("a", name, href=f"#{identity}")) for name, identity in identities.items()]
     top = element("header", element("h1", title), element("nav", element("ul", *links), aria_label="Sections"))
     body = [

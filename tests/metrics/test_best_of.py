@@ -4,7 +4,7 @@ from itertools import combinations
 
 import pytest
 
-from completesplat.metrics.samples import best, expected_best_curve
+from completesplat.metrics.scoring import best, expected_best_curve
 
 SCORES = [21.5, 19.0, 24.25, 19.0, 22.75, -3.0]
 

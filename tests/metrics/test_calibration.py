@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from completesplat.metrics.hidden_modes import EDGES, bin_sums, curve, spread_and_error
+from completesplat.metrics.mode_coverage import EDGES, bin_sums, curve, spread_and_error
 
 SAMPLES = 16
 EVERYWHERE = torch.ones(200, 200, dtype=torch.bool)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from completesplat.metrics.evaluation import depth_errors
+from completesplat.metrics.scoring import depth_errors
 
 
 def images(*rows: list[float]) -> torch.Tensor:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from completesplat.metrics.samples import diversity
+from completesplat.metrics.scoring import diversity
 
 
 def test_diversity_is_the_mean_difference_of_all_pairs():

@@ -10,8 +10,8 @@ from torch import distributed, multiprocessing
 
 from completesplat.data.loading.scenes import EvaluationScenes, SceneStore
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import Evaluation
 from completesplat.metrics.image_sets import Patches
+from completesplat.metrics.scoring import Evaluation
 from completesplat.scene import Views
 
 COUNTS = range(1, 10)

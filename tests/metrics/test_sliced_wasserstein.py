@@ -36,11 +36,7 @@ def generator() -> torch.Generator:
 
 @pytest.mark.parametrize(
     ("size", "sizes"),
-    [
-        ((64, 64), [(64, 64), (32, 32), (16, 16)]),
-        ((33, 70), [(33, 70), (17, 35)]),
-        ((31, 16), [(31, 16)]),
-    ],
+    [((64, 64), [(64, 64), (32, 32), (16, 16)]), ((33, 70), [(33, 70), (17, 35)]), ((31, 16), [(31, 16)])],
 )
 def test_the_pyramid_goes_down_to_16_pixels_and_reconstructs_the_image(size, sizes):
     image = torch.rand(2, 3, *size, generator=generator())

@@ -88,14 +88,14 @@ def test_the_naive_predictors_are_below_without_seeds(ablations) -> None:
 
 def test_naive_predictors_that_differ_between_jobs_are_averaged_and_said(sweep) -> None:
     sweep.scored("seed=0", psnr=20.0)
-    assert not any("mean_image" in said for said in summarize(sweep.folder).remarks)
+    assert not any("mean_image" in said for said in summarize(sweep.folder).table.remarks)
     other = sweep.scored("seed=1", psnr=20.0) / "metrics.json"
     other.write_text(other.read_text().replace("15.0", "17.0"))
     summary = summarize(sweep.folder)
     assert [row["full_novel_psnr_mean"] for row in summary.rows] == [20, 16, 12]
-    (said,) = (said for said in summary.remarks if "mean_image" in said)
+    (said,) = (said for said in summary.table.remarks if "mean_image" in said)
     assert "does not score the same in all jobs" in said
-    assert not any("copy_reference" in said for said in summary.remarks)
+    assert not any("copy_reference" in said for said in summary.table.remarks)
 
 
 def test_different_numbers_of_scenes_are_not_passed_over(sweep) -> None:
@@ -105,12 +105,12 @@ def test_different_numbers_of_scenes_are_not_passed_over(sweep) -> None:
     summary = summarize(sweep.folder)
     assert [row["scenes"] for row in summary.rows[:2]] == ["40/38", 40]
     assert [row["steps"] for row in summary.rows[:2]] == ["9/7", 9]
-    assert "m1: its jobs were tested on different scenes (40/38)." in summary.remarks
-    assert any("do not compare" in said for said in summary.remarks)
+    assert "m1: its jobs were tested on different scenes (40/38)." in summary.table.remarks
+    assert any("do not compare" in said for said in summary.table.remarks)
 
 
 def test_equal_numbers_of_scenes_need_no_remark(ablations) -> None:
-    assert not any("scenes" in said for said in summarize(ablations.folder).remarks)
+    assert not any("scenes" in said for said in summarize(ablations.folder).table.remarks)
 
 
 def test_a_job_without_a_test_has_its_row_without_figures(sweep) -> None:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from completesplat.metrics.hidden_modes import REJECTED, classify, draw_modes, mean_of, mean_scores, scores
+from completesplat.metrics.mode_coverage import REJECTED, classify, draw_modes, mean_of, mean_scores, scores
 
 MODES = torch.rand(4, 50, 3, generator=torch.Generator().manual_seed(0))
 EVEN = torch.full((4,), 0.25)

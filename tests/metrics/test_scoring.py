@@ -1,13 +1,14 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.image_sets import Patches
-from completesplat.metrics.missing import Missing
+from completesplat.metrics.images import Missing
+from completesplat.metrics.scoring import Evaluation
 from completesplat.scene import SceneBatch, Views
 
 
@@ -124,8 +125,8 @@ def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, 
     )
     second.skipped = 1
     second.update_samples("scene 0", torch.rand(2, 3, 3, 16, 16), scenes(1, 2).all_views()[0])  # padding, as it were
-    states = [(e.scores, e.views, e.drawn, e.sets.state(), e.skipped) for e in (second, first)]
-    monkeypatch.setattr("completesplat.metrics.evaluation.gathered", lambda own: states)
+    states = [(e.scores, e.views, e.drawn, e.sets.kept, e.skipped) for e in (second, first)]
+    monkeypatch.setattr("completesplat.metrics.scoring.gathered", lambda own: states)
     first.gather()
     assert first.results() == alone.results()
     assert first.results()["model"]["scenes"] == count
@@ -178,7 +179,7 @@ def test_depth_is_scored_where_the_truth_is_known():
     predicted[:, :, 8:] = 4.0
     predicted[1, :, :, 8:] = 99.0
     evaluation.update("model", torch.full((1, 3, 3, 16, 16), 0.5), scenes(1, 2))
-    evaluation.update_depth("scene 0", predicted, DepthViews(true, masks))
+    evaluation.update_depth("scene 0", predicted, replace(scenes(1, 2).all_views()[0], depths=true, masks=masks))
     full, of_object = (evaluation.results()["model"][region]["novel"] for region in ("full", "object"))
     assert full["depth_abs_rel"] == pytest.approx((0.1 + 1) / 2)
     assert of_object["depth_abs_rel"] == pytest.approx(0.1)
