@@ -18,14 +18,6 @@ def test_the_curve_is_the_mean_best_of_all_choices(higher_is_better, chosen):
     assert expected_best_curve(SCORES, higher_is_better) == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_long_curve_goes_from_the_mean_to_the_best_and_never_back():
-    scores = [float((37 * i) % 101) for i in range(100)]
-    curve = expected_best_curve(scores)
-    assert curve[0] == pytest.approx(sum(scores) / 100)
-    assert curve[-1] == max(scores)
-    assert curve == sorted(curve)
-
-
 def test_the_best_is_the_first_of_equals():
     assert best(SCORES) == 2
     assert best(SCORES, higher_is_better=False) == 5

@@ -54,14 +54,6 @@ def test_bins_hold_the_variances_between_their_edges_and_sums_add_up():
         assert mean.isnan() or lower <= mean < upper
 
 
-def test_variance_and_error_are_those_of_torch_channel_by_channel():
-    samples, truth = torch.rand(5, 3, 4, 4), torch.rand(3, 4, 4)
-    variance, error = spread_and_error(samples, truth)
-    pixel = samples[:, :, 1, 2]
-    assert variance[1, 2].item() == pytest.approx((((pixel - pixel.mean(0)) ** 2).sum(0) / 4).mean().item(), rel=1e-5)
-    assert error[1, 2].item() == pytest.approx(((pixel.mean(0) - truth[:, 1, 2]) ** 2).mean().item(), rel=1e-5)
-
-
 def test_a_region_without_pixels_has_no_figures():
     nothing = torch.zeros(4, 4)
     found = curve(bin_sums(nothing, nothing, torch.zeros(4, 4, dtype=torch.bool)))

@@ -22,7 +22,6 @@ def test_errors_are_those_of_a_worked_example():
 
 
 def test_a_common_scale_is_an_error_of_that_scale():
-    """A prediction 1.2 times too deep is within 1.25, one 1.2 times deeper still is not: nothing is aligned."""
     true = 1 + torch.rand(2, 1, 8, 8, generator=torch.Generator().manual_seed(0))
     everywhere = torch.ones_like(true, dtype=torch.bool)
     for scale, within in ((1.2, 1.0), (1 / 1.2, 1.0), (1.44, 0.0), (1 / 1.44, 0.0)):

@@ -26,7 +26,6 @@ def scenes(batch: int, targets: int, first: int = 0) -> SceneBatch:
 
 
 def test_views_are_averaged_within_scenes_before_scenes_are():
-    """One scene with 1 novel view at 20 dB and one with 3 at 40 dB average to 30 dB, not to 35."""
     evaluation = Evaluation()
     for targets, error in ((1, 0.1), (3, 0.01)):
         images = torch.full((1, 1 + targets, 3, 16, 16), 0.5 + error)
@@ -93,7 +92,6 @@ def test_of_several_samples_the_first_the_best_and_the_mean_are_told():
 
 
 def test_the_best_is_chosen_by_the_criterion():
-    """A sample with the right colours but the wrong structure has the higher PSNR, the other one the higher SSIM."""
     generator = torch.Generator().manual_seed(0)
     batch = scenes(1, 1)
     texture = 0.2 * torch.rand(1, 2, 3, 16, 16, generator=generator)
@@ -109,7 +107,7 @@ def test_the_best_is_chosen_by_the_criterion():
     assert chosen == {"psnr": True, "ssim": False}
 
 
-@pytest.mark.parametrize("count", range(1, 10))
+@pytest.mark.parametrize("count", [1, 2, 5])
 def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, count):
     def scored(names: list[int]) -> Evaluation:
         evaluation = Evaluation(samples=2, sets={"swd": Patches(patches=2)})

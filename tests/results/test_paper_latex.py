@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from paper_latex import check, differences, environment, figure, grid
+from paper_latex import check, differences, figure
 
 from completesplat.results.published import PrintedColumn, PublishedTable, parse, published
 
@@ -57,10 +57,7 @@ def test_a_table_typed_as_printed_has_no_differences() -> None:
     ("typed", "wrong", "said"),
     [
         ("17.90 best", "17.9 best", "Slow / One, Apples PSNR ↑: '17.9' best, the paper prints '17.90' best"),
-        ("17.90 best", "17.90", "'17.90', the paper prints '17.90' best"),
-        ("17.90 best", "17.90 second", "'17.90' second"),
         ("One dagger", "One", "Methods: 'One', the paper prints 'One' dagger"),
-        ("One dagger", "One star", "'One' star"),
         ("Two | - |", "Two | - | -", "Apples # LPIPS ↓: '-', the paper prints ''"),
         ("Fast | Three", "Slow | Three", "Rendering Speed: 'Slow', the paper prints 'Fast'"),
         ("Fast | Four | 17.4 second | 0.40", "Fast | Four | 17.4 second", "3 cells, the paper has 4"),
@@ -73,30 +70,16 @@ def test_every_difference_is_found(typed, wrong, said) -> None:
     assert said in found
 
 
-def test_another_heading_is_a_difference() -> None:
+def test_another_heading_phrase_or_table_and_a_table_without_headings_are_differences() -> None:
     (found,) = differences(table(), SMALL.replace("Apples", "Pears"))
     assert "Pears PSNR" in found
-
-
-def test_a_phrase_that_the_table_does_not_say_is_a_difference() -> None:
     assert differences(table(says="in inches"), SMALL) == ["small: the paper does not say 'in inches'"]
-
-
-def test_a_missing_table_and_one_without_headings_are_differences() -> None:
     assert differences(table(label="nowhere"), SMALL) == ["small: the paper has no table labelled nowhere"]
     assert differences(table(label="other", says="x"), SMALL) == ["small: no heading with PSNR"]
 
 
 def test_a_paper_without_tables_differs_in_all() -> None:
     assert len(check("")) == len(published())
-
-
-def test_cells_that_span_rows_are_repeated_and_comments_left_out() -> None:
-    found = environment(SMALL, "small")
-    assert found is not None
-    read = grid(found, "PSNR")
-    assert [row[0].text for row in read.rows] == ["Slow", "Slow", "Fast", "Fast"]
-    assert read.headings == list(HEADINGS)
 
 
 @pytest.mark.parametrize(

@@ -105,11 +105,6 @@ def test_a_sweep_without_finished_jobs_says_so(sweep, written, capsys) -> None:
     assert "Not finished: job=0." in capsys.readouterr().out
 
 
-def test_a_folder_without_jobs_says_so(sweep, written) -> None:
-    sweep.folder.mkdir()
-    assert "0 of 0 jobs have finished." in written(sweep)
-
-
 def test_the_chart_draws_bars_as_long_as_the_means(sweep) -> None:
     for ablation, psnr in {"full": 24.0, "m1": 12.0, "no_skips": 18.0}.items():
         sweep.scored(f"ablation={ablation}", psnr=psnr)
@@ -181,27 +176,14 @@ def test_a_plan_that_depends_on_other_files_is_not_guessed(sweep) -> None:
     assert summarize(sweep.folder).table.remarks[0] == "1 of 1 jobs have finished."
 
 
-def test_all_jobs_finished_need_no_list(ablations) -> None:
-    first, second, *_ = summarize(ablations.folder).table.remarks
-    assert first == "9 of 9 jobs have finished."
-    assert second == "Commit c0ffee."
-
-
-def test_the_command_is_given_once_without_the_folders_of_a_machine(ablations) -> None:
-    (command,) = summarize(ablations.folder).commands
-    assert command == "completesplat fit -m experiment=small ablation=full,no_skips data.root=.../set"
-
-
-def test_jobs_of_different_commits_are_told(sweep) -> None:
+def test_commits_machine_date_and_the_command_without_the_folders_of_a_machine_are_told(sweep) -> None:
     for seed, commit in enumerate(("c0ffee", "decade-dirty", "c0ffee")):
         sweep.add(f"seed={seed}", commit=commit)
-    assert "Commits c0ffee, decade-dirty." in summarize(sweep.folder).table.remarks
-
-
-def test_the_machine_and_the_date_are_told(ablations) -> None:
-    last = summarize(ablations.folder).table.remarks[-1]
-    assert machine()["processor"] in last
-    assert time.strftime("%Y-") in last
+    summary = summarize(sweep.folder)
+    assert "Commits c0ffee, decade-dirty." in summary.table.remarks
+    assert machine()["processor"] in summary.table.remarks[-1]
+    assert time.strftime("%Y-") in summary.table.remarks[-1]
+    assert summary.commands == ["completesplat fit -m experiment=small ablation=full,no_skips data.root=.../set"]
 
 
 CONFIG = """
@@ -252,20 +234,18 @@ def test_a_sweep_ends_with_its_table(launched, capsys) -> None:
     assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
 
 
-def test_a_sweep_with_a_failed_job_has_a_summary_of_the_others(launched) -> None:
-    with pytest.raises(ValueError, match="this job fails"):
-        launched("-m", "seed=0,1,2", "fails=1")
+@pytest.mark.parametrize(
+    ("override", "error", "finished", "missing"),
+    [("fails=1", ValueError, 2, "seed=1"), ("killed=1", KeyboardInterrupt, 1, "all, seed=1; all, seed=2")],
+)
+def test_a_sweep_that_fails_or_is_killed_has_a_summary_of_what_was_done(
+    launched, override, error, finished, missing
+) -> None:
+    with pytest.raises(error):
+        launched("-m", "seed=0,1,2", override)
     text = Path("swept/summary.md").read_text()
-    assert "2 of 3 jobs have finished." in text
-    assert "Not finished: seed=1." in text
-
-
-def test_a_sweep_that_is_killed_has_a_summary_of_what_was_done(launched) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        launched("-m", "seed=0,1,2", "killed=1")
-    text = Path("swept/summary.md").read_text()
-    assert "1 of 3 jobs have finished." in text
-    assert "Not finished: all, seed=1; all, seed=2." in text
+    assert f"{finished} of 3 jobs have finished." in text
+    assert f"Not finished: {missing}." in text
 
 
 def test_a_single_run_has_no_summary(launched, tmp_path) -> None:
