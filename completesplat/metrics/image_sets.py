@@ -20,16 +20,14 @@ SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
-Descriptors = list[Tensor]
-"""Of some images, kinds of descriptors: each [images * n features]."""
+Descriptors = list[Tensor]  # of some images, kinds of descriptors: each [images * n features]
 
 
 @runtime_checkable
 class SetMetric(Protocol):
     """Describes images one by one, and compares what it knows of two sets."""
 
-    regions: tuple[str, ...]
-    """Of the pixels that it looks at: "full", "object"."""
+    regions: tuple[str, ...]  # of the pixels that it looks at: "full", "object"
 
     def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """What is kept of images with values in [0, 1]; whatever it draws for an image depends on its seed only."""

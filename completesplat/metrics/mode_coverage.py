@@ -8,6 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+Samples = Float[Tensor, "sample pixel 3"]
+Modes = Float[Tensor, "mode pixel 3"]
+Probabilities = Float[Tensor, " mode"]
+PerPixel = Float[Tensor, "*view height width"]
 REJECTED = -1
 # Of variances of colours in [0, 1]: all below a deviation of 0.001, then two bins in each decade.
 EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.float64)
@@ -30,18 +34,12 @@ class HiddenModeScores:
     rejected: float
 
 
-def distances(
-    samples: Float[Tensor, "sample pixel 3"], modes: Float[Tensor, "mode pixel 3"]
-) -> Float[Tensor, "sample mode"]:
+def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
     """Root mean square difference of every sample and every mode."""
     return torch.stack([(samples - mode).square().mean((1, 2)).sqrt() for mode in modes], dim=1)
 
 
-def classify(
-    samples: Float[Tensor, "sample pixel 3"],
-    modes: Float[Tensor, "mode pixel 3"],
-    probabilities: Float[Tensor, " mode"],
-) -> Int64[Tensor, " sample"]:
+def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
     """The mode that each sample belongs to, or `REJECTED`.
 
     Raises:
@@ -66,11 +64,7 @@ def mean_of(
     return mean
 
 
-def scores(
-    samples: Float[Tensor, "sample pixel 3"],
-    modes: Float[Tensor, "mode pixel 3"],
-    probabilities: Float[Tensor, " mode"],
-) -> HiddenModeScores:
+def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
     """Scores of one scene; samples and modes are the region's pixels, those of all its views in one row.
 
     Raises:
@@ -107,7 +101,7 @@ def draw_modes(
 
 def spread_and_error(
     samples: Float[Tensor, "sample *view 3 height width"], truth: Float[Tensor, "*view 3 height width"]
-) -> tuple[Float[Tensor, "*view height width"], Float[Tensor, "*view height width"]]:
+) -> tuple[PerPixel, PerPixel]:
     """Variance over the samples (unbiased) and squared error of their mean, each a mean over the three channels.
 
     Raises:
@@ -119,9 +113,7 @@ def spread_and_error(
 
 
 def bin_sums(
-    variance: Float[Tensor, "*view height width"],
-    squared_error: Float[Tensor, "*view height width"],
-    region: Bool[Tensor, "*view height width"],
+    variance: PerPixel, squared_error: PerPixel, region: Bool[Tensor, "*view height width"]
 ) -> Float[Tensor, "bin 3"]:
     """Number of pixels, sum of variances and sum of squared errors of the region's pixels, by bin of variance.
 

@@ -19,6 +19,7 @@ from completesplat.scene import SceneBatch, Views
 
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
+Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
 MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
@@ -170,9 +171,7 @@ def _region(images: Tensor, truth: Views, region: str) -> Tensor:
 
 
 def depth_errors(
-    predicted: Float[Tensor, "image 1 height width"],
-    true: Float[Tensor, "image 1 height width"],
-    valid: Bool[Tensor, "image 1 height width"],
+    predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 height width"]
 ) -> list[dict[str, float] | None]:
     """For each image, over its valid pixels whose true depth is finite and above 0, without alignment of scale.
 

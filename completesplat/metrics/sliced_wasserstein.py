@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+Items = Float[Tensor, "item feature"]
 PATCH = 7
 SMALLEST_SIDE = 16
 PROJECTIONS, REPEATS = 128, 4
-SMALLEST_DEVIATION = 1e-4
-"""A fortieth of a step of 8 bits: less is rounding, and is not scaled up."""
+SMALLEST_DEVIATION = 1e-4  # A fortieth of a step of 8 bits: less is rounding, and is not scaled up
 
 
 def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image 3 _ _"]]:
@@ -93,12 +93,7 @@ def sliced_wasserstein(
     return 1000 * torch.stack(distances).mean().item()
 
 
-def projected_distance(
-    first: Float[Tensor, "item feature"],
-    second: Float[Tensor, "item feature"],
-    projections: int,
-    generator: torch.Generator,
-) -> Float[Tensor, ""]:
+def projected_distance(first: Items, second: Items, projections: int, generator: torch.Generator) -> Float[Tensor, ""]:
     """1-Wasserstein distance of two sets of one size on a line, mean over random directions (Rabin et al. 2011)."""
     directions = torch.randn(projections, first.shape[1], generator=generator)
     directions = (directions / directions.norm(dim=1, keepdim=True)).to(first)

@@ -20,8 +20,7 @@ SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
 ROWS = ("samplers.json", "controls.json", "depth.json")
 """What `completesplat report NAME` leaves beside its figure: settings and rows."""
-PROTOCOL = "protocol"
-"""Where results say how they were measured, beside the entries of the predictors."""
+PROTOCOL = "protocol"  # where results say how they were measured, beside the entries of the predictors
 NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
 """What a protocol must say, by the name of the file of results."""
 REGIONS = ("full", "object")
@@ -161,8 +160,7 @@ class Job:
     metrics: dict[str, Any] | None = None
     test: dict[str, Any] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
-    label: str = ""
-    """What the job is called among those of its sweep."""
+    label: str = ""  # what the job is called among those of its sweep
 
 
 SEED = "seed"

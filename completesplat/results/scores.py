@@ -10,19 +10,14 @@ from completesplat.results.runs import SEED, Job, Result
 from completesplat.results.tables import ABSENT, FORMATS, Cell, Notes, by_name, marks
 
 MODEL, BEST_OF_K, MEAN_OF_K = "model", "best_of_k", "mean_of_k"
-PROPOSED = "full"
-"""The unchanged method among the ablations: the last row, as in the paper."""
-UPPER_BOUND = "upper_bound"
-"""Marks jobs, and their rows, whose model has seen the views that it is scored on."""
+PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
+UPPER_BOUND = "upper_bound"  # marks jobs, and their rows, whose model has seen the views that it is scored on
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
-AGREEMENT = 1e-4
-"""How far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it."""
+AGREEMENT = 1e-4  # how far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
-WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]
-"""Scores in the table of a sweep."""
+WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]  # scores in the table of a sweep
 
-OURS = "completesplat: "
-"""Not "ours": so the paper calls its own rows."""
+OURS = "completesplat: "  # not "ours": so the paper calls its own rows
 DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
 DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
 DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]

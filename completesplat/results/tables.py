@@ -34,8 +34,7 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-Column = tuple[str, str, str]
-"""A heading, the key of the record, and the format of its values, empty for text."""
+Column = tuple[str, str, str]  # A heading, the key of the record, and the format of its values, empty for text
 LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
 EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
@@ -94,8 +93,7 @@ class Heading:
 
     text: str
     group: str = ""
-    figures: bool = True
-    """Whether the column is aligned to the right."""
+    figures: bool = True  # whether the column is aligned to the right
 
     def joined(self, separator: str = ": ") -> str:
         """Group and text in one."""
@@ -129,8 +127,7 @@ class Table:
     rows: list[TableRow]
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
-    gaps: bool = False
-    """Whether cells may be empty."""
+    gaps: bool = False  # whether cells may be empty
 
     def __post_init__(self) -> None:
         """Refuse a row that does not fit the headings, and an empty cell unless there may be gaps."""

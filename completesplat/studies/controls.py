@@ -15,8 +15,7 @@ from completesplat.scene import SceneBatch
 from completesplat.studies.figures import Strip, written_figure
 from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
 
-Settings = Sequence[tuple[float, float]]
-"""Skip and guidance weights."""
+Settings = Sequence[tuple[float, float]]  # skip and guidance weights
 Row = dict[str, float | bool | None]
 Tick = Callable[[str], None]
 Measure = Callable[[SceneBatch, float, float], Mapping[str, float | None]]

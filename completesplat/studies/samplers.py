@@ -16,8 +16,7 @@ from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
 REFERENCE = ("ddim", 50)
-CLOSE = 0.1
-"""Difference in PSNR, in dB, that does not count."""
+CLOSE = 0.1  # difference in PSNR, in dB, that does not count
 
 
 def rows(

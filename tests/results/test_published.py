@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
 from completesplat.results.published import tables
@@ -212,25 +211,17 @@ SWEPT = {"data_set": "toy_objects", "resolution": 32, "scenes": 9, "missing": {"
 
 
 @pytest.fixture
-def job(runs: Path):
+def job(runs: Path, sweep):
     """Writes a finished job of the sweep `runs/sweep`."""
+    sweep.folder = runs / "sweep"
 
     def write(ablation: str, seed: int, psnr: float, **protocol) -> None:
-        folder = runs / f"sweep/ablation={ablation},seed={seed}"
-        folder.mkdir(parents=True)
-        OmegaConf.save(OmegaConf.create({"seed": seed}), folder / "config.yaml")
-        record = {
-            "command": ["completesplat fit"],
-            "commit": "c",
-            "overrides": [f"ablation={ablation}", f"seed={seed}"],
-        }
-        (folder / "run.json").write_text(json.dumps(record))
         seconds = {"inference": 2.0 + seed, "rendering": 0.5}
         model = {"scenes": 9, "views": 9, "seconds": seconds, "full": {"novel": {"psnr": psnr, "ssim": 0.5}}}
         mean_image = {"scenes": 9, "views": 9, "full": {"novel": {"psnr": 10.0}}}
         test = {"protocol": SWEPT | protocol, "model": model, "mean_image": mean_image}
-        (folder / "metrics.json").write_text(json.dumps({"steps": 5, "test": test}))
-        OmegaConf.save(OmegaConf.create({"hydra": {"overrides": {"task": []}}}), runs / "sweep/multirun.yaml")
+        sweep.add(f"ablation={ablation}", f"seed={seed}", test=test)
+        sweep.plan([])
 
     return write
 
