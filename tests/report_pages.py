@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from completesplat.export.video import write_video
-from completesplat.results.html_elements import EMPTY
+from completesplat.results.html_page import EMPTY
 
 HOSTILE = '<img src=x onerror=alert(1)> & "quoted"'
 FRAMES, SAMPLES = 12, 3

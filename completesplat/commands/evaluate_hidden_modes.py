@@ -22,7 +22,7 @@ from completesplat.data.hidden_modes import hidden_modes
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.results.wandb import log_modes
-from completesplat.studies.hidden_modes import Measured, draw, measure, predictors, usable
+from completesplat.studies.mode_benchmark import Measured, draw, measure, predictors, usable
 from completesplat.training.loggers import finished
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
-from completesplat.metrics.missing import Missing, unless_missing
+from completesplat.metrics.images import Images, Missing, unless_missing
 from completesplat.metrics.sliced_wasserstein import descriptors, sliced_wasserstein
 from completesplat.weights import weights_file
 
@@ -20,18 +20,16 @@ SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
-Descriptors = list[Tensor]
-"""Of some images, kinds of descriptors: each [images * n features]."""
+Descriptors = list[Tensor]  # of some images, kinds of descriptors: each [images * n features]
 
 
 @runtime_checkable
 class SetMetric(Protocol):
     """Describes images one by one, and compares what it knows of two sets."""
 
-    regions: tuple[str, ...]
-    """Of the pixels that it looks at: "full", "object"."""
+    regions: tuple[str, ...]  # of the pixels that it looks at: "full", "object"
 
-    def describe(self, images: Float[Tensor, "image 3 height width"], seeds: Sequence[int]) -> Descriptors:
+    def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """What is kept of images with values in [0, 1]; whatever it draws for an image depends on its seed only."""
         ...
 
@@ -45,11 +43,7 @@ class SetMetric(Protocol):
 
 
 class ImageSets:
-    """Keeps what set metrics need of the images of each predictor, region and scene.
-
-    Args:
-        metrics: by any name.
-    """
+    """Keeps what set metrics need of the images of each predictor, region and scene."""
 
     TRUE = "true"
 
@@ -57,9 +51,7 @@ class ImageSets:
         self.metrics = metrics
         self.kept: dict[tuple[str, str, int], dict[str, Descriptors]] = defaultdict(dict)
 
-    def add(
-        self, owner: str, region: str, scene: str, images: Float[Tensor, "image 3 height width"], seeds: Sequence[int]
-    ) -> None:
+    def add(self, owner: str, region: str, scene: str, images: Images, seeds: Sequence[int]) -> None:
         """Images of a scene that belong to a predictor, or are `TRUE`; those of a scene are kept once."""
         for index, metric in enumerate(self.metrics):
             scenes = self.kept[owner, region, index]
@@ -72,37 +64,25 @@ class ImageSets:
         for index, metric in enumerate(self.metrics):
             own, true = self.kept[owner, region, index], self.kept[self.TRUE, region, index]
             if own:
-                order = sorted(own)
-                found |= metric.distances(*(_joined([scenes[name] for name in order]) for scenes in (true, own)))
+                parts = ([scenes[name] for name in sorted(own)] for scenes in (true, own))
+                found |= metric.distances(*([torch.cat(kind) for kind in zip(*part, strict=True)] for part in parts))
         return found
 
-    def state(self) -> dict[Any, Any]:
-        """What other processes need to know."""
-        return dict(self.kept)
-
-    def merge(self, state: dict[Any, Any]) -> None:
+    def merge(self, kept: dict[tuple[str, str, int], dict[str, Descriptors]]) -> None:
         """Add what another process kept."""
-        for key, scenes in state.items():
+        for key, scenes in kept.items():
             self.kept[key] |= scenes
 
 
-def _joined(parts: Sequence[Descriptors]) -> Descriptors:
-    return [torch.cat(kinds) for kinds in zip(*parts, strict=True)]
-
-
 class Patches:
-    """The sliced Wasserstein distance of patches, all pixels, as "swd"; see `sliced_wasserstein`.
-
-    Args:
-        patches: of each image and level of its pyramid.
-    """
+    """The sliced Wasserstein distance of `patches` patches an image and level, all pixels, as "swd"."""
 
     regions = ("full",)
 
     def __init__(self, patches: int = 16) -> None:
         self.patches = patches
 
-    def describe(self, images: Float[Tensor, "image 3 height width"], seeds: Sequence[int]) -> Descriptors:
+    def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """See `SetMetric`."""
         return list(descriptors(images, seeds, self.patches))
 
@@ -116,10 +96,9 @@ class Patches:
 
 
 class InceptionFeatures(nn.Module):
-    """Pool features of images, by a TorchScript Inception that takes bytes and resizes them itself; frozen.
+    """Pool features of images, by a frozen TorchScript Inception that takes bytes and resizes them itself.
 
-    Args:
-        network: called as NVlabs' `stylegan2-ada-pytorch/metrics` do: `network(bytes, return_features=True)`.
+    `network` is called as NVlabs' `stylegan2-ada-pytorch/metrics` do: `network(bytes, return_features=True)`.
     """
 
     def __init__(self, network: torch.jit.ScriptModule) -> None:
@@ -128,28 +107,23 @@ class InceptionFeatures(nn.Module):
         self.requires_grad_(False)
 
     @torch.no_grad()
-    def forward(self, images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image feature"]:
+    def forward(self, images: Images) -> Float[Tensor, "image feature"]:
         """Features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
         pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
         with torch.autocast(images.device.type, enabled=False):
-            return self.network(pixels, return_features=True).float()
+            features: Tensor = self.network(pixels, return_features=True).float()
+        return features
 
 
 class Inception:
-    """FID and KID, as "fid" and "kid", for all and for object pixels.
-
-    Args:
-        features: of images.
-        subset_size: of KID: items of a subset, at most.
-    """
+    """FID and KID (of subsets of at most `subset_size` items), as "fid" and "kid", for all and for object pixels."""
 
     regions = ("full", "object")
 
     def __init__(self, features: InceptionFeatures, subset_size: int = 1000) -> None:
-        self.features = features
-        self.subset_size = subset_size
+        self.features, self.subset_size = features, subset_size
 
-    def describe(self, images: Float[Tensor, "image 3 height width"], seeds: Sequence[int]) -> Descriptors:
+    def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """See `SetMetric`; nothing is drawn."""
         return [self.features.to(images.device)(images)]
 
@@ -173,12 +147,8 @@ def inception(weights: str | None, sha256: str | None = None, subset_size: int =
 def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
     """NVlabs' translation of the network that FID is defined with (Heusel et al. 2017; `inception-2015-12-05`).
 
-    A TorchScript file is a program, not mere weights: only the one with this hash is run. With `sha256` None any file
-    is run, and whoever gives it vouches for it.
-
-    Args:
-        weights: a file, or a URL (http or https) that is downloaded into torch's hub cache once.
-        sha256: the file's SHA-256, or its first digits.
+    A TorchScript file is a program, not mere weights: only the one with this SHA-256 (or these first digits of it) is
+    run. With None any file is run, and whoever gives it vouches for it. A URL is downloaded into torch's hub cache.
 
     Raises:
         WeightsError: the file is missing, cannot be downloaded, is another one, or is no such network.
@@ -188,7 +158,8 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256) -> Inception
         with warnings.catch_warnings():
             # torch would have new programs exported; this one is published as TorchScript only.
             warnings.simplefilter("ignore", DeprecationWarning)
-            network = torch.jit.load(str(path), map_location="cpu")
+            load: Callable[..., Any] = torch.jit.load
+            network = load(str(path), map_location="cpu")
     except (OSError, RuntimeError, ValueError) as error:
         raise WeightsError(f"{path}: not a readable TorchScript file; {DOWNLOAD_ADVICE}") from error
     if "return_features" not in {argument.name for argument in network.forward.schema.arguments}:
@@ -225,13 +196,8 @@ def kernel_distance(
 ) -> float:
     """Squared maximum mean discrepancy, unbiased, hence at times below zero (Binkowski et al. 2018, Section 4).
 
-    The kernel is (x.y / features + 1)^3. The mean over random subsets, in float64 and not multiplied by 1000; where a
-    set is larger than a subset, it depends on the order of the items.
-
-    Args:
-        subset_size: items in a subset, at most; all items of the smaller set where it has fewer.
-        subsets: number of subsets drawn from each set.
-        seed: of the subsets.
+    The kernel is (x.y / features + 1)^3. The mean over random subsets of at most `subset_size` items, in float64 and
+    not multiplied by 1000; where a set is larger than a subset, it depends on the order of the items.
 
     Raises:
         ValueError: a set of less than two.

@@ -1,32 +1,57 @@
 """Image metrics, one value per image: PSNR, SSIM, LPIPS where its weights are at hand."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.errors import WeightsError
 from completesplat.losses.lpips import PerceptualDistance, load_heads, load_vgg16
-from completesplat.metrics.missing import Missing, unless_missing
+
+Metric = TypeVar("Metric")
+Images = Float[Tensor, "image 3 height width"]
+PerImage = Float[Tensor, " image"]
 
 PSNR_LIMIT = 100.0
 """Identical images have an infinite PSNR; reported values stop here (dB), so that averages stay finite."""
 ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
 
 
-def psnr(
-    predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
-) -> Float[Tensor, " image"]:
+@dataclass(frozen=True)
+class Missing:
+    """Why metrics cannot be measured here, and their names in results; nothing stands in for them."""
+
+    reason: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"missing: {self.reason}"
+
+
+def unless_missing(
+    weights: str | None, load: Callable[[str], Metric], advice: str, names: tuple[str, ...]
+) -> Metric | Missing:
+    """What `load` makes of the weights; without them (`advice`), or where they cannot be used, why `names` miss."""
+    if weights is None:
+        return Missing(advice, names)
+    try:
+        return load(weights)
+    except WeightsError as error:
+        return Missing(" ".join(str(error).split()), names)
+
+
+def psnr(predicted: Images, true: Images) -> PerImage:
     """Peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
-    values = peak_signal_noise_ratio(predicted, true, data_range=1.0, reduction="none", dim=(1, 2, 3))
+    values: Tensor = peak_signal_noise_ratio(predicted, true, data_range=1.0, reduction="none", dim=(1, 2, 3))
     return values.clamp(max=PSNR_LIMIT)
 
 
-def ssim(
-    predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
-) -> Float[Tensor, " image"]:
+def ssim(predicted: Images, true: Images) -> PerImage:
     """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
 
     The mean is over all pixels, and the window sees the picture mirrored beyond its border, as in Flash3D's evaluator
@@ -57,10 +82,9 @@ class PerceptualMetric:
     def __init__(self, distance: PerceptualDistance) -> None:
         self.distance = distance
 
-    def __call__(
-        self, predicted: Float[Tensor, "image 3 height width"], true: Float[Tensor, "image 3 height width"]
-    ) -> Float[Tensor, " image"]:
-        return self.distance.to(predicted.device)(predicted, true)
+    def __call__(self, predicted: Images, true: Images) -> PerImage:
+        distances: Tensor = self.distance.to(predicted.device)(predicted, true)
+        return distances
 
 
 def perceptual_metric(

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
+Items = Float[Tensor, "item feature"]
 PATCH = 7
 SMALLEST_SIDE = 16
 PROJECTIONS, REPEATS = 128, 4
-SMALLEST_DEVIATION = 1e-4
-"""A fortieth of a step of 8 bits: less is rounding, and is not scaled up."""
+SMALLEST_DEVIATION = 1e-4  # A fortieth of a step of 8 bits: less is rounding, and is not scaled up
 
 
 def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image 3 _ _"]]:
@@ -53,12 +53,8 @@ def descriptors(
 ) -> list[Float[Tensor, "descriptor 147"]]:
     """Patches of each level of the pyramid, not yet normalised; those of all images of a set are concatenated.
 
-    An image's patches depend on itself and its seed only, so a set may be described in parts, by several processes.
-
-    Args:
-        images: values in [0, 1], sides of at least 16 pixels.
-        seeds: one an image, of the places of its patches; a prediction and its truth share theirs.
-        patches: number for each image and level.
+    An image's patches depend on itself and its seed only, so a set may be described in parts, by several processes. A
+    prediction and its truth share their seeds.
 
     Raises:
         ValueError: the images are smaller than 16 pixels, or another number of seeds.
@@ -80,14 +76,9 @@ def descriptors(
 def sliced_wasserstein(
     first: Sequence[Float[Tensor, "_ 147"]], second: Sequence[Float[Tensor, "_ 147"]], seed: int = 0
 ) -> float:
-    """Mean over the levels, multiplied by 1000 as in the paper's tables.
+    """Mean over the levels of two sets' descriptors, multiplied by 1000 as in the paper's tables.
 
-    Blind to brightness and contrast, which the normalisation of each set removes.
-
-    Args:
-        first: descriptors of one set, level by level.
-        second: descriptors of the other set, as many.
-        seed: of the projections.
+    Blind to brightness and contrast, which the normalisation of each set removes. `seed` is of the projections.
 
     Raises:
         ValueError: sets of different sizes.
@@ -97,26 +88,21 @@ def sliced_wasserstein(
     generator = torch.Generator().manual_seed(seed)
     distances = []
     for one, other in zip(first, second, strict=True):
-        sets = _normalize(one), _normalize(other)
+        sets = _normalized(one), _normalized(other)
         distances += [projected_distance(*sets, PROJECTIONS, generator) for _ in range(REPEATS)]
     return 1000 * torch.stack(distances).mean().item()
 
 
-def projected_distance(
-    first: Float[Tensor, "item feature"],
-    second: Float[Tensor, "item feature"],
-    projections: int,
-    generator: torch.Generator,
-) -> Float[Tensor, ""]:
+def projected_distance(first: Items, second: Items, projections: int, generator: torch.Generator) -> Float[Tensor, ""]:
     """1-Wasserstein distance of two sets of one size on a line, mean over random directions (Rabin et al. 2011)."""
     directions = torch.randn(projections, first.shape[1], generator=generator)
     directions = (directions / directions.norm(dim=1, keepdim=True)).to(first)
     one, other = ((directions @ x.T).sort(1).values for x in (first, second))
-    return (one - other).abs().mean()
+    return torch.mean((one - other).abs())
 
 
-def _normalize(patches: Float[Tensor, "descriptor 147"]) -> Float[Tensor, "descriptor 147"]:
+def _normalized(patches: Float[Tensor, "descriptor 147"]) -> Float[Tensor, "descriptor 147"]:
     """Each channel less its mean, over its deviation."""
-    channels = patches.unflatten(1, (3, PATCH * PATCH))
+    channels = patches.reshape(-1, 3, PATCH * PATCH)
     deviation, mean = torch.std_mean(channels, dim=(0, 2), correction=0, keepdim=True)
-    return ((channels - mean) / deviation.clamp(min=SMALLEST_DEVIATION)).flatten(1)
+    return torch.flatten((channels - mean) / deviation.clamp(min=SMALLEST_DEVIATION), 1)

@@ -1,58 +1,193 @@
 """One page of HTML that needs nothing else: tables, figures, and samples that turn under the mouse."""
 
+import io
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from PIL import Image
+
 from completesplat import __version__
 from completesplat.errors import CompleteSplatError
-from completesplat.results.html_elements import (
-    ByteBudget,
-    Html,
-    described,
-    element,
-    folded,
-    joined,
-    left_out,
-    picture,
-    scrollable,
-    turntable,
-)
 from completesplat.results.own import mode_tables, own_tables
 from completesplat.results.published import tables as compared
 from completesplat.results.runs import CONFIG, MODES, ROWS, SCENE, SCORES, RunTree, find, mapping_or_empty, origin
 from completesplat.results.scores import entries
 from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table, TableRow
 
-MARKED = {BEST: "strong", SECOND: "u"}
-PUBLISHED = "paper"
-"""The source of rows that are no results of ours."""
+EMPTY = {"img", "meta", "link", "br"}  # elements that have no end tag
 
-FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}
-"""Subfolders of a run, and the pictures in each."""
+WIDEST, MOST_PIXELS = 1600, 50_000_000
+"""Pixels of the widest picture shown, wider ones are made smaller; and of the largest read."""
+AS_THEY_ARE, QUALITY = 300_000, 85
+"""Bytes up to which a picture of that width is not encoded again; and quality of JPEG."""
+SIDE, LONGEST = 256, 60_000
+"""Pixels of a frame's longer side; and of the widest strip of frames (JPEG ends at 65,535)."""
+
+
+class Html(str):
+    """Text that is HTML. Everything else is plain text, whatever characters it holds."""
+
+
+def element(name: str, /, *children: str, **attributes: str | int | bool) -> Html:
+    """`<name attribute="value">children</name>`; children are elements, or plain text.
+
+    Attributes are `class_` for `class`, `aria_label` for `aria-label`; True for one without a value, False for none.
+    """
+    given = [(key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not False]
+    opened = "".join(f" {key}" if value is True else f' {key}="{escape(str(value))}"' for key, value in given)
+    if name in EMPTY:
+        return Html(f"<{name}{opened}>")
+    return Html(f"<{name}{opened}>{joined(*children)}</{name}>")
+
+
+def joined(*children: str) -> Html:
+    """Elements and plain text, one after the other."""
+    return Html("".join(child if isinstance(child, Html) else escape(child) for child in children))
+
+
+def scrollable(name: str, *children: str) -> Html:
+    """A box that scrolls sideways by itself, also by keyboard; `name` says what it holds to those who do not see it."""
+    return element("div", *children, class_="scroll", tabindex="0", role="region", aria_label=name)
+
+
+def folded(summary: str, *children: str, open_: bool = False) -> Html:
+    """A part that is shown when its summary is clicked."""
+    return element("details", element("summary", summary), *children, open=open_)
+
+
+def described(pairs: dict[str, str]) -> Html:
+    """Names and values, as a list; what is empty is left out."""
+    parts = [element("div", element("dt", name), element("dd", value)) for name, value in pairs.items() if value]
+    return element("dl", *parts)
+
+
+def left_out(text: str) -> Html:
+    """A line on what is not shown."""
+    return element("p", text, class_="left-out")
+
+
+class ByteBudget:
+    """The bytes that pictures may take in one page; data URIs take four characters for three bytes."""
+
+    def __init__(self, megabytes: float) -> None:
+        self.left = megabytes * 1e6
+
+    def uri(self, data: bytes, kind: str) -> str | None:
+        """The data URI of a picture, or None where it does not fit any more."""
+        uri = f"data:image/{kind};base64,{b64encode(data).decode()}"
+        if len(uri) > self.left:
+            return None
+        self.left -= len(uri)
+        return uri
+
+
+def picture(path: Path, caption: str, budget: ByteBudget) -> Html:
+    """A figure with its caption, which is also what is read out; or why it is not shown."""
+    try:
+        data, kind, width, height = _encoded(path)
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        return left_out(f"{caption}: cannot be shown ({' '.join(str(error).split())})")
+    if (uri := budget.uri(data, kind)) is None:
+        return left_out(f"{caption}: left out, the page is full")
+    image = element("img", src=uri, alt=caption, width=width, height=height, loading="lazy")
+    return element("figure", scrollable(caption, image), element("figcaption", caption), class_="picture")
+
+
+def _encoded(path: Path) -> tuple[bytes, str, int, int]:
+    """The file as it is if it is a small PNG, else a JPEG of it: bytes, kind, width and height."""
+    data = path.read_bytes()
+    with Image.open(io.BytesIO(data)) as image:
+        width, height = image.size
+        if width * height > MOST_PIXELS:
+            raise ValueError(f"{width} x {height} pixels are too many")
+        image.load()
+        if image.format == "PNG" and len(data) <= AS_THEY_ARE and width <= WIDEST:
+            return data, "png", width, height
+        small = image.convert("RGBA")
+    white = Image.new("RGBA", small.size, "white")
+    white.alpha_composite(small)
+    white.thumbnail((WIDEST, WIDEST * 4))
+    return as_jpeg(white.convert("RGB")), "jpeg", *white.size
+
+
+def as_jpeg(image: Image.Image) -> bytes:
+    """A JPEG file."""
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=QUALITY, optimize=True)
+    return file.getvalue()
+
+
+def strip(video: Path, count: int) -> tuple[Image.Image, int]:
+    """At most `count` frames from left to right, evenly spread over all of a video, and how many they are.
+
+    Raises:
+        OSError, RuntimeError, ValueError, IndexError: no readable video (imageio's; it depends on what is wrong).
+    """
+    import imageio.v2 as imageio
+
+    frames: list[Image.Image] = []
+    reader: Any
+    with imageio.get_reader(video, format="FFMPEG") as reader:
+        total = reader.count_frames()
+        wanted = {index * total // count for index in range(count)}
+        for index, frame in enumerate(reader):
+            if index in wanted:
+                image = Image.fromarray(np.asarray(frame))
+                image.thumbnail((SIDE, SIDE))
+                frames.append(image)
+    if not frames:
+        raise ValueError("it has no frames")
+    shown = [np.asarray(image) for image in frames[: LONGEST // frames[0].width]]
+    return Image.fromarray(np.concatenate(shown, axis=1)), len(shown)
+
+
+def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudget) -> Html:
+    """A figure of an orbit of one sample; without scripts the strip can be scrolled. Or why it is not shown."""
+    try:
+        joined, frames = strip(video, count)
+    except (OSError, RuntimeError, ValueError, IndexError) as error:
+        return left_out(f"{video.name}: cannot be shown ({' '.join(str(error).split())[:200]})")
+    uri, name = budget.uri(as_jpeg(joined), "jpeg"), f"{image}, {sample}"
+    if uri is None:
+        return left_out(f"{video.name}: left out, the page is full")
+    drawn = element("img", src=uri, alt=f"{name}, seen from {frames} directions", style=f"width:{100 * frames}%")
+    box = element(
+        "div",
+        drawn,
+        class_="turntable",
+        tabindex="0",
+        role="slider",
+        aria_label=f"{name}: turn it",
+        **{"aria_valuemin": "0", "aria_valuemax": str(frames - 1), "aria_valuenow": "0"},
+        aria_valuetext="0 degrees",
+        data_frames=str(frames),
+        style=f"aspect-ratio:{joined.width // frames}/{joined.height}",
+    )
+    angle = element("span", "0°", class_="angle", aria_hidden="true")
+    return element("figure", box, element("figcaption", sample, " ", angle))
+
+
+MARKED = {BEST: "strong", SECOND: "u"}
+PLAIN = (type(None), str, int, float)
+PUBLISHED = "paper"  # the source of rows that are no results of ours
+
+FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}  # subfolders of a run, and the pictures in each
 CAPTIONS = {
     "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
     "samples": ": samples of fixed scenes while training",
 }
-LONGEST = 20_000
-"""Characters of a configuration that are shown."""
-NAMED = {
-    "image": "photograph",
-    "mask": "mask",
-    "box": "box",
-    "fov_degrees": "degrees of view",
-    "seed": "seed",
-    "skip_weight": "skip weight",
-    "guidance_weight": "guidance",
-    "sampler": "sampler",
-    "steps": "steps",
-}
+MOST_CHARACTERS = 20_000  # characters of a configuration that are shown
+NAMED = {"image": "photograph", "mask": "mask", "box": "box", "fov_degrees": "degrees of view", "seed": "seed"}
+NAMED |= {"skip_weight": "skip weight", "guidance_weight": "guidance", "sampler": "sampler", "steps": "steps"}
 """Settings of a prediction, and what they are called here."""
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """What the browser enforces: this page asks for nothing, whatever is in it."""
-UNFOLDED = 3
-"""Up to this number of runs all are unfolded; of more, only those with a report's figure."""
+UNFOLDED = 3  # up to this number of runs all are unfolded; of more, only those with a report's figure
 HINT = (
     "Move the mouse over a sample, drag a finger across it, or give it the focus and use the arrow keys: all samples "
     "of the photograph turn together. What the photograph does not show is made up, differently in each sample."
@@ -74,9 +209,9 @@ class Limits:
 
 def comparison(table: Table) -> Html:
     """A table with what stands below it; without a result of ours it is folded."""
-    if is_published(table):
-        return folded(f"{table.title}: the published figures, none of ours", _whole(table))
-    return _whole(table)
+    below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
+    whole = element("div", _grid(table), folded("What this table says, and how it was measured", below))
+    return folded(f"{table.title}: the published figures, none of ours", whole) if is_published(table) else whole
 
 
 def is_published(table: Table) -> bool:
@@ -87,14 +222,9 @@ def is_published(table: Table) -> bool:
 def rows_of(title: str, rows: Sequence[Any]) -> Html:
     """Records with the same keys, such as `completesplat report samplers` writes."""
     records = [row for row in rows if isinstance(row, Mapping)]
-    keys = list(dict.fromkeys(str(key) for row in records for key, value in row.items() if _is_plain(value)))
+    keys = list(dict.fromkeys(str(key) for row in records for key, x in row.items() if isinstance(x, PLAIN)))
     body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
     return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body, gaps=True))
-
-
-def _whole(table: Table) -> Html:
-    below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
-    return element("div", _grid(table), folded("What this table says, and how it was measured", below))
 
 
 def _grid(table: Table) -> Html:
@@ -107,23 +237,15 @@ def _grid(table: Table) -> Html:
 
 
 def _head(table: Table) -> list[Html]:
-    spans = table.groups()
-    above = [element("th", name, scope="colgroup", colspan=count, class_="group") for name, count in spans]
-    names = [element("th", heading.text, scope="col", class_=_kind(heading)) for heading in table.headings]
-    return [element("tr", *above), element("tr", *names)] if above else [element("tr", *names)]
+    above = [element("th", name, scope="colgroup", colspan=count, class_="group") for name, count in table.groups()]
+    words = [False if heading.figures else "words" for heading in table.headings]
+    names = [element("th", h.text, scope="col", class_=kind) for h, kind in zip(table.headings, words, strict=True)]
+    return [element("tr", *cells) for cells in (above, names) if cells]
 
 
 def _cell(heading: Heading, cell: Cell) -> Html:
     text = element(MARKED[cell.mark], cell.text) if cell.mark in MARKED else cell.text
-    return element("td", text, class_=_kind(heading))
-
-
-def _kind(heading: Heading) -> str | bool:
-    return False if heading.figures else "words"
-
-
-def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, str | int | float)
+    return element("td", text, class_=False if heading.figures else "words")
 
 
 def _said(value: Any) -> str:
@@ -141,13 +263,9 @@ class ShownRun:
 
 
 def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bool) -> Html:
-    """A section of one run.
+    """A section of one run, unfolded at first if `open_`.
 
-    Args:
-        run: the run.
-        most_pictures: how many are shown of each subfolder, the latest; the section says how many others there are.
-        budget: bytes that are left in the page.
-        open_: whether it is unfolded at first.
+    Of each subfolder `most_pictures` are shown, the latest; the section says how many others there are.
     """
     parts = [described(origin(run.path, levels=0)), *map(comparison, run.tables)]
     for name in ROWS:
@@ -161,7 +279,7 @@ def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bo
         parts += _more(len(paths) - most_pictures, f"more in {run.name}/{part}".rstrip("/"))
     if (run.path / CONFIG).is_file():
         text = (run.path / CONFIG).read_text(encoding="utf-8", errors="replace")
-        cut = text[:LONGEST] + ("\n... cut here" if len(text) > LONGEST else "")
+        cut = text[:MOST_CHARACTERS] + ("\n... cut here" if len(text) > MOST_CHARACTERS else "")
         parts.append(folded("All settings", element("pre", cut, tabindex="0")))
     return element("details", element("summary", run.name), *parts, class_="run", open=open_)
 
@@ -180,7 +298,8 @@ def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget
         turntable(video, image, video.stem.replace("orbit_", "sample "), limits.frames, budget)
         for video in videos[: limits.samples]
     ]
-    parts = [element("h3", name), described({"settings": _settings(settings), **origin(path)})]
+    said = [f"{told} {_said(settings[key])}" for key, told in NAMED.items() if settings.get(key) is not None]
+    parts = [element("h3", name), described({"settings": ", ".join(said), **origin(path)})]
     if turning:
         parts.append(element("div", *turning, class_="samples"))
     parts += _more(len(videos) - limits.samples, "more samples")
@@ -190,19 +309,10 @@ def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget
     return element("section", *parts, aria_label=f"Prediction {name}")
 
 
-def _settings(settings: dict[str, Any]) -> str:
-    """The settings that matter, in one line."""
-    return ", ".join(f"{name} {_said(settings[key])}" for key, name in NAMED.items() if settings.get(key) is not None)
-
-
 def page(folder: Path, out: Path, limits: Limits, made: Mapping[str, str]) -> tuple[str, list[str]]:
-    """The page, and a line for each file of results that could not be used.
+    """The page on all below a folder but what lies in `out`, and a line for each file of results that is of no use.
 
-    Args:
-        folder: searched for runs and predictions.
-        out: where the page goes; what lies there is not shown.
-        limits: how much is shown.
-        made: command, date and commit of the page itself.
+    `made` are command, date and commit of the page itself.
 
     Raises:
         CompleteSplatError: there is no such folder, or nothing to show in it.
@@ -243,8 +353,8 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
         tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
     shown = []
     for path in tree.runs:
-        figures = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
-        figures = {part: paths for part, paths in figures.items() if paths}
+        found = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
+        figures = {part: paths for part, paths in found.items() if paths}
         shows = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
         if shows and path.resolve() != out.resolve():
             shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
@@ -254,14 +364,10 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
 def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str, str]) -> str:
     style, script = (Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
     identities = {name: name.lower().replace(" ", "-") for name in sections}
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=POLICY),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("title", title),
-        element("style", Html(style)),
-    )
+    meta: list[dict[str, Any]] = [{"charset": "utf-8"}, {"http_equiv": "Content-Security-Policy", "content": POLICY}]
+    meta.append({"name": "viewport", "content": "width=device-width, initial-scale=1"})
+    heads = [*(element("meta", **attributes) for attributes in meta), element("title", title)]
+    head = element("head", *heads, element("style", Html(style)))
     links = [element("li", element("a", name, href=f"#{identity}")) for name, identity in identities.items()]
     top = element("header", element("h1", title), element("nav", element("ul", *links), aria_label="Sections"))
     body = [

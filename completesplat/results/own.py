@@ -1,9 +1,9 @@
 """Tables of our own scores: one for each way of measuring, so that all rows of a table compare."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from completesplat.results.runs import Result
 from completesplat.results.scores import MODEL, Entry, described
@@ -35,18 +35,27 @@ IDENTITY += [Heading("rendering", "time per sequence"), Heading("scenes"), Headi
 SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
 SCORES |= {"rejected": "rejected ↓"}
 COUNTS = ("scenes", "samples")
+MODES_SAID = (
+    "Coverage: share of the modes that samples hit. Total variation: of the samples' distribution from the true one. "
+    "Sharpness: distance to the nearest mode over that of the modes' mean. Rejected: share of the samples."
+)
 
 
-def alike(protocol: dict[str, Any]) -> str:
-    """A key that is equal for protocols whose scores compare."""
-    return json.dumps([protocol.get(key) for key in ALIKE], sort_keys=True, default=str)
+Measured = TypeVar("Measured")
+
+
+def alike(found: Iterable[tuple[Measured, dict[str, Any]]], *more: str) -> dict[str, list[Measured]]:
+    """Those whose protocols say the same, by a key of it: scores compare within a group only."""
+    groups: dict[str, list[Measured]] = {}
+    for one, protocol in found:
+        key = json.dumps([protocol.get(name) for name in (*ALIKE, *more)], sort_keys=True, default=str)
+        groups.setdefault(key, []).append(one)
+    return groups
 
 
 def own_tables(entries: Sequence[Entry]) -> list[Table]:
     """The tables, in the order of data sets and protocols."""
-    groups: dict[str, list[Entry]] = {}
-    for entry in entries:
-        groups.setdefault(alike(entry.run.protocol), []).append(entry)
+    groups = alike((entry, entry.run.protocol) for entry in entries)
     return [_table(f"own_{index}", groups[key]) for index, key in enumerate(sorted(groups), 1)]
 
 
@@ -60,7 +69,12 @@ def protocol_said(protocol: dict[str, Any]) -> str:
 
 def _table(name: str, entries: Sequence[Entry]) -> Table:
     protocol, notes = entries[0].run.protocol, Notes()
-    kept = _distinct(entries)
+    # Own models first; a naive predictor, which scores the same in all runs of a protocol, once.
+    naive: dict[str, Entry] = {}
+    for entry in entries:
+        if not entry.own:
+            naive.setdefault(entry.predictor + json.dumps(entry.scores | {"seconds": None}, sort_keys=True), entry)
+    kept = [*(entry for entry in entries if entry.own), *naive.values()]
     shown = [column for column in COLUMNS if any(_known(entry, column) for entry in kept)]
     competing = [entry.own and not entry.upper_bound for entry in kept]
     marked = {name: marks([entry.value(name) for entry in kept], competing, name) for name in shown}
@@ -76,18 +90,6 @@ def _table(name: str, entries: Sequence[Entry]) -> Table:
     return Table(name, title, [*IDENTITY, *map(score_heading, shown)], rows, remarks, notes)
 
 
-def _distinct(entries: Sequence[Entry]) -> list[Entry]:
-    """Own models first; a naive predictor, which scores the same in all runs of a protocol, once."""
-    seen, naive = set(), []
-    for entry in entries:
-        scores = {key: value for key, value in entry.scores.items() if key != "seconds"}
-        key = entry.predictor + json.dumps(scores, sort_keys=True)
-        if not entry.own and key not in seen:
-            seen.add(key)
-            naive.append(entry)
-    return [*(entry for entry in entries if entry.own), *naive]
-
-
 def _known(entry: Entry, column: str) -> bool:
     """Whether a column has something to say: a figure, or why there is none."""
     region, _, name = column.split("_")
@@ -97,41 +99,29 @@ def _known(entry: Entry, column: str) -> bool:
 
 def mode_tables(runs: Sequence[Result]) -> list[Table]:
     """One for each protocol and number of samples."""
-    groups: dict[str, list[Result]] = {}
-    for run in runs:
-        groups.setdefault(f"{alike(run.protocol)} {run.protocol.get('samples')}", []).append(run)
+    groups = alike(((run, run.protocol) for run in runs), "samples")
     return [_modes_table(f"hidden_modes_{index}", groups[key]) for index, key in enumerate(sorted(groups), 1)]
 
 
 def _modes_table(name: str, runs: Sequence[Result]) -> Table:
-    notes = Notes()
-    ours: list[TableRow] = []
-    known: list[TableRow] = []
-    seen = []
+    notes, seen = Notes(), []
+    rows: dict[str, list[TableRow]] = {"ours": [], "known": []}
+
+    def shown(scores: dict[str, Any], key: str, form: str) -> Cell:
+        value = scores.get(key)
+        if not isinstance(value, int | float):
+            return notes.missing(f"{key.replace('_', ' ')}: the file of results holds none")
+        return Cell(format(value, form), value=float(value) if form else None)
+
     for run in runs:
         for method, scores in run.entries.items():
-            label = f"{run.protocol.get('method', 'model')}" if method == MODEL else method.replace("_", " ")
-            cells = [_cell(scores, key, ".3f", notes) for key in SCORES] + [
-                _cell(scores, key, "", notes) for key in COUNTS
-            ]
-            if method != MODEL and (label, cells) in seen:  # what is no model is the same in all runs
-                continue
-            seen.append((label, cells))
-            first = Cell(f"{label} [{notes.number(described(run))}]")
-            rows, source = (ours, "ours") if method == MODEL else (known, "known")
-            rows.append(TableRow(source, [first, *cells]))
+            label = str(run.protocol.get("method", "model")) if method == MODEL else method.replace("_", " ")
+            cells = [shown(scores, key, ".3f") for key in SCORES] + [shown(scores, key, "") for key in COUNTS]
+            if method == MODEL or (label, cells) not in seen:  # what is no model is the same in all runs
+                seen.append((label, cells))
+                source = "ours" if method == MODEL else "known"
+                rows[source].append(TableRow(source, [Cell(f"{label} [{notes.number(described(run))}]"), *cells]))
     headings = [Heading("method", figures=False), *map(Heading, SCORES.values()), *map(Heading, COUNTS)]
-    remarks = [
-        "Coverage: share of the modes that samples hit. Total variation: of the samples' distribution from the true "
-        "one. Sharpness: distance to the nearest mode over that of the modes' mean. Rejected: share of the samples.",
-    ]
     protocol = runs[0].protocol
     data = protocol.get("data_set") or f"data {str(protocol.get('data_fingerprint', 'unknown'))[:12]}"
-    return Table(name, f"Hidden modes, {data}", headings, [*ours, *known], remarks, notes)
-
-
-def _cell(scores: dict[str, Any], key: str, form: str, notes: Notes) -> Cell:
-    value = scores.get(key)
-    if not isinstance(value, int | float):
-        return notes.missing(f"{key.replace('_', ' ')}: the file of results holds none")
-    return Cell(format(value, form), value=float(value) if form else None)
+    return Table(name, f"Hidden modes, {data}", headings, [*rows["ours"], *rows["known"]], [MODES_SAID], notes)

@@ -56,18 +56,16 @@ class PrintedCell:
 
 @dataclass(frozen=True)
 class PrintedColumn:
-    """A column as printed: all levels of its heading joined, and what stands in it."""
+    """A column as printed: all levels of its heading joined; a key of `LEADING` or `METRICS`; the data set, if one."""
 
     heading: str
     key: str
-    """`method`, `speed`, `inference`, `rendering`, `scenes`, `resolution`, or one of `METRICS`."""
     data_set: str
-    """As a run's protocol names it; empty where the table holds several and the column belongs to none."""
 
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A table of the paper, and the protocol of its figures."""
+    """A table of the paper, and the protocol of its figures; the head of `figures.yaml` says what each entry is."""
 
     name: str
     place: str
@@ -76,24 +74,16 @@ class PublishedTable:
     region: str
     view: str
     evaluations: list[str]
-    """The protocols (`conf/evaluation/`) by which a run of ours is measured as these figures are."""
     says: list[str]
     columns: list[PrintedColumn]
     rows: list[list[PrintedCell]]
     legend: Mapping[str, str]
-    """What the marks dagger and star mean here."""
     resolution: str = ""
-    """The resolution of all rows; empty where each row states its own."""
     subset: str = ""
-    """The list of sequences that the figures are taken to be of; empty where there is one list only."""
     oracle_samples: int | None = None
-    """The samples of the row "k-best oracle"; None where there is no such row."""
     complete: Mapping[str, str] = field(default_factory=dict)
-    """How many scenes a complete run has, by the number that the paper prints, where they differ."""
     remarks: list[str] = field(default_factory=list)
-    """What must be known to compare with it."""
     options: Mapping[str, str] = field(default_factory=dict)
-    """Names of our configurations, and the methods that they stand for."""
 
     def data_sets(self) -> list[str]:
         """The data sets whose figures the table holds."""
@@ -105,9 +95,9 @@ def published() -> list[PublishedTable]:
     return [_table(entry) for entry in _content()["tables"]]
 
 
-def source() -> str:
-    """Authors, title and place of the paper."""
-    return _content()["source"]
+def _source(table: PublishedTable) -> str:
+    said = "best in bold and second best underlined as printed"
+    return f"Published figures: {_content()['source']}, {table.place}; {said}."
 
 
 def parse(cell: str) -> PrintedCell:
@@ -128,9 +118,8 @@ def _content() -> dict[str, Any]:
 
 def _table(entry: Mapping[str, Any]) -> PublishedTable:
     given = {key: value for key, value in entry.items() if key not in ("data_set", *MARKS)}
-    given["columns"] = [
-        PrintedColumn(**{"data_set": entry.get("data_set", "")} | column) for column in entry["columns"]
-    ]
+    data_set = {"data_set": entry.get("data_set", "")}
+    given["columns"] = [PrintedColumn(**data_set | column) for column in entry["columns"]]
     given["rows"] = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
     return PublishedTable(**given, legend={mark: entry[mark] for mark in MARKS if mark in entry})
 
@@ -147,20 +136,18 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     headings = [Heading(LEADING[key], "time per sequence" if key in COST else "", key not in IDENTITY) for key in keys]
     headings += [Heading(column.heading) for column in scored]
     rows = [TableRow("paper", _published(table, row, keys)) for row in table.rows]
-    for entry in entries:
-        if belongs(table, entry):
-            cells = [_own(entry, key, notes) for key in keys]
-            for column in scored:
-                fits = column.data_set == entry.run.protocol["data_set"]
-                cells.append(entry.cell(f"{table.region}_{table.view}_{column.key}", notes) if fits else Cell(ABSENT))
-            rows.append(TableRow("ours", cells))
+    for entry in (entry for entry in entries if belongs(table, entry)):
+        protocol = entry.run.protocol
+        own = {"method": entry.method(notes), "speed": Cell(ABSENT)} | {key: entry.time(key) for key in COST}
+        own |= {key: Cell(str(protocol[key])) for key in ("scenes", "resolution")}
+        cells = [own[key] for key in keys]
+        for column in scored:
+            fits = column.data_set == protocol["data_set"]
+            cells.append(entry.cell(f"{table.region}_{table.view}_{column.key}", notes) if fits else Cell(ABSENT))
+        rows.append(TableRow("ours", cells))
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
     remarks = [_source(table), *signs, LEGEND, VIEWS, *table.remarks]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
-
-
-def _source(table: PublishedTable) -> str:
-    return f"Published figures: {source()}, {table.place}; best in bold and second best underlined as printed."
 
 
 def belongs(table: PublishedTable, entry: Entry) -> bool:
@@ -210,17 +197,9 @@ def shown(printed: PrintedCell) -> Cell:
     return Cell((printed.text or BLANK) + signs, mark)
 
 
-def _own(entry: Entry, key: str, notes: Notes) -> Cell:
-    if key == "method":
-        return entry.method(notes)
-    if key in COST:
-        return entry.time(key)
-    return Cell(ABSENT if key == "speed" else str(entry.run.protocol[key]))
-
-
 def published_ablations(table: PublishedTable) -> Table:
     """The paper's figures alone."""
-    headings = [Heading("setting", figures=False), *_headings(table)]
+    headings = [Heading("setting", figures=False), *(Heading(c.heading, "published") for c in table.columns[1:])]
     body = [TableRow("paper", [shown(cell) for cell in row]) for row in table.rows]
     return Table(table.name, f"{table.place}: {table.title}", headings, body, [_source(table), LEGEND])
 
@@ -233,9 +212,7 @@ def sweep_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> list[
     tested = [job for job in jobs if job.protocol]
     if not any(_option(job.label, table) for job in tested):
         return []
-    groups: dict[str, list[Job]] = {}
-    for job in tested:
-        groups.setdefault(alike(job.protocol), []).append(job)
+    groups = alike((job, job.protocol) for job in tested)
     return [_ablations_beside(table, group, name) for group in groups.values()]
 
 
@@ -251,7 +228,8 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
     ours = {_option(row["ablation"], table) for row in own}
     absent = [Cell(ABSENT)] * (4 + len(COLUMNS))
     body += [TableRow("paper", [Cell(ABSENT), *row, *absent]) for method, row in printed.items() if method not in ours]
-    headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False), *_headings(table)]
+    headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False)]
+    headings += [Heading(column.heading, "published") for column in table.columns[1:]]
     group = f"ours: {protocol['data_set']}, {protocol['resolution']} pixels"
     headings += [Heading(text, group) for text in ("seeds", "scenes", *COST, *map(metric, COLUMNS))]
     remarks = [_source(table), f"Ours: {name}, mean ± sample deviation over seeds. {protocol_said(protocol)}"]
@@ -270,7 +248,11 @@ def _ablation(
     label, reasons = row["ablation"], jobs[0].protocol.get("missing") or {}
     published = printed.get(_option(label, table), [Cell(ABSENT)] * len(table.columns))
     counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
-    cells = [Cell(label), *published, *counts, *_times([job for job in jobs if job.label == label])]
+    cells = [Cell(label), *published, *counts]
+    seconds = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs if job.label == label]
+    for part in COST:
+        measured = [found[part] for found in seconds if found.get(part) is not None]
+        cells.append(time_cell(sum(measured) / len(measured) if measured else None))
     for column, cell in zip(COLUMNS, scores, strict=True):
         name = column.rpartition("_")[2]
         reason = f"{name}: {reasons.get(name, 'not measured in all jobs of this row')}"
@@ -281,18 +263,6 @@ def _ablation(
 def _option(label: str, table: PublishedTable) -> str:
     """The paper's row that a row of ours stands for; empty if there is none."""
     return next((table.options[part] for part in label.split(", ") if part in table.options), "")
-
-
-def _headings(table: PublishedTable) -> list[Heading]:
-    """The headings of the published figures."""
-    return [Heading(column.heading, "published") for column in table.columns[1:]]
-
-
-def _times(jobs: Sequence[Job]) -> list[Cell]:
-    """The times of one sequence, mean over jobs."""
-    found = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs]
-    measured = [[entry[part] for entry in found if entry.get(part) is not None] for part in COST]
-    return [time_cell(sum(seconds) / len(seconds) if seconds else None) for seconds in measured]
 
 
 def tables(tree: RunTree | None) -> list[Table]:
@@ -308,12 +278,10 @@ def tables(tree: RunTree | None) -> list[Table]:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    sweeps = {folder: collect(folder) for folder in tree.sweeps}
     made: list[Table] = []
     (ablations,) = (table for table in published() if table.options)
-    compared = {
-        folder: sweep_beside(ablations, jobs, str(folder.relative_to(tree.folder))) for folder, jobs in sweeps.items()
-    }
+    names = {folder: str(folder.relative_to(tree.folder)) for folder in tree.sweeps}
+    compared = {folder: sweep_beside(ablations, collect(folder), name) for folder, name in names.items()}
     single = entries([run for run in tree.scores if not compared.get(run.folder.parent)])
     for table in published():
         if table.options:

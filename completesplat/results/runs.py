@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, ValueType
+from hydra.core.override_parser.types import ValueType
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
@@ -20,8 +20,7 @@ SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
 ROWS = ("samplers.json", "controls.json", "depth.json")
 """What `completesplat report NAME` leaves beside its figure: settings and rows."""
-PROTOCOL = "protocol"
-"""Where results say how they were measured, beside the entries of the predictors."""
+PROTOCOL = "protocol"  # where results say how they were measured, beside the entries of the predictors
 NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
 """What a protocol must say, by the name of the file of results."""
 REGIONS = ("full", "object")
@@ -134,16 +133,11 @@ def _is_entry(entry: dict[str, Any]) -> bool:
 
 def origin(path: Path, levels: int = 1) -> dict[str, str]:
     """Command, date and commit of what lies in a folder, as its `run.json` or that of one of `levels` parents says."""
-    for place in [path, *path.parents[:levels]]:
-        record = mapping_or_empty(place / RECORD)
-        if record:
-            command = record.get("command")
-            return {
-                "command": typed(command) if isinstance(command, list) else "",
-                "started": str(record.get("started") or ""),
-                "commit": str(record.get("commit") or ""),
-            }
-    return {"command": "", "started": "", "commit": ""}
+    records = (mapping_or_empty(place / RECORD) for place in [path, *path.parents[:levels]])
+    record: dict[str, Any] = next(filter(None, records), {})
+    command = record.get("command")
+    said = {"command": typed(command) if isinstance(command, list) else ""}
+    return said | {key: str(record.get(key) or "") for key in ("started", "commit")}
 
 
 def typed(command: Sequence[Any]) -> str:
@@ -154,31 +148,19 @@ def typed(command: Sequence[Any]) -> str:
 
 @dataclass(frozen=True)
 class Job:
-    """A job of a sweep. One that has not started has no name, one that is not done has no `metrics`."""
+    """A job of a sweep: its folder's name (empty before its start), `run.json`, `metrics.json` (None until it is done).
+
+    `test` (`Evaluation.results` by predictor) and `protocol` are empty where nothing was tested.
+    """
 
     name: str
-    """That of the job's folder."""
     overrides: dict[str, str] = field(default_factory=dict)
     config: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
-    """The job's `run.json`."""
     metrics: dict[str, Any] | None = None
-    label: str = ""
-    """What the job is called among those of its sweep."""
-
-    @property
-    def test(self) -> dict[str, Any]:
-        """`Evaluation.results` of the test set, by predictor; empty where nothing was tested."""
-        return {key: entry for key, entry in self._results.items() if key != PROTOCOL}
-
-    @property
-    def protocol(self) -> dict[str, Any]:
-        """How the test was done; empty where nothing was tested, or where the results do not say it."""
-        return self._results.get(PROTOCOL, {})
-
-    @property
-    def _results(self) -> dict[str, Any]:
-        return (self.metrics or {}).get("test", {})
+    test: dict[str, Any] = field(default_factory=dict)
+    protocol: dict[str, Any] = field(default_factory=dict)
+    label: str = ""  # what the job is called among those of its sweep
 
 
 SEED = "seed"
@@ -187,7 +169,10 @@ SEED = "seed"
 def collect(folder: Path) -> list[Job]:
     """All jobs of a sweep's folder; those without a folder of their own, which have not started, at the end."""
     folders = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    found = [_job(path) for path in sorted(folders, key=_natural)]
+    # `seed=10` stands behind `seed=9`.
+    split = {path: re.split(r"(\d+)", path.name) for path in folders}
+    natural = {path: [int(part) if part.isdecimal() else part for part in parts] for path, parts in split.items()}
+    found = [_job(path) for path in sorted(folders, key=natural.__getitem__)]
     recorded = [job for job in found if job.record]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
@@ -199,8 +184,8 @@ def collect(folder: Path) -> list[Job]:
 def planned(folder: Path) -> list[list[str]]:
     """The overrides of all jobs by number, of which hydra's sweeper makes the product.
 
-    They come from the `multirun.yaml` that hydra leaves in the folder when a sweep starts. Empty where there is none,
-    or where it takes more than that file to know the jobs: `glob(...)` depends on the files of the configuration.
+    Empty without the `multirun.yaml` that hydra leaves in the folder when a sweep starts, or where it takes more than
+    that file to know the jobs: `glob(...)` depends on the files of the configuration.
     """
     if not (folder / PLAN).is_file():
         return []
@@ -209,15 +194,11 @@ def planned(folder: Path) -> list[list[str]]:
     overrides = OverridesParser.create().parse_overrides(given)
     if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
         return []
-    choices = {override.get_key_element(): _choices(override) for override in overrides}
-    return [list(job) for job in product(*choices.values())]
-
-
-def _choices(override: Override) -> list[str]:
-    key = override.get_key_element()
-    if override.is_discrete_sweep():
-        return [f"{key}={value}" for value in override.sweep_string_iterator()]
-    return [f"{key}={override.get_value_element_as_str()}"]
+    values = {
+        o.get_key_element(): o.sweep_string_iterator() if o.is_discrete_sweep() else [o.get_value_element_as_str()]
+        for o in overrides
+    }
+    return [list(job) for job in product(*([f"{key}={value}" for value in of] for key, of in values.items()))]
 
 
 def _pairs(overrides: Sequence[str]) -> dict[str, str]:
@@ -229,11 +210,6 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
     return {key: value for key, _, value in split if key != "out" and (key, value) != ("ckpt_path", "last")}
 
 
-def _natural(path: Path) -> list[str | int]:
-    """A key that sorts `seed=10` behind `seed=9`."""
-    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
-
-
 def _job(folder: Path) -> Job:
     record = mapping_or_empty(folder / RECORD)
     if not record:
@@ -241,7 +217,10 @@ def _job(folder: Path) -> Job:
     config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
     assert isinstance(config, dict)
     named = {str(key): value for key, value in config.items()}
-    return Job(folder.name, _pairs(record["overrides"]), named, record, mapping_or_empty(folder / SCORES) or None)
+    metrics = mapping_or_empty(folder / SCORES) or None
+    test: dict[str, Any] = dict((metrics or {}).get("test", {}))
+    protocol = test.pop(PROTOCOL, {})
+    return Job(folder.name, _pairs(record["overrides"]), named, record, metrics, test, protocol)
 
 
 def _labelled(jobs: Sequence[Job]) -> list[Job]:

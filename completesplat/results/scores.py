@@ -10,19 +10,14 @@ from completesplat.results.runs import SEED, Job, Result
 from completesplat.results.tables import ABSENT, FORMATS, Cell, Notes, by_name, marks
 
 MODEL, BEST_OF_K, MEAN_OF_K = "model", "best_of_k", "mean_of_k"
-PROPOSED = "full"
-"""The unchanged method among the ablations: the last row, as in the paper."""
-UPPER_BOUND = "upper_bound"
-"""Marks jobs, and their rows, whose model has seen the views that it is scored on."""
+PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
+UPPER_BOUND = "upper_bound"  # marks jobs, and their rows, whose model has seen the views that it is scored on
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
-AGREEMENT = 1e-4
-"""How far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it."""
+AGREEMENT = 1e-4  # how far, relatively, a naive predictor's scores may lie apart in two jobs before the summary says it
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
-WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]
-"""Scores in the table of a sweep."""
+WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]  # scores in the table of a sweep
 
-OURS = "completesplat: "
-"""Not "ours": so the paper calls its own rows."""
+OURS = "completesplat: "  # not "ours": so the paper calls its own rows
 DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
 DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
 DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]
@@ -41,7 +36,11 @@ def rows(finished: Sequence[Job]) -> list[dict[str, Any]]:
     for job in finished:
         shared = frozenset((key, value) for key, value in job.overrides.items() if key != SEED)
         settings.setdefault(shared, []).append(job)
-    ours = sorted((_row(jobs, names) for jobs in settings.values()), key=_order)
+
+    def order(row: dict[str, Any]) -> list[tuple[bool, str]]:  # alphabetical, part by part, the unchanged method last
+        return [(part == PROPOSED, part) for part in row["ablation"].split(", ")]
+
+    ours = sorted((_row(jobs, names) for jobs in settings.values()), key=order)
     return [*ours, *(_naive_row(predictor, finished, names) for predictor in _naive_predictors(finished))]
 
 
@@ -64,14 +63,10 @@ def _scores(job: Job, predictor: str) -> dict[str, float]:
     return by_name(job.test.get(predictor, {}))
 
 
-def _order(row: dict[str, Any]) -> list[tuple[bool, str]]:
-    """A key that sorts labels alphabetically, part by part, the unchanged method last."""
-    return [(part == PROPOSED, part) for part in row["ablation"].split(", ")]
-
-
 def _row(jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
     measured = [job.metrics for job in jobs if job.metrics]
-    row: dict[str, Any] = {"ablation": jobs[0].label, "seeds": len(jobs), "scenes": _scenes(jobs, MODEL)}
+    scenes = _one_or_all(job.test[MODEL]["scenes"] for job in jobs if MODEL in job.test)
+    row: dict[str, Any] = {"ablation": jobs[0].label, "seeds": len(jobs), "scenes": scenes}
     row["steps"] = _one_or_all(metrics["steps"] for metrics in measured)
     row[UPPER_BOUND] = any(metrics.get(UPPER_BOUND) for metrics in measured)
     tables = [_scores(job, MODEL) for job in jobs]
@@ -85,8 +80,8 @@ def _row(jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
 
 
 def _naive_row(predictor: str, jobs: Sequence[Job], names: Sequence[str]) -> dict[str, Any]:
-    row: dict[str, Any] = {"ablation": predictor, "seeds": None, "scenes": _scenes(jobs, predictor), "steps": None}
-    row[UPPER_BOUND] = False
+    scenes = _one_or_all(job.test[predictor]["scenes"] for job in jobs if predictor in job.test)
+    row: dict[str, Any] = dict(zip(IDENTITY, (predictor, None, scenes, None, False), strict=True))
     tables = [_scores(job, predictor) for job in jobs]
     for name in names:
         values = [table[name] for table in tables if name in table]
@@ -97,10 +92,6 @@ def _naive_row(predictor: str, jobs: Sequence[Job], names: Sequence[str]) -> dic
 
 def _agree(values: Sequence[float]) -> bool:
     return np.allclose(values, values[0], rtol=AGREEMENT, atol=0, equal_nan=True)
-
-
-def _scenes(jobs: Sequence[Job], predictor: str) -> int | str | None:
-    return _one_or_all(job.test[predictor]["scenes"] for job in jobs if predictor in job.test)
 
 
 def _one_or_all(values: Iterable[int]) -> int | str | None:
@@ -123,16 +114,13 @@ def figures(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> list[list[C
     columns = []
     for name in names:
         means = [row.get(f"{name}_mean") for row in rows]
-        deviations = [row.get(f"{name}_deviation") for row in rows]
-        texts = [_figure(*pair, FORMATS[name.rpartition("_")[2]]) for pair in zip(means, deviations, strict=True)]
+        form, texts = FORMATS[name.rpartition("_")[2]], []
+        for row, mean in zip(rows, means, strict=True):
+            deviation = row.get(f"{name}_deviation")
+            after = "" if deviation is None else f" ± {deviation:{form}}"
+            texts.append("" if mean is None else f"{mean:{form}}{after}")
         columns.append([Cell(*cell) for cell in zip(texts, marks(means, competing, name), means, strict=True)])
     return [list(cells) for cells in zip(*columns, strict=True)]
-
-
-def _figure(mean: float | None, deviation: float | None, form: str) -> str:
-    if mean is None:
-        return ""
-    return format(mean, form) if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
 
 
 @dataclass(frozen=True)
@@ -155,19 +143,14 @@ class Entry:
 
     def method(self, notes: Notes) -> Cell:
         """The method, what of its samples was scored, and the number of the note on how it was measured."""
-        return Cell(f"{self._label()} [{notes.number(described(self.run))}]")
-
-    def _label(self) -> str:
-        if not self.own:
-            return OURS + self.predictor.replace("_", " ")
-        protocol = self.run.protocol
-        method, samples = str(protocol.get("method", "model")), protocol.get("samples", 1)
-        kinds = {
-            BEST_OF_K: f", {samples}-best oracle",
-            MEAN_OF_K: f", mean of {samples} samples",
-            MODEL: ", single sample" if protocol.get("sampler") else "",
-        }
-        return OURS + method + kinds[self.predictor] + (" (upper bound)" if self.upper_bound else "")
+        protocol, label = self.run.protocol, self.predictor.replace("_", " ")
+        if self.own:
+            samples = protocol.get("samples", 1)
+            kinds = {BEST_OF_K: f", {samples}-best oracle", MEAN_OF_K: f", mean of {samples} samples"}
+            kinds[MODEL] = ", single sample" if protocol.get("sampler") else ""
+            label = f"{protocol.get('method', 'model')}{kinds[self.predictor]}"
+            label += " (upper bound)" if self.upper_bound else ""
+        return Cell(f"{OURS}{label} [{notes.number(described(self.run))}]")
 
     def value(self, name: str) -> float | None:
         """The score named `REGION_VIEW_METRIC`; None if it was not measured."""
@@ -207,15 +190,11 @@ def time_cell(seconds: float | None) -> Cell:
 def described(run: Result) -> str:
     """How a run was measured, in one line."""
     protocol = run.protocol
-    said = [f"{key} {_counted(protocol[key])}" for key in DESCRIBED if protocol.get(key) is not None]
+    known = {key: protocol[key] for key in DESCRIBED if protocol.get(key) is not None}
+    said = [f"{key} {len(value) if isinstance(value, list) else value}" for key, value in known.items()]
     checkpoint = protocol.get("checkpoint") or {}
     said += [f"checkpoint {key} {str(checkpoint[key])[:12]}" for key in ("step", "sha256") if checkpoint.get(key)]
     fingerprint, machine = protocol.get("data_fingerprint"), protocol.get("machine") or {}
     said += [f"data {str(fingerprint)[:12]}"] if fingerprint else []
     said += [f"on {machine.get('gpu') or machine.get('processor')}, {machine.get('date')}"] if machine else []
     return f"{run.name}: {', '.join(said)}."
-
-
-def _counted(value: Any) -> Any:
-    """The number of names in a list of them."""
-    return len(value) if isinstance(value, list) else value

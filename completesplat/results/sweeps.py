@@ -75,18 +75,14 @@ def _summarize(config: Any, last: bool) -> None:
 
 @dataclass(frozen=True)
 class Summary:
-    """What is said of a sweep."""
+    """What is said of a sweep: rows with all metrics in all digits, and a table of the headline columns with remarks.
+
+    `commands` started the jobs; usually there is one. Each absolute path is cut to its last part.
+    """
 
     rows: list[dict[str, Any]]
-    """Those of `completesplat.results.scores`: all metrics, in all digits."""
     table: Table
-    """The headline columns; the remarks stand below."""
     commands: list[str]
-
-    @property
-    def remarks(self) -> list[str]:
-        """Sentences on what has finished and what compares."""
-        return self.table.remarks
 
 
 def summarize(folder: Path) -> Summary:
@@ -95,7 +91,8 @@ def summarize(folder: Path) -> Summary:
 
     jobs = collect(folder)
     found = rows([job for job in jobs if job.metrics is not None])
-    return Summary(found, _table(found, _remarks(jobs, found)), _commands(jobs))
+    commands = dict.fromkeys(FOLDERS.sub(".../", typed(job.record["command"])) for job in jobs if job.record)
+    return Summary(found, _table(found, _remarks(jobs, found)), list(commands))
 
 
 def _table(rows: Sequence[dict[str, Any]], remarks: list[str]) -> Table:
@@ -103,34 +100,33 @@ def _table(rows: Sequence[dict[str, Any]], remarks: list[str]) -> Table:
 
     shown, identity = headline(rows), ("ablation", "seeds", "scenes")
     body = [
-        TableRow("naive" if row["seeds"] is None else "ours", [*(_cell(row[key]) for key in identity), *cells])
+        TableRow(
+            "naive" if row["seeds"] is None else "ours",
+            [*(Cell("" if row[key] is None else str(row[key])) for key in identity), *cells],
+        )
         for row, cells in zip(rows, figures(rows, shown), strict=True)
     ]
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, shown)]
     return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks, gaps=True)
 
 
-def _cell(value: Any) -> Cell:
-    return Cell("" if value is None else str(value))
-
-
 def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences: how many jobs have finished, which have not, what must not be compared, commit, machine and date."""
     finished = [job for job in jobs if job.metrics is not None]
     said = [f"{len(finished)} of {len(jobs)} jobs have finished."]
-    missing = [_described(job) for job in jobs if job.metrics is None]
+    missing = []
+    for job in (job for job in jobs if job.metrics is None):
+        seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
+        missing.append(job.name or ", ".join([job.label, *seed]))  # there is no folder before a job starts
     if missing:
         said.append(f"Not finished: {'; '.join(missing)}.")
     commits = list(dict.fromkeys(job.record["commit"] or "unknown" for job in jobs if job.record))
     said += _incomparable(finished, rows)
     said.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
-    return [*said, _machine()]
-
-
-def _described(job: Job) -> str:
-    """The job's folder; `no_skips, seed=1` where there is none yet."""
-    seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
-    return job.name or ", ".join([job.label, *seed])
+    here = machine()
+    hardware = ", ".join([here["processor"], f"{here['cores']} cores", *([here["gpu"]] if "gpu" in here else [])])
+    software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
+    return [*said, f"Summary of {here['date']}, made on {hardware}, {software}."]
 
 
 def _incomparable(finished: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
@@ -144,19 +140,6 @@ def _incomparable(finished: Sequence[Job], rows: Sequence[dict[str, Any]]) -> li
     for predictor in disagreeing(finished):
         said.append(f"{predictor} does not score the same in all jobs, so they differ in their test data; its mean.")
     return said
-
-
-def _machine() -> str:
-    here = machine()
-    hardware = ", ".join([here["processor"], f"{here['cores']} cores", *([here["gpu"]] if "gpu" in here else [])])
-    software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
-    return f"Summary of {here['date']}, made on {hardware}, {software}."
-
-
-def _commands(jobs: Sequence[Job]) -> list[str]:
-    """The commands that started the jobs, usually one, each absolute path cut to its last part."""
-    lines = (typed(job.record["command"]) for job in jobs if job.record)
-    return list(dict.fromkeys(FOLDERS.sub(".../", line) for line in lines))
 
 
 def write_summary(folder: Path) -> Summary:
@@ -174,14 +157,14 @@ def write_summary(folder: Path) -> Summary:
 
 def _markdown(summary: Summary) -> str:
     table = "\n".join(markdown_lines(summary.table)) if summary.rows else NOTHING
-    remarks = "\n".join(f"- {remark}" for remark in summary.remarks)
+    remarks = "\n".join(f"- {remark}" for remark in summary.table.remarks)
     commands = "```\n" + "\n".join(summary.commands) + "\n```\n" if summary.commands else ""
     return f"{table}\n\n{CAPTION}\n\n{remarks}\n\n{commands}".rstrip() + "\n"
 
 
 def _latex(summary: Summary) -> str:
     table = latex_lines(summary.table) if summary.rows else [escape(NOTHING)]
-    remarks = [escape(f"{remark} ") + r"\par" for remark in (CAPTION, *summary.remarks)]
+    remarks = [escape(f"{remark} ") + r"\par" for remark in (CAPTION, *summary.table.remarks)]
     commands = [rf"\texttt{{{escape(command)}}}\par" for command in summary.commands]
     below = [r"\par\smallskip\footnotesize\raggedright", *remarks, *commands]
     lines = [r"% \usepackage{booktabs}", r"\begin{table}", r"\centering", *table, *below, r"\end{table}"]

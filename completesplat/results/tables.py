@@ -1,7 +1,7 @@
 """The one type of table, and its writers: Markdown, LaTeX, CSV and the terminal."""
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise, product
 from pathlib import Path
@@ -34,8 +34,7 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-Column = tuple[str, str, str]
-"""A heading, the key of the record, and the format of its values, empty for text."""
+Column = tuple[str, str, str]  # A heading, the key of the record, and the format of its values, empty for text
 LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
 EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
@@ -55,14 +54,10 @@ def score_heading(name: str) -> "Heading":
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
-    """For each score whether it is the best, the second best, or unmarked.
+    """For each score of a metric (or `REGION_VIEW_METRIC`) whether it is the best, the second best, or unmarked.
 
-    Scores are compared as they are written, so that those which look equal share a mark.
-
-    Args:
-        values: the scores; None for one that was not measured.
-        competing: whether each may be marked. Naive predictors and upper bounds may not.
-        name: of the metric, or `REGION_VIEW_METRIC`.
+    Scores are compared as they are written, so that those which look equal share a mark; None was not measured. Naive
+    predictors and upper bounds are not `competing`, and have no mark.
     """
     name = name.rpartition("_")[2]
     sign = 1 if name in LOWER_IS_BETTER else -1
@@ -98,8 +93,7 @@ class Heading:
 
     text: str
     group: str = ""
-    figures: bool = True
-    """Whether the column is aligned to the right."""
+    figures: bool = True  # whether the column is aligned to the right
 
     def joined(self, separator: str = ": ") -> str:
         """Group and text in one."""
@@ -133,8 +127,7 @@ class Table:
     rows: list[TableRow]
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
-    gaps: bool = False
-    """Whether cells may be empty."""
+    gaps: bool = False  # whether cells may be empty
 
     def __post_init__(self) -> None:
         """Refuse a row that does not fit the headings, and an empty cell unless there may be gaps."""
@@ -180,16 +173,11 @@ def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any
 
 def by_name(entry: dict[str, Any]) -> dict[str, float]:
     """The scores of a predictor's entry in `Evaluation.results`, by `REGION_VIEW_METRIC`."""
-    views = {
-        f"{region}_{view}": x for region, part in entry.items() if isinstance(part, dict) for view, x in part.items()
-    }
+    parts = [(region, part) for region, part in entry.items() if isinstance(part, dict)]
+    views = [(f"{region}_{view}", found) for region, part in parts for view, found in part.items()]
     # The seconds of a sequence hold figures, not metrics by view.
-    return {
-        f"{name}_{metric}": value
-        for name, metrics in views.items()
-        if isinstance(metrics, dict)
-        for metric, value in metrics.items()
-    }
+    named = [(name, found) for name, found in views if isinstance(found, dict)]
+    return {f"{name}_{metric}": value for name, found in named for metric, value in found.items()}
 
 
 def evaluation_table(results: dict[str, Any]) -> Table:
@@ -265,14 +253,13 @@ def write_tables(tables: Sequence[Table], out: Path) -> None:
     """Write `tables.md`, `tables.tex` and `tables.csv`, the last with a line for each cell."""
     write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
     write_text(out / "tables.tex", "\n".join(map(as_latex, tables)))
-    write_csv(out / "tables.csv", CSV_COLUMNS, (line for table in tables for line in _csv_lines(table)))
-
-
-def _csv_lines(table: Table) -> Iterator[list[Any]]:
-    for row in table.rows:
-        for heading, cell in zip(table.headings, row.cells, strict=True):
-            place = [table.name, table.title, row.source, row.cells[0].text, heading.group, heading.text]
-            yield [*place, cell.text, cell.mark, cell.value]
+    lines = [
+        [one.name, one.title, row.source, row.cells[0].text, head.group, head.text, cell.text, cell.mark, cell.value]
+        for one in tables
+        for row in one.rows
+        for head, cell in zip(one.headings, row.cells, strict=True)
+    ]
+    write_csv(out / "tables.csv", CSV_COLUMNS, lines)
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:

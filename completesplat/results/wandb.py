@@ -15,7 +15,7 @@ from torch import Tensor
 from completesplat.export.pictures import color_depth, enlarge, surface_depth, to_bytes
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
-from completesplat.metrics.evaluation import BEST, MODEL, Evaluation, Scores
+from completesplat.metrics.scoring import BEST, MODEL, Evaluation, Scores
 from completesplat.results.published import tables
 from completesplat.results.runs import find
 from completesplat.results.tables import Table, by_name
@@ -29,15 +29,10 @@ READABLE_SIDE = 128
 
 
 class SceneTable:
-    """Rows of the first scenes that a test scores in this process, each given to `add`.
+    """Rows of the first `most` scenes that a test scores in this process, each given to `add`.
 
     Pictures are rows of views: the reference's, then targets, evenly spread. Depth and turntable are of the first
     sample; the turntables are also `folder/00.mp4` and so on.
-
-    Args:
-        module: the model that is tested.
-        folder: where the videos go.
-        most: how many scenes are kept.
     """
 
     def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
@@ -124,13 +119,9 @@ def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> Scen
 
 
 def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
-    """Log `test/PREDICTOR/REGION_VIEW_METRIC`; for W&B also tables, pictures and videos.
+    """Log `test/PREDICTOR/REGION_VIEW_METRIC` of `SceneModule.test_results`; for W&B also tables, pictures and videos.
 
-    Args:
-        results: those of `SceneModule.test_results`.
-        scenes: what `begin` returned.
-        trainer: the trainer of the test, with its loggers.
-        out: the run directory, with the results in its `metrics.json`.
+    `scenes` is what `begin` returned, `out` the run directory with the results in its `metrics.json`.
     """
     flat = {predictor: by_name(scores) for predictor, scores in results.items()}
     numbers = {f"test/{predictor}/{name}": x for predictor, scores in flat.items() for name, x in scores.items()}

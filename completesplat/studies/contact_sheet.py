@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
-from torch import Tensor
 
 from completesplat.atomic import atomic_path
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.errors import DataError
+from completesplat.export.pictures import GAP, INK, LINE, MARGIN, PAPER
 from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
 
 MOST_SEQUENCES = 8
-CELL, GAP, LINE, MARGIN = 216, 6, 20, 12
-INK, PAPER, GREY, MASK = "black", "white", (190, 190, 190), (255, 220, 0)
-TEXT, NAME, TITLE = 13, 15, 18
+CELL, TEXT, NAME, TITLE = 216, 13, 15, 18
+GREY, MASK = (190, 190, 190), (255, 220, 0)
 DRAWINGS = ("from above", "from the side")
 LEGEND = (
     "Pictures: one cross stands at one place of each scene and must stick to it, its square level as a floor; "
@@ -29,12 +27,10 @@ LEGEND = (
 
 
 def show(sequences: Sequence[PosedSequence], path: Path, pictures: int = 6, title: str = "") -> None:
-    """Write a PNG with a row for each sequence: evenly spaced pictures, and its cameras from above and from the side.
+    """Write a PNG with a row for each sequence: some pictures, and its cameras from above and from the side.
 
-    A picture that cannot be read is a grey cell with the kind of its `DataError`.
-
-    Args:
-        pictures: for each sequence, the first and the last frame among them; fewer where it has fewer.
+    The pictures are evenly spaced, the first and the last frame among them. One that cannot be read is a grey cell
+    with the kind of its `DataError`.
 
     Raises:
         ValueError: no sequences, more than `MOST_SEQUENCES`, or no pictures.
@@ -43,12 +39,13 @@ def show(sequences: Sequence[PosedSequence], path: Path, pictures: int = 6, titl
         raise ValueError(f"a sheet has 1 to {MOST_SEQUENCES} sequences and 1 picture of each or more")
     width = _left(pictures + len(DRAWINGS)) - GAP + MARGIN
     legend = [line for text in LEGEND for line in _wrapped(text, width - 2 * MARGIN)]
-    header = MARGIN + int(1.5 * LINE) + len(legend) * LINE
+    top = MARGIN + int(1.5 * LINE)
+    header = top + len(legend) * LINE
     row_height = 2 * LINE + CELL + GAP
     sheet = Image.new("RGB", (width, header + len(sequences) * row_height + MARGIN), PAPER)
     _text(sheet, (MARGIN, MARGIN), title, width - 2 * MARGIN, TITLE)
     for index, line in enumerate(legend):
-        _text(sheet, (MARGIN, MARGIN + int(1.5 * LINE) + index * LINE), line, width - 2 * MARGIN)
+        _text(sheet, (MARGIN, top + index * LINE), line, width - 2 * MARGIN)
     for index, sequence in enumerate(sequences):
         _draw_row(sheet, header + index * row_height, sequence, pictures)
     with atomic_path(path) as temporary:
@@ -58,27 +55,21 @@ def show(sequences: Sequence[PosedSequence], path: Path, pictures: int = 6, titl
 def _draw_row(sheet: Image.Image, top: int, sequence: PosedSequence, pictures: int) -> None:
     """Heading, cells and captions below them."""
     cross = place_cross(sequence.cameras, sequence.depth_ranges[0])
-    _text(sheet, (MARGIN, top), _heading(sequence), sheet.width - 2 * MARGIN, NAME)
+    (near, far), (focal, *_) = sequence.depth_ranges[0].tolist(), sequence.cameras.intrinsics[0, 0].tolist()
+    fov = math.degrees(2 * math.atan(sequence.cameras.image_size[1] / 2 / focal))
+    numbers = f"{len(sequence.frames)} cameras, field of view {fov:.1f}°, near {near:.3g}, far {far:.3g}"
+    _text(sheet, (MARGIN, top), f"{sequence.name}: {numbers}", sheet.width - 2 * MARGIN, NAME)
     chosen = np.unique(np.linspace(0, len(sequence.frames) - 1, pictures).round().astype(int)).tolist()
-    below = top + LINE + CELL
+    cells = {}
     for column, index in enumerate(chosen):
         cell, where = _picture_cell(sequence, index, cross)
-        sheet.paste(cell, (_left(column), top + LINE))
-        _text(sheet, (_left(column), below), f"frame {sequence.frames[index]}{where}", CELL)
+        cells[column] = cell, f"frame {sequence.frames[index]}{where}"
     drawn = drawings(sequence, cross)
-    for column, (label, drawing) in enumerate(
-        zip(DRAWINGS, (drawn.from_above(CELL), drawn.from_the_side(CELL)), strict=True), start=pictures
-    ):
-        sheet.paste(drawing, (_left(column), top + LINE))
-        _text(sheet, (_left(column), below), f"{label}, bar: {drawn.scale_bar():g}", CELL)
-
-
-def _heading(sequence: PosedSequence) -> str:
-    near, far = sequence.depth_ranges[0].tolist()
-    width, focal = sequence.cameras.image_size[1], sequence.cameras.intrinsics[0, 0, 0].item()
-    fov = math.degrees(2 * math.atan(width / 2 / focal))
-    numbers = f"{len(sequence.frames)} cameras, field of view {fov:.1f}°, near {near:.3g}, far {far:.3g}"
-    return f"{sequence.name}: {numbers}"
+    for column, cell in enumerate((drawn.from_above(CELL), drawn.from_the_side(CELL))):
+        cells[pictures + column] = cell, f"{DRAWINGS[column]}, bar: {drawn.scale_bar():g}"
+    for column, (cell, caption) in cells.items():
+        sheet.paste(cell, (_left(column), top + LINE))
+        _text(sheet, (_left(column), top + LINE + CELL), caption, CELL)
 
 
 def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Image.Image, str]:
@@ -91,26 +82,16 @@ def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Im
             _text(cell, (GAP, CELL // 2 - LINE + number * LINE), line, CELL - 2 * GAP)
         return cell, ""
     cell = _with_outline(picture)
-    camera = sequence.cameras[index]
-    scale = CELL / camera.image_size[1]
+    camera, draw = sequence.cameras[index], ImageDraw.Draw(cell)
     nearest = NEAREST * cross.arms.norm(dim=-1)[0].item()
-    draw = ImageDraw.Draw(cell)
-    for _, ends in visible_segments(camera, cross.square(), nearest):
-        _line(draw, scale * ends, "white", 2)
-    arms = visible_segments(camera, cross.ends(), nearest)
-    for arm, ends in arms:
-        _line(draw, scale * ends, CROSS_COLORS[arm], 3)
-    if not arms:
-        return cell, ": cross behind"
+    sides, arms = (visible_segments(camera, segments, nearest) for segments in (cross.square(), cross.ends()))
+    lines = [(ends, "white", 2) for _, ends in sides] + [(ends, CROSS_COLORS[arm], 3) for arm, ends in arms]
+    for ends, color, width in lines:
+        points = [(x, y) for x, y in (CELL / camera.image_size[1] * ends).tolist()]
+        draw.line(points, INK, width + 2)  # a dark edge keeps it visible on anything
+        draw.line(points, color, width)
     inside = any(((ends > 0) & (ends < camera.image_size[1])).all(dim=-1).any() for _, ends in arms)
-    return cell, "" if inside else ": cross outside"
-
-
-def _line(draw: ImageDraw.ImageDraw, ends: Float[Tensor, "2 2"], color: str | tuple[int, int, int], width: int) -> None:
-    """A line with a dark edge, which keeps it visible on anything."""
-    points = [(x, y) for x, y in ends.tolist()]
-    draw.line(points, INK, width + 2)
-    draw.line(points, color, width)
+    return cell, "" if inside else ": cross outside" if arms else ": cross behind"
 
 
 def _with_outline(picture: Picture) -> Image.Image:
@@ -144,9 +125,5 @@ def _text(picture: Image.Image, place: tuple[int, int], text: str, width: int, s
 def _wrapped(text: str, width: int) -> list[str]:
     """Lines that fit into `width` pixels."""
     font = ImageFont.load_default(size=TEXT)
-    columns = next(
-        columns
-        for columns in range(len(text), 0, -1)
-        if all(font.getlength(line) <= width for line in textwrap.wrap(text, columns))
-    )
-    return textwrap.wrap(text, columns)
+    wrapped = (textwrap.wrap(text, columns) for columns in range(len(text), 0, -1))
+    return next(lines for lines in wrapped if all(font.getlength(line) <= width for line in lines))

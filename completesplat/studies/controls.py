@@ -10,10 +10,15 @@ import torch
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.metrics.images import psnr
-from completesplat.metrics.samples import diversity
+from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import Strip, written_figure
 from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
+
+Settings = Sequence[tuple[float, float]]  # skip and guidance weights
+Row = dict[str, float | bool | None]
+Tick = Callable[[str], None]
+Measure = Callable[[SceneBatch, float, float], Mapping[str, float | None]]
 
 # From faithful to diverse (supplement, "Diverse Sampling").
 PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
@@ -33,42 +38,30 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
 
 
 def rows(
-    renderer: SampleRenderer,
-    settings: Sequence[tuple[float, float]],
-    scenes: Sequence[SceneBatch],
-    near_degrees: float,
-    tick: Callable[[str], None],
-) -> list[dict[str, float | bool | None]]:
+    renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], near_degrees: float, tick: Tick
+) -> list[Row]:
     """A row for each setting, mean over the scenes.
 
     `reference_psnr` is of the reference view; `near_object_psnr` of the true object's pixels in the targets that look
-    at most `near_degrees` away from the reference: mostly surface that the input shows (which surface it shows exactly
-    would take depth maps, which scenes have not got). `diversity` is of the targets.
+    at most `near_degrees` away from the reference: mostly surface that the input shows. `diversity` is of the targets.
     """
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
         images = renderer(scene, skip_weight=skip_weight, guidance_weight=guidance_weight)
-        true = scene.all_views()
-        seen = near(scene.reference.cameras[0], scene.targets.cameras[0], near_degrees)
+        reference, targets = scene.reference, scene.targets[0]
+        seen = near(reference.cameras[0], targets.cameras, near_degrees)
         return {
-            "reference_psnr": psnr(images[:, 0], true.images[:, 0].expand_as(images[:, 0])).mean().item(),
-            "near_object_psnr": object_psnr(
-                images[:, 1:][:, seen], scene.targets.images[0, seen], scene.targets.masks[0, seen]
-            ),
+            "reference_psnr": psnr(images[:, 0], reference.images.expand_as(images[:, 0])).mean().item(),
+            "near_object_psnr": object_psnr(images[:, 1:][:, seen], targets.images[seen], targets.masks[seen]),
             "diversity": diversity(images[:, 1:]),
         }
 
     return over_settings(settings, scenes, measure, tick)
 
 
-def over_settings(
-    settings: Sequence[tuple[float, float]],
-    scenes: Sequence[SceneBatch],
-    measure: Callable[[SceneBatch, float, float], Mapping[str, float | None]],
-    tick: Callable[[str], None],
-) -> list[dict[str, float | bool | None]]:
+def over_settings(settings: Settings, scenes: Sequence[SceneBatch], measure: Measure, tick: Tick) -> list[Row]:
     """A row for each setting: the mean over the scenes of what is measured with its skip and guidance weight."""
-    found: list[dict[str, float | bool | None]] = []
+    found: list[Row] = []
     for skip_weight, guidance_weight in settings:
         tick(f"skip weight {skip_weight:g}, guidance weight {guidance_weight:g}")
         means = mean_over_scenes([measure(scene, skip_weight, guidance_weight) for scene in scenes])
@@ -78,7 +71,7 @@ def over_settings(
 
 
 def strips(
-    renderer: SampleRenderer, settings: Sequence[tuple[float, float]], scene: SceneBatch, samples: int
+    renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int
 ) -> tuple[list[list[Strip | None]], list[str]]:
     """Rows by skip weight, columns by guidance weight: one sample's reference view, and several from far away.
 
@@ -90,22 +83,16 @@ def strips(
     true = scene.all_views().images[0]
     rows: list[list[Strip | None]] = [[Strip(true[[0, far]], "truth: reference, far"), *[None] * (len(weights) - 1)]]
     for skip in skips[::-1]:
-        row: list[Strip | None] = []
-        for weight in weights:
-            if (skip, weight) not in settings:
-                row.append(None)
-                continue
-            images = renderer(scene, skip_weight=skip, guidance_weight=weight)
-            shown = torch.cat([images[:1, 0], images[:samples, far]])
-            row.append(Strip(shown, f"guidance {weight:g}", (skip, weight) in PAPER))
-        rows.append(row)
+        rows.append([None] * len(weights))
+        for column, weight in enumerate(weights):
+            if (skip, weight) in settings:
+                images = renderer(scene, skip_weight=skip, guidance_weight=weight)
+                shown = torch.cat([images[:1, 0], images[:samples, far]])
+                rows[-1][column] = Strip(shown, f"guidance {weight:g}", (skip, weight) in PAPER)
     return rows, ["", *(f"skip {skip:g}" for skip in skips[::-1])]
 
 
-PANELS = [
-    ("reference_psnr", "Reference view: PSNR, dB"),
-    ("near_object_psnr", "Object in near views: PSNR, dB"),
-]
+PANELS = {"reference_psnr": "Reference view: PSNR, dB", "near_object_psnr": "Object in near views: PSNR, dB"}
 
 
 def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
@@ -114,7 +101,7 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
 
     with written_figure(path, title, (13, 5.5)) as figure:
         skips = sorted({row["skip_weight"] for row in rows})
-        for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
+        for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):
             drawn = [row for row in rows if row[key] is not None]
             for skip in skips:
                 own = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
@@ -124,10 +111,9 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
                     panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
             for row in drawn:
                 if row["paper"]:
-                    x, y = row["diversity"], row[key]
-                    panel.plot(x, y, "o", markersize=13, fillstyle="none", color="crimson")
-                    name = f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
-                    panel.annotate(name, (x, y), (9, 9), textcoords="offset points", color="crimson")
+                    place, name = (row["diversity"], row[key]), f"({row['skip_weight']:g}, {row['guidance_weight']:g})"
+                    panel.plot(*place, "o", markersize=13, fillstyle="none", color="crimson")
+                    panel.annotate(name, place, (9, 9), textcoords="offset points", color="crimson")
             panel.set(xlabel="diversity: difference of two samples in novel views (RMS)", ylabel=label)
             panel.grid(alpha=0.3)
             panel.margins(0.12)

@@ -1,6 +1,6 @@
 """Where the samples of one input disagree in depth: the paper's figure of diversity in depth, with numbers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -9,7 +9,7 @@ from torch import Tensor
 from completesplat.export.pictures import NOTHING, color_depth, color_normals, ramp, surface_depth
 from completesplat.geometry.normals import normals_from_depth
 from completesplat.scene import SceneBatch
-from completesplat.studies.controls import over_settings
+from completesplat.studies.controls import Row, Settings, Tick, over_settings
 from completesplat.studies.figures import Strip
 from completesplat.studies.samples import SampleRenderer, farthest, near
 
@@ -27,12 +27,8 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
 
 
 def rows(
-    renderer: SampleRenderer,
-    settings: Sequence[tuple[float, float]],
-    scenes: Sequence[SceneBatch],
-    far_degrees: float,
-    tick: Callable[[str], None],
-) -> list[dict[str, float | bool | None]]:
+    renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], far_degrees: float, tick: Tick
+) -> list[Row]:
     """A row for each (skip weight, guidance weight), mean over the scenes.
 
     `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units,
@@ -75,8 +71,8 @@ def strips(
 
     The far view is the target that looks in the direction most different from the reference's. The truth is the input
     and the far view; a sample's pictures are its render, depth and normals in the far view; the deviation is that of
-    the depth in the reference and in the far view, dark where the samples agree. The depths of a row have one scale,
-    and so have its deviations. Grey: nothing to see, or to compare.
+    the depth in both views, dark where the samples agree. The depths of a row have one scale, and so have its
+    deviations. Grey: nothing to see, or to compare.
     """
     rows = []
     for scene in scenes:

@@ -18,13 +18,7 @@ from completesplat.export.pictures import to_bytes
 def written_figure(
     path: Path, title: str, size: tuple[float, float], dpi: int = 110, layout: str | None = "constrained"
 ) -> Iterator[Figure]:
-    """A figure to draw on, which is written as a PNG when the block ends without an exception.
-
-    Args:
-        size: width and height in inches.
-        dpi: pixels per inch.
-        layout: matplotlib's layout engine; None leaves the places of the panels to the caller.
-    """
+    """A figure of this width and height in inches, which is written as a PNG when the block ends without exception."""
     figure = Figure(figsize=size, layout=layout)  # type: ignore[arg-type]
     figure.suptitle(title)
     yield figure
@@ -32,10 +26,8 @@ def written_figure(
         figure.savefig(temporary, dpi=dpi)
 
 
-READABLE_SIDE = 0.9
-"""Side of a picture, in inches."""
-GAP = 1
-"""Space between the pictures of a strip, in pixels."""
+READABLE_SIDE = 0.9  # of a picture, in inches
+GAP = 1  # between the pictures of a strip, in pixels
 
 
 @dataclass(frozen=True)
@@ -48,12 +40,7 @@ class Strip:
 
 
 def draw_strips(rows: Sequence[Sequence[Strip | None]], names: Sequence[str], path: Path, title: str) -> None:
-    """Write a PNG; None leaves a place empty.
-
-    Args:
-        rows: of equal length.
-        names: of the rows.
-    """
+    """Write a PNG of rows of equal length and their names; None leaves a place empty."""
     widths = [max(len(strip.images) for strip in column if strip) for column in zip(*rows, strict=True)]
     size = (READABLE_SIDE * sum(widths) + 1.2, (READABLE_SIDE + 0.3) * len(rows) + 0.5)
     with written_figure(path, title, size, dpi=130) as figure:

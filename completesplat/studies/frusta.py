@@ -42,17 +42,13 @@ class Cross:
 
 
 def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
-    """A cross for cameras [view]: where their optical axes meet, if they do in front of all of them.
+    """A cross for cameras [view] where their optical axes meet, if they do in front of all of them.
 
     Otherwise on the axis of the first, the middle or the last camera, where most cameras see it; of the best places
-    the nearest, but none nearer than the middle of the depth range in terms of 1 / depth.
-
-    Args:
-        depth_range: near and far of the first camera.
+    the nearest, but none nearer than the middle of the first camera's depth range in terms of 1 / depth.
     """
-    center = _common_point(cameras)
-    if center is None:
-        center = _most_seen_point(cameras, depth_range)
+    met = _common_point(cameras)
+    center = _most_seen_point(cameras, depth_range) if met is None else met
     depth = transform_points(cameras.world_to_camera[0], center[None])[0, 2].abs()
     length = ARM * depth * cameras.image_size[1] / 2 / cameras.intrinsics[0, 0, 0]
     return Cross(center, length * level_axes(cameras))
@@ -79,7 +75,7 @@ def visible_segments(
     """Number and ends in pixels of the segments, cut off where they are less deep than `nearest` before a camera []."""
     _, depths = project(camera, segments.flatten(0, 1))
     result = []
-    for index, (ends, depth) in enumerate(zip(segments, depths.unflatten(0, (-1, 2)), strict=True)):
+    for index, (ends, depth) in enumerate(zip(segments, depths.reshape(-1, 2), strict=True)):
         if depth.max() <= nearest:
             continue
         shares = ((nearest - depth) / (depth.flip(0) - depth)).where(depth < nearest, 0)
@@ -133,11 +129,9 @@ EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (5, 6)]
 class Drawings:
     """A sequence prepared for drawing; both drawings have one scale.
 
-    Attributes:
-        axes: right, up and ahead of the first camera, level, as rows.
-        frusta: [view], apex, four corners of the picture at some depth, and a tick at its upper edge.
-        depth_range: the ends of the first camera's, along its axis, as far as they are drawn; `cut` if that is not far.
-        middle, span: of all that is drawn, along the axes and in scene units.
+    `axes` are the first camera's right, up and ahead, level, as rows; `frusta` apex, corners of the picture at some
+    depth, and a tick at its upper edge; `depth_range` the ends of the first camera's as far as they are drawn (`cut`:
+    not up to far); `middle` along the axes and `span` in scene units are of all that is drawn.
     """
 
     axes: Float[Tensor, "3 3"]
@@ -159,7 +153,7 @@ class Drawings:
 
     def scale_bar(self) -> float:
         """A round length of about a quarter of the drawings, in scene units."""
-        power = 10 ** math.floor(math.log10(self.span / 3))
+        power: float = 10 ** math.floor(math.log10(self.span / 3))
         return max(step * power for step in (1, 2, 5) if step * power <= self.span / 3)
 
     def _draw(self, side: int, plane: Float[Tensor, "2 3"], middle: Float[Tensor, "2"]) -> Image.Image:
@@ -173,7 +167,7 @@ class Drawings:
             if index % every == 0 or index == count - 1:
                 for start, end in EDGES:
                     pen.line(self.frusta[index, [start, end]], color, width)
-            pen.dot(self.centers[index], color, 2 if index else 4)
+            pen.draw.circle(pen.pixels(self.centers[[index]])[0], FINE * (2 if index else 4), color)
         pen.line(self.depth_range, RANGE, 3)
         pen.ends(self.depth_range, RANGE, self.cut)
         for arm, color in zip(self.cross.ends(), CROSS_COLORS, strict=True):
@@ -206,17 +200,16 @@ def time_color(share: float) -> tuple[int, int, int]:
 
 
 def _extent(points: Float[Tensor, "_ 3"]) -> float:
-    return float((points.amax(dim=0) - points.amin(dim=0)).max())
+    extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
+    return extent
 
 
 def _frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
     """Apex, corners of the picture at this depth, and from the middle of its upper edge a tick to above."""
     height, width = cameras.image_size
     pixels = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0), (width / 2, -height / 5)]
-    corners = unproject(
-        cameras, torch.tensor(pixels).to(cameras.intrinsics), torch.full((6,), depth).to(cameras.intrinsics)
-    )
-    return torch.cat([cameras.centers[:, None], corners], dim=1)
+    places, depths = (torch.tensor(values).to(cameras.intrinsics) for values in (pixels, [depth] * 6))
+    return torch.cat([cameras.centers[:, None], unproject(cameras, places, depths)], dim=1)
 
 
 @dataclass(frozen=True)
@@ -230,23 +223,21 @@ class _Pen:
     span: float
 
     def line(self, points: Float[Tensor, "_ 3"], color: tuple[int, int, int], width: int) -> None:
-        self.draw.line(self._pixels(points), color, FINE * width)
-
-    def dot(self, point: Float[Tensor, "3"], color: tuple[int, int, int], radius: float) -> None:
-        self.draw.circle(self._pixels(point[None])[0], FINE * radius, color)
+        self.draw.line(self.pixels(points), color, FINE * width)
 
     def ends(self, interval: Float[Tensor, "2 3"], color: tuple[int, int, int], arrow: bool) -> None:
         """A bar across the near end; another or, for a range that goes on, an arrow at the far end."""
-        (x0, y0), (x1, y1) = self._pixels(interval)
+        (x0, y0), (x1, y1) = self.pixels(interval)
         length = math.hypot(x1 - x0, y1 - y0)
         if length < 1:  # it points at the spectator
             return
         x, y = 7 * FINE * (x1 - x0) / length, 7 * FINE * (y1 - y0) / length
-        self.draw.line([(x0 - y, y0 + x), (x0 + y, y0 - x)], color, 3 * FINE)
+        first, last = ([(a - y, b + x), (a + y, b - x)] for a, b in ((x0, y0), (x1, y1)))
+        self.draw.line(first, color, 3 * FINE)
         if arrow:
-            self.draw.polygon([(x1 - y, y1 + x), (x1 + y, y1 - x), (x1 + 1.5 * x, y1 + 1.5 * y)], color)
+            self.draw.polygon([*last, (x1 + 1.5 * x, y1 + 1.5 * y)], color)
         else:
-            self.draw.line([(x1 - y, y1 + x), (x1 + y, y1 - x)], color, 3 * FINE)
+            self.draw.line(last, color, 3 * FINE)
 
     def scale_bar(self, length: float) -> None:
         """Draw a bar of this length (scene units) in the lower left corner."""
@@ -256,7 +247,7 @@ class _Pen:
         for x in (left, right):
             self.draw.line([(x, bottom - 3 * FINE), (x, bottom + 3 * FINE)], FIRST, FINE)
 
-    def _pixels(self, points: Float[Tensor, "n 3"]) -> list[tuple[float, float]]:
+    def pixels(self, points: Float[Tensor, "n 3"]) -> list[tuple[float, float]]:
         unit = self.side * (1 - 2 * MARGIN) / self.span
         right, up = (unit * (points @ self.plane.mT - self.middle)).unbind(dim=-1)
         return [(self.side / 2 + x, self.side / 2 - y) for x, y in zip(right.tolist(), up.tolist(), strict=True)]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import cycle
 
 import torch
 from jaxtyping import Float
@@ -46,9 +47,8 @@ def strips(
     """
     rows: list[list[Strip | None]] = []
     names = []
-    for index, scene in enumerate(scenes):
-        size = scene.reference.images.shape[-1]
-        visible = box_visibility(boxes[index % len(boxes)], size).to(scene.reference.images)
+    for scene, box in zip(scenes, cycle(boxes), strict=False):
+        visible = box_visibility(box, scene.reference.images.shape[-1]).to(scene.reference.images)
         images = renderer(scene, visible=visible[None], guidance_weight=guidance_weight)
         count = images.shape[1] - 1
         shown = [1 + i * count // views for i in range(min(views, count))]

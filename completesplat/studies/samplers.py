@@ -10,14 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.metrics.images import psnr, ssim
-from completesplat.metrics.samples import diversity
+from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
-from completesplat.studies.samples import SampleRenderer
+from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
 REFERENCE = ("ddim", 50)
-CLOSE = 0.1
-"""Difference in PSNR, in dB, that does not count."""
+CLOSE = 0.1  # difference in PSNR, in dB, that does not count
 
 
 def rows(
@@ -46,30 +45,24 @@ def rows(
 
 def _row(
     renderer: SampleRenderer, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]
-) -> dict:
+) -> dict[str, Any]:
     """Measures of one sampler; its renders are appended to `settled` if they are the first."""
-    measured: list[dict[str, float]] = []
-    times = []
-    first = not settled
-    watch = Watch(renderer.model)
+    measured, times, first, watch = [], [], not settled, Watch(renderer.model)
     for index, scene in enumerate(scenes):
         with watch:
             images = renderer(scene, **settings)[:, 1:]
         times.append(watch.seconds)
         if first:
             settled.append(images)
-        true = scene.targets.images.expand_as(images).flatten(0, 1)
-        flat = images.flatten(0, 1)
-        measured.append(
-            {
-                "psnr": psnr(flat, true).mean().item(),
-                "ssim": ssim(flat, true).mean().item(),
-                "diversity": diversity(images),
-                "agreement": psnr(flat, settled[index].flatten(0, 1)).mean().item(),
-            }
-        )
-    means = {key: sum(row[key] for row in measured) / len(measured) for key in measured[0]}
-    return means | {"calls": watch.calls, "ms": 1000 * min(times) / renderer.samples}
+        flat, true = images.flatten(0, 1), scene.targets.images.expand_as(images).flatten(0, 1)
+        row = {
+            "psnr": psnr(flat, true).mean().item(),
+            "ssim": ssim(flat, true).mean().item(),
+            "diversity": diversity(images),
+            "agreement": psnr(flat, settled[index].flatten(0, 1)).mean().item(),
+        }
+        measured.append(row)
+    return mean_over_scenes(measured) | {"calls": watch.calls, "ms": 1000 * min(times) / renderer.samples}
 
 
 class Watch:
@@ -81,26 +74,25 @@ class Watch:
 
     def __enter__(self) -> None:
         self.calls = 0
-        parts = self.model.conditioning, self.model.denoiser, self.model.autoreconstructor.reconstructor
-        begin, count, end = self._begin, self._count, self._end
+
+        def begin(*_: Any) -> None:
+            self.start = _now()
+
+        def count(*_: Any) -> None:
+            self.calls += 1
+
+        def end(*_: Any) -> None:
+            self.seconds = _now() - self.start
+
         self.hooks = [
-            parts[0].register_forward_pre_hook(lambda *_: begin()),
-            parts[1].register_forward_pre_hook(lambda *_: count()),
-            parts[2].register_forward_hook(lambda *_: end()),
+            self.model.conditioning.register_forward_pre_hook(begin),
+            self.model.denoiser.register_forward_pre_hook(count),
+            self.model.autoreconstructor.reconstructor.register_forward_hook(end),
         ]
 
     def __exit__(self, *_: Any) -> None:
         for hook in self.hooks:
             hook.remove()
-
-    def _begin(self) -> None:
-        self.start = _now()
-
-    def _count(self) -> None:
-        self.calls += 1
-
-    def _end(self) -> None:
-        self.seconds = _now() - self.start
 
 
 def _now() -> float:

@@ -19,11 +19,9 @@ from completesplat.scene import SceneBatch
 
 @dataclass(frozen=True)
 class SampleRenderer:
-    """Draws samples and renders them, the reference view first and then all targets.
+    """Draws samples, from the same noise whatever the settings, and renders the reference view and then all targets.
 
-    Args:
-        background: grey value where a scene leaves a pixel open.
-        samples: scenes drawn for an input, from the same noise whatever the settings.
+    Where a scene leaves a pixel open, there is `background`, a grey value.
     """
 
     model: CompleteSplat
@@ -42,20 +40,9 @@ class SampleRenderer:
 
     @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
-        """Colour, depth and opacity of one scene (a batch of one), [sample view].
-
-        Args:
-            **settings: of `CompleteSplat.generate`.
-        """
-        reference = scene.reference
-        gaussians = self.model.generate(
-            reference.images,
-            reference.cameras,
-            scene.depth_range,
-            samples=self.samples,
-            seed=self.seed,
-            **settings,
-        )
+        """Colour, depth and opacity of one scene (a batch of one), [sample view]; settings of `generate`."""
+        given = scene.reference.images, scene.reference.cameras, scene.depth_range
+        gaussians = self.model.generate(*given, samples=self.samples, seed=self.seed, **settings)
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 

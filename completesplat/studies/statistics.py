@@ -34,8 +34,7 @@ Row = dict[str, tuple[float, float, float]]
 def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, Any]:
     """Figures of each split, with numbers and None only: the content of a JSON file.
 
-    Sequences (of at least one frame) are taken one after the other; a few numbers of each are kept. Pictures are not
-    read.
+    Sequences (of at least one frame) are taken one after the other; a few numbers of each are kept. No picture is read.
 
     Returns:
         `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min`, `median` and `max`: the
@@ -45,7 +44,11 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
     """
     rows = {split: [_measure(sequence) for sequence in members] for split, members in sequences.items()}
     return {
-        "splits": {split: _summary(members) for split, members in rows.items()},
+        "splits": {
+            split: {"sequences": len(members), "frames": sum(int(row["frames_per_sequence"][0]) for row in members)}
+            | {key: _merged([row[key] for row in members]) for key, _, _ in MEASURES}
+            for split, members in rows.items()
+        },
         "histograms": {key: _histogram(key, rows) for key, _, _ in MEASURES},
     }
 
@@ -53,18 +56,17 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    counts = Table(title="Sequences and frames", title_justify="left")
-    ranges = Table(title="Smallest, median and largest", title_justify="left")
-    for heading in ("split", "sequences", "frames"):
-        counts.add_column(heading, justify="left" if heading == "split" else "right", no_wrap=True)
+    counts = Table("split", title="Sequences and frames", title_justify="left")
+    ranges = Table("", title="Smallest, median and largest", title_justify="left")
+    counts.columns[0].no_wrap = True
+    for heading in ("sequences", "frames"):
+        counts.add_column(heading, justify="right", no_wrap=True)
     for split, summary in splits.items():
         counts.add_row(split, f"{summary['sequences']:,}", f"{summary['frames']:,}")
-    ranges.add_column("")
-    for split in splits:
         for heading in (f"{split}\nmin", "\nmedian", "\nmax"):
             ranges.add_column(heading, justify="right", no_wrap=True)
     for key, label, form in MEASURES:
-        values = [splits[split][key][part] for split in splits for part in ("min", "median", "max")]
+        values = [summary[key][part] for summary in splits.values() for part in ("min", "median", "max")]
         ranges.add_row(label, *("-" if value is None else format(value, form) for value in values))
     console = Console(width=None if Console().is_terminal else 120, markup=False)
     console.print(counts)
@@ -74,7 +76,9 @@ def show_statistics(results: dict[str, Any]) -> None:
 def _measure(sequence: PosedSequence) -> Row:
     cameras, count = sequence.cameras, float(len(sequence.frames))
     extent = _largest_distance(cameras.centers)
-    angle = _largest_angle(cameras.world_to_camera[:, 2, :3])
+    # Half the angle from the length of the chord: accurate for small angles, as the arc cosine is not.
+    chord = _largest_distance(cameras.world_to_camera[:, 2, :3])
+    angle = float(np.degrees(2 * np.arcsin(min(1.0, chord / 2))))
     return {
         "frames_per_sequence": (count, count, count),
         "fov_degrees": _range(_fields_of_view(cameras.intrinsics, cameras.image_size[1])),
@@ -100,24 +104,14 @@ def _fields_of_view(intrinsics: Float[Tensor, "view 3 3"], width: int) -> Float[
 
 def _largest_distance(centers: Float[Tensor, "view 3"]) -> float:
     exact = "donot_use_mm_for_euclid_dist"
-    return max(torch.cdist(part, centers, compute_mode=exact).max().item() for part in centers.split(CHUNK))
+    parts = torch.split(centers, CHUNK)
+    return max(torch.cdist(part, centers, compute_mode=exact).max().item() for part in parts)
 
 
-def _largest_angle(directions: Float[Tensor, "view 3"]) -> float:
-    """Between any two unit vectors, in degrees."""
-    # Half the angle from the length of the chord: accurate for small angles, as the arc cosine is not.
-    return float(np.degrees(2 * np.arcsin(min(1.0, _largest_distance(directions) / 2))))
-
-
-def _summary(rows: list[Row]) -> dict[str, Any]:
-    frames = sum(int(row["frames_per_sequence"][0]) for row in rows)
-    return {"sequences": len(rows), "frames": frames} | {key: _merged(rows, key) for key, _, _ in MEASURES}
-
-
-def _merged(rows: list[Row], key: str) -> dict[str, float | None]:
-    if not rows:
+def _merged(ranges: list[tuple[float, float, float]]) -> dict[str, float | None]:
+    if not ranges:
         return {"min": None, "median": None, "max": None}
-    low, middle, high = np.array([row[key] for row in rows]).T
+    low, middle, high = np.array(ranges).T
     return {"min": float(low.min()), "median": float(np.median(middle)), "max": float(high.max())}
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from completesplat.export.pictures import SheetCell, color_depth, picture_sheet
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
-from completesplat.metrics.samples import diversity
+from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
 from completesplat.training.fixed_scenes import DrawsFixedScenes, log_drawings

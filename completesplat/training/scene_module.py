@@ -20,8 +20,8 @@ from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.loading.distributed import gathered
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.images import psnr
+from completesplat.metrics.scoring import Evaluation
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 
@@ -181,7 +181,7 @@ class SceneModule(LightningModule):
     def _score_depth(self, name: str, predicted: Float[Tensor, "view 1 _ _"], truth: Views) -> None:
         """Where the truth is known, at the size of the renders."""
         if truth.depths is not None and truth.depths.shape == predicted.shape:
-            self.evaluation.update_depth(name, predicted, DepthViews(truth.depths.to(predicted), truth.masks))
+            self.evaluation.update_depth(name, predicted, truth)
 
     def on_test_end(self) -> None:
         loader: Any = self.trainer.test_dataloaders

@@ -9,7 +9,7 @@ from PIL import Image
 from report_pages import FRAMES, HOSTILE, SAMPLES, Page, grey, picture, write_results
 from support import call
 
-from completesplat.results.html_elements import strip
+from completesplat.results.html_page import strip
 
 
 @pytest.fixture(scope="module")

@@ -31,21 +31,12 @@ def test_frechet_distance_agrees_with_a_matrix_square_root(features):
     assert frechet_distance(*reversed(features)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_frechet_distance_of_a_set_that_is_shifted_and_scaled_has_a_closed_form(features):
-    """Of N(m, S) and N(am + b, a^2 S): the squared distance of the means and (a - 1)^2 tr S."""
-    mean, covariance = moments(features[0])
-    changed = 1.5 * features[0].double() + 2
-    expected = ((0.5 * mean + 2) ** 2).sum() + 0.25 * np.trace(covariance)
-    assert frechet_distance(features[0].double(), changed) == pytest.approx(expected, rel=1e-6)
-
-
 def test_equal_sets_have_no_frechet_distance_even_with_fewer_items_than_features(features):
     few = features[0][:4]
     assert frechet_distance(few, few.flip(0)) == pytest.approx(0, abs=1e-4)
 
 
 def test_small_differences_beside_a_large_mean_are_kept(features):
-    """In float32 the squares of the means would drown the variances."""
     near = frechet_distance(features[0].double(), features[0].double() * 1.01)
     far = frechet_distance(features[0].double() + 3e4, (features[0].double() * 1.01) + 3e4)
     mean, covariance = moments(features[0])
@@ -66,7 +57,6 @@ def test_kernel_distance_agrees_with_sums_over_pairs(features):
 
 
 def test_kernel_distance_is_unbiased():
-    """The mean over all subsets of a size is the same for every size; a biased estimate would grow as they shrink."""
     generator = torch.Generator().manual_seed(1)
     first, second = torch.randn(20, 3, generator=generator), torch.randn(20, 3, generator=generator)
     whole = kernel_distance(first, second)

@@ -61,15 +61,7 @@ def run(runs: Path) -> Write:
 
 
 COMMAND = ["completesplat fit", "-m", "experiment=small", "ablation=full,no_skips", "data.root=/home/someone/data/set"]
-CONFIG = {
-    "seed": 0,
-    "batch": 1,
-    "ckpt_path": None,
-    "out": "",
-    "data": {"root": ""},
-    "model": {},
-    "trainer": {"max_steps": 9},
-}
+CONFIG = {"seed": 0, "batch": 1, "out": "", "data": {"root": ""}, "model": {}, "trainer": {"max_steps": 9}}
 NAIVE = {"mean_image": 15.0, "copy_reference": 12.0}
 
 

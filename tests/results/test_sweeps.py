@@ -80,8 +80,8 @@ def test_all_remarks_and_the_command_stand_below_both_tables(ablations, written)
     markdown = written(ablations)
     tex = (ablations.folder / "summary.tex").read_text()
     summary = summarize(ablations.folder)
-    assert len(summary.remarks) == 4
-    for said in (SSIM_NOTE, *summary.remarks, *summary.commands):
+    assert len(summary.table.remarks) == 4
+    for said in (SSIM_NOTE, *summary.table.remarks, *summary.commands):
         assert said in markdown
         assert escape(said) in tex
 
@@ -103,11 +103,6 @@ def test_a_sweep_without_finished_jobs_says_so(sweep, written, capsys) -> None:
     assert not blue(sweep.folder).any()
     show_summary(summarize(sweep.folder))
     assert "Not finished: job=0." in capsys.readouterr().out
-
-
-def test_a_folder_without_jobs_says_so(sweep, written) -> None:
-    sweep.folder.mkdir()
-    assert "0 of 0 jobs have finished." in written(sweep)
 
 
 def test_the_chart_draws_bars_as_long_as_the_means(sweep) -> None:
@@ -153,7 +148,7 @@ def test_jobs_that_have_not_finished_are_named(ablations) -> None:
     (broken / "metrics.json").write_text('{"steps": 9, "te')
     (ablations.folder / "silent").mkdir()  # ended before it could say what it was
     (ablations.folder / ".submitit").mkdir()
-    remarks = summarize(ablations.folder).remarks
+    remarks = summarize(ablations.folder).table.remarks
     assert remarks[0] == "9 of 12 jobs have finished."
     assert remarks[1] == "Not finished: job=9; job=10; silent."
     assert [row["seeds"] for row in summarize(ablations.folder).rows[:3]] == [3, 3, 3]
@@ -164,44 +159,31 @@ def test_jobs_that_never_started_are_named_too(sweep) -> None:
     sweep.plan([*given, "out=written/in/another/way"])
     sweep.scored("ablation=m1", "seed=0", psnr=20.0)
     sweep.add("ablation=full", "seed=0")
-    remarks = summarize(sweep.folder).remarks
+    remarks = summarize(sweep.folder).table.remarks
     assert remarks[:2] == ["1 of 4 jobs have finished.", "Not finished: job=1; m1, seed=1; full, seed=1."]
 
 
 def test_a_job_that_could_not_say_what_it_was_is_counted_once(sweep) -> None:
     sweep.plan(["ablation=m1,full"])
     (sweep.folder / "ablation=full").mkdir()
-    remarks = summarize(sweep.folder).remarks
+    remarks = summarize(sweep.folder).table.remarks
     assert remarks[:2] == ["0 of 2 jobs have finished.", "Not finished: m1; full."]
 
 
 def test_a_plan_that_depends_on_other_files_is_not_guessed(sweep) -> None:
     sweep.plan(["ablation=glob(*)", "seed=0,1"])
     sweep.scored("ablation=m1", "seed=0", psnr=20.0)
-    assert summarize(sweep.folder).remarks[0] == "1 of 1 jobs have finished."
+    assert summarize(sweep.folder).table.remarks[0] == "1 of 1 jobs have finished."
 
 
-def test_all_jobs_finished_need_no_list(ablations) -> None:
-    first, second, *_ = summarize(ablations.folder).remarks
-    assert first == "9 of 9 jobs have finished."
-    assert second == "Commit c0ffee."
-
-
-def test_the_command_is_given_once_without_the_folders_of_a_machine(ablations) -> None:
-    (command,) = summarize(ablations.folder).commands
-    assert command == "completesplat fit -m experiment=small ablation=full,no_skips data.root=.../set"
-
-
-def test_jobs_of_different_commits_are_told(sweep) -> None:
+def test_commits_machine_date_and_the_command_without_the_folders_of_a_machine_are_told(sweep) -> None:
     for seed, commit in enumerate(("c0ffee", "decade-dirty", "c0ffee")):
         sweep.add(f"seed={seed}", commit=commit)
-    assert "Commits c0ffee, decade-dirty." in summarize(sweep.folder).remarks
-
-
-def test_the_machine_and_the_date_are_told(ablations) -> None:
-    last = summarize(ablations.folder).remarks[-1]
-    assert machine()["processor"] in last
-    assert time.strftime("%Y-") in last
+    summary = summarize(sweep.folder)
+    assert "Commits c0ffee, decade-dirty." in summary.table.remarks
+    assert machine()["processor"] in summary.table.remarks[-1]
+    assert time.strftime("%Y-") in summary.table.remarks[-1]
+    assert summary.commands == ["completesplat fit -m experiment=small ablation=full,no_skips data.root=.../set"]
 
 
 CONFIG = """
@@ -252,20 +234,18 @@ def test_a_sweep_ends_with_its_table(launched, capsys) -> None:
     assert "2 of 2 jobs have finished." in (folder / "summary.md").read_text()
 
 
-def test_a_sweep_with_a_failed_job_has_a_summary_of_the_others(launched) -> None:
-    with pytest.raises(ValueError, match="this job fails"):
-        launched("-m", "seed=0,1,2", "fails=1")
+@pytest.mark.parametrize(
+    ("override", "error", "finished", "missing"),
+    [("fails=1", ValueError, 2, "seed=1"), ("killed=1", KeyboardInterrupt, 1, "all, seed=1; all, seed=2")],
+)
+def test_a_sweep_that_fails_or_is_killed_has_a_summary_of_what_was_done(
+    launched, override, error, finished, missing
+) -> None:
+    with pytest.raises(error):
+        launched("-m", "seed=0,1,2", override)
     text = Path("swept/summary.md").read_text()
-    assert "2 of 3 jobs have finished." in text
-    assert "Not finished: seed=1." in text
-
-
-def test_a_sweep_that_is_killed_has_a_summary_of_what_was_done(launched) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        launched("-m", "seed=0,1,2", "killed=1")
-    text = Path("swept/summary.md").read_text()
-    assert "1 of 3 jobs have finished." in text
-    assert "Not finished: all, seed=1; all, seed=2." in text
+    assert f"{finished} of 3 jobs have finished." in text
+    assert f"Not finished: {missing}." in text
 
 
 def test_a_single_run_has_no_summary(launched, tmp_path) -> None:

@@ -39,7 +39,6 @@ def test_the_sheet_grows_by_equal_steps(orbit, tmp_path):
 
 
 def test_pictures_are_evenly_spaced_in_time(orbit, tmp_path):
-    """Each frame's picture has its own grey: 10 times the index."""
     sequence = orbit(24, read=lambda i: Picture(torch.full((3, SIZE, SIZE), 10 * i, dtype=torch.uint8), None))
     shown = cells(sheet_of([sequence], tmp_path, 6), 1, 6)[0]
     indices = [int(cell[0, 0, 0]) // 10 for cell in shown]
@@ -72,7 +71,6 @@ def test_the_cross_is_drawn_where_it_projects(orbit, tmp_path):
 
 
 def test_a_cross_behind_the_camera_is_not_drawn(walk, tmp_path):
-    """The second camera is 9 ahead of the first and aside, the cross at most 2 before the first."""
     sequence = walk((0.0, 0.0, 0.0), (50.0, 0.0, 9.0), depth_range=(1.0, 2.0))
     first, second = cells(sheet_of([sequence], tmp_path, 2), 1, 2)[0]
     assert (first == CROSS_COLORS[1]).all(-1).any()

@@ -68,7 +68,6 @@ def test_deviation_is_numpys_over_the_samples_that_see_something():
 
 
 def test_a_shift_in_depth_is_its_deviation_in_the_reference_view():
-    """Depths 3, 3.5 and 4: the deviation is 0.5. With skips of weight 1 these samples are the same."""
     free, faithful = rows(renderer(), SETTINGS, [scene()], 90, lambda _: None)
     for name in ("reference", "reference_object"):
         assert free[f"{name}_deviation"] == pytest.approx(0.5, abs=1e-3)

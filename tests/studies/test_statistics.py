@@ -30,14 +30,7 @@ def test_an_orbit_has_the_figures_of_its_circle(orbit):
     assert summary["distance_from_first"]["max"] == pytest.approx(4)
 
 
-def test_an_arc_has_the_angle_that_it_spans(orbit):
-    summary = statistics({"train": [orbit(7, radius=3.0, turn=60.0)]})["splits"]["train"]
-    assert summary["largest_angle_degrees"]["max"] == pytest.approx(60)
-    assert summary["path_extent"]["max"] == pytest.approx(3)
-
-
 def test_a_long_path_is_measured_between_all_its_cameras(walk):
-    """The farthest two are neither the first nor the last of more cameras than are compared at a time."""
     places = [(float(10 - abs(i - 400) / 40), 0.0, 0.0) if i != 300 else (-5.0, 0.0, 0.0) for i in range(900)]
     assert statistics({"a": [walk(*places)]})["splits"]["a"]["path_extent"]["max"] == pytest.approx(15)
 

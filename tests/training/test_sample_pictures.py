@@ -12,7 +12,7 @@ from PIL import Image
 from support import SMALL, compose_config
 
 from completesplat.metrics.images import PSNR_LIMIT, psnr
-from completesplat.metrics.samples import diversity
+from completesplat.metrics.scoring import diversity
 from completesplat.training.fixed_scenes import fixed_scenes
 from completesplat.training.sample_pictures import SceneDrawings, evenly_spaced, samples_sheet, strip_sheet
 

@@ -15,7 +15,7 @@ from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
-from completesplat.metrics.hidden_modes import (
+from completesplat.metrics.mode_coverage import (
     EDGES,
     REJECTED,
     HiddenModeScores,
@@ -41,48 +41,40 @@ def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
 
     A model that draws nothing gives `samples` equal ones. Samples are computed and rendered `batch` at a time.
     """
-    predict = _samples if module.draws_samples else _repeated
-    found: dict[str, Predictor] = {"model": partial(predict, module, samples, batch)}
+
+    def model(scene: SceneBatch, seed: int) -> Renders:
+        if not module.draws_samples:
+            image = _render(module, module.reconstruct(scene, seed=seed), scene)
+            return image.expand(samples, *image.shape[1:])
+        gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
+        return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
+
+    found: dict[str, Predictor] = {"model": model}
     if isinstance(getattr(module, "model", None), VariationalAutoReconstructor):
         found["posterior_samples"] = partial(_posterior_samples, module, samples, batch)
     return found
 
 
-def _samples(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
-    gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
-    return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
-
-
-def _repeated(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
-    image = _render(module, module.reconstruct(scene, seed=seed), scene)
-    return image.expand(samples, *image.shape[1:])
-
-
 def _posterior_samples(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
     model: VariationalAutoReconstructor = module.model
-    images = scene.reference.images * scene.visible if module.masked else scene.reference.images
-    posterior, features = model.encoder(images)
+    reference = scene.reference
+    posterior, features = model.encoder(reference.images * scene.visible if module.masked else reference.images)
     # On the CPU, so that a seed means the same on every device.
     noise = torch.randn(samples, *posterior.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
     latents = posterior.mean + noise.to(posterior.mean) * posterior.std
-    parts = [_decoded(model, part, features, scene) for part in latents.split(batch)]
-    return torch.cat([_render(module, gaussians, scene) for gaussians in parts])
 
+    def rendered(part: Float[Tensor, "sample channel _ _"]) -> Renders:
+        count = len(part)
+        splatter_image = model.reconstructor(part, [feature.expand(count, -1, -1, -1) for feature in features])
+        cameras = reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
+        return _render(module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)
 
-def _decoded(
-    model: VariationalAutoReconstructor,
-    latents: Float[Tensor, "sample channel _ _"],
-    features: Sequence[Float[Tensor, "1 _ _ _"]],
-    scene: SceneBatch,
-) -> Gaussians:
-    count = len(latents)
-    splatter_image = model.reconstructor(latents, [feature.expand(count, -1, -1, -1) for feature in features])
-    cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
-    return splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1))
+    return torch.cat([rendered(part) for part in torch.split(latents, batch)])
 
 
 def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
-    return module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)
+    images: Renders = module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)
+    return images
 
 
 REGIONS = ("hidden", "visible")
@@ -110,6 +102,34 @@ class Measured:
     shown: dict[str, list[Shown]] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
+
+    def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
+        """Score the renders of the views that show the modes."""
+        found = scores(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
+        self.scores.setdefault(method, []).append(found)
+
+    def add_calibration(self, method: str, renders: Renders, scene: HiddenModes) -> None:
+        """Count the renders of all targets."""
+        variance, error = spread_and_error(renders, scene.scene.targets.images[0])
+        found = self.sums.setdefault(method, {})
+        for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
+            found[name] = found.get(name, 0) + bin_sums(variance, error, region)
+
+    def show(self, method: str, images: Renders, scene: HiddenModes, count: int) -> None:
+        """Keep pictures and classes of some samples."""
+        pixels, modes = in_region(images[:count], scene.region), in_region(scene.truths, scene.region)
+        classes = classify(pixels, modes, scene.probabilities)
+        reference, truths = scene.scene.reference.images[0].cpu(), scene.truths[:, 0].cpu()
+        shown = Shown(
+            scene.scene.names[0],
+            reference,
+            truths,
+            scene.modes,
+            scene.true_mode,
+            images[:count, 0].cpu(),
+            tuple(classes.tolist()),
+        )
+        self.shown.setdefault(method, []).append(shown)
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Means over the scenes by method."""
@@ -139,6 +159,9 @@ def measure(
 ) -> Measured:
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
+    Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
+    their mean.
+
     Raises:
         CompleteSplatError: no scene can be used.
     """
@@ -147,54 +170,21 @@ def measure(
         if isinstance(scene, DataError):
             measured.skipped.append(str(scene))
             continue
-        _measure_naive(measured, scene, samples, seed + index)
+        mean = mean_of(scene.truths, scene.probabilities)
+        measured.add("true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed + index), scene)
+        measured.add("mean_predictor", mean.expand(samples, *mean.shape), scene)
         for method, predict in predictors.items():
             renders = predict(scene.scene, seed + index)
             own = renders[:, list(scene.views)]
-            _add(measured, method, own, scene)
-            _add_calibration(measured, method, renders, scene)
+            measured.add(method, own, scene)
+            measured.add_calibration(method, renders, scene)
             if len(measured.names) < shown_scenes:
-                measured.shown.setdefault(method, []).append(_shown(scene, own, shown_samples))
+                measured.show(method, own, scene, shown_samples)
         measured.names.append(scene.scene.names[0])
     if not measured.names:
         reason = measured.skipped[0] if measured.skipped else "there are none"
         raise CompleteSplatError(f"no test scene can be used for hidden modes; the first: {reason}")
     return measured
-
-
-def _measure_naive(measured: Measured, scene: HiddenModes, samples: int, seed: int) -> None:
-    """Add two predictors that know all modes: one repeats their mean, one draws by their probabilities."""
-    mean = mean_of(scene.truths, scene.probabilities)
-    _add(measured, "true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed), scene)
-    _add(measured, "mean_predictor", mean.expand(samples, *mean.shape), scene)
-
-
-def _add(measured: Measured, method: str, images: Float[Tensor, "_ view 3 height width"], scene: HiddenModes) -> None:
-    found = scores(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
-    measured.scores.setdefault(method, []).append(found)
-
-
-def _add_calibration(
-    measured: Measured, method: str, renders: Float[Tensor, "_ view 3 height width"], scene: HiddenModes
-) -> None:
-    variance, error = spread_and_error(renders, scene.scene.targets.images[0])
-    found = measured.sums.setdefault(method, {})
-    for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
-        sums = bin_sums(variance, error, region)
-        found[name] = found[name] + sums if name in found else sums
-
-
-def _shown(scene: HiddenModes, images: Float[Tensor, "_ view 3 height width"], count: int) -> Shown:
-    classes = classify(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
-    return Shown(
-        name=scene.scene.names[0],
-        reference=scene.scene.reference.images[0].cpu(),
-        truths=scene.truths[:, 0].cpu(),
-        modes=scene.modes,
-        true_mode=scene.true_mode,
-        samples=images[:count, 0].cpu(),
-        classes=tuple(classes[:count].tolist()),
-    )
 
 
 def usable(scenes: HiddenModeScenes, count: int | None) -> Iterator[HiddenModes | DataError]:
@@ -206,21 +196,12 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> Iterator[HiddenModes 
             yield error
 
 
-SIDE = 1.0
-"""Side of a picture, in inches."""
-GAP = 0.06
-CHARTS = 10.0
-"""Width of the charts, in inches; `GAP` is the space between pictures, in inches, too."""
-MEASURES = [
-    ("coverage", "coverage\n(best: 1)"),
-    ("total_variation", "total variation\n(best: 0)"),
-    ("sharpness", "sharpness\n(best: 0)"),
-    ("rejected", "rejected\n(best: 0)"),
-]
+SIDE, GAP, CHARTS = 1.0, 0.06, 10.0
+"""Side of a picture, space between pictures and width of the charts, in inches."""
+BEST = {"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0}
 COLORS = {"hidden": "C3", "visible": "C0"}
 STYLES = ("o-", "s--")
-LOWEST = EDGES[0].item() / 2
-"""Variances and errors below the first edge are drawn here."""
+LOWEST = EDGES[0].item() / 2  # where variances and errors below the first edge are drawn
 
 
 def draw(
@@ -254,29 +235,25 @@ def draw(
 def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:
     for panels, scene in zip(rows, shown, strict=True):
         panels[0].set_ylabel(scene.name, fontsize=7)
-        _draw_picture(panels[0], scene.reference, "input", "k")
-        for mode, panel in enumerate(panels[1 : 1 + len(scene.modes)]):
-            _draw_picture(panel, scene.truths[mode], scene.modes[mode], "g" if mode == scene.true_mode else "k")
-        for image, found, panel in zip(scene.samples, scene.classes, panels[1 + len(scene.modes) :], strict=True):
-            _draw_picture(panel, image, *(("rejected", "0.5") if found == REJECTED else (scene.modes[found], "C1")))
-
-
-def _draw_picture(panel: Any, image: Float[Tensor, "3 height width"], label: str, color: str) -> None:
-    panel.imshow(to_bytes(image), interpolation="nearest")
-    panel.set(xticks=[], yticks=[])
-    panel.set_title(label, fontsize=8, color=color, pad=2)
-    for spine in panel.spines.values():
-        spine.set(color=color, linewidth=0.6 if color == "k" else 2)
+        labels = [("input", "k")]
+        labels += [(name, "g" if mode == scene.true_mode else "k") for mode, name in enumerate(scene.modes)]
+        labels += [("rejected", "0.5") if n == REJECTED else (scene.modes[n], "C1") for n in scene.classes]
+        images = [scene.reference, *scene.truths, *scene.samples]
+        for panel, image, (label, color) in zip(panels, images, labels, strict=True):
+            panel.imshow(to_bytes(image), interpolation="nearest")
+            panel.set(xticks=[], yticks=[])
+            panel.set_title(label, fontsize=8, color=color, pad=2)
+            panel.spines[:].set(color=color, linewidth=0.6 if color == "k" else 2)
 
 
 def _draw_bars(panel: Any, results: Mapping[str, Mapping[str, float]]) -> None:
     width = 0.8 / len(results)
     for index, (method, found) in enumerate(results.items()):
-        places = [place + (index + 0.5) * width - 0.4 for place in range(len(MEASURES))]
-        values = [found[key] for key, _ in MEASURES]
-        bars = panel.bar(places, values, width, label=method.replace("_", " "), color=f"C{index}")
+        places = [place + (index + 0.5) * width - 0.4 for place in range(len(BEST))]
+        bars = panel.bar(places, [found[key] for key in BEST], width, label=method.replace("_", " "), color=f"C{index}")
         panel.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-    panel.set_xticks(range(len(MEASURES)), [label for _, label in MEASURES], fontsize=8)
+    labels = [f"{key.replace('_', ' ')}\n(best: {best})" for key, best in BEST.items()]
+    panel.set_xticks(range(len(BEST)), labels, fontsize=8)
     panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
     panel.margins(y=0.12)
     panel.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)

@@ -1,13 +1,17 @@
 """How well samples cover what could be there, where all of it is known: modes, calibration."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+Samples = Float[Tensor, "sample pixel 3"]
+Modes = Float[Tensor, "mode pixel 3"]
+Probabilities = Float[Tensor, " mode"]
+PerPixel = Float[Tensor, "*view height width"]
 REJECTED = -1
 # Of variances of colours in [0, 1]: all below a deviation of 0.001, then two bins in each decade.
 EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.float64)
@@ -17,14 +21,11 @@ EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.floa
 class HiddenModeScores:
     """Scores of one scene's samples, or means of several scenes'.
 
-    Attributes:
-        coverage: share of the modes (of positive probability) that at least one sample belongs to.
-        total_variation: of the samples' shares from the modes' probabilities, half the sum of absolute differences;
-            rejected samples are a class of their own, of probability 0, so that 1 is the worst: nothing but them.
-            A perfect sampler of few samples does not reach 0; compare with draws of the true distribution.
-        sharpness: distance of a sample to its nearest mode, over that of the modes' mean to its nearest mode; mean over
-            the samples, the rejected too. 0: exactly modes; 1: as far from them as their mean.
-        rejected: share of the samples.
+    `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`: of
+    the samples' shares from the modes' probabilities, half the sum of absolute differences; rejected samples are a
+    class of probability 0, so that 1 is the worst. A perfect sampler of few samples does not reach 0; compare with
+    draws of the true distribution. `sharpness`: distance of a sample to its nearest mode, over that of the modes' mean
+    to its nearest mode; mean over all samples (0: exactly modes). `rejected`: share of the samples.
     """
 
     coverage: float
@@ -33,18 +34,12 @@ class HiddenModeScores:
     rejected: float
 
 
-def distances(
-    samples: Float[Tensor, "sample pixel 3"], modes: Float[Tensor, "mode pixel 3"]
-) -> Float[Tensor, "sample mode"]:
+def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
     """Root mean square difference of every sample and every mode."""
     return torch.stack([(samples - mode).square().mean((1, 2)).sqrt() for mode in modes], dim=1)
 
 
-def classify(
-    samples: Float[Tensor, "sample pixel 3"],
-    modes: Float[Tensor, "mode pixel 3"],
-    probabilities: Float[Tensor, " mode"],
-) -> Int64[Tensor, " sample"]:
+def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
     """The mode that each sample belongs to, or `REJECTED`.
 
     Raises:
@@ -65,20 +60,12 @@ def mean_of(
     modes: Float[Tensor, "mode *picture _"], probabilities: Float[Tensor, " mode"]
 ) -> Float[Tensor, "*picture _"]:
     """The modes' mean, weighted by their probabilities."""
-    return torch.tensordot(probabilities, modes, dims=1)
+    mean: Tensor = torch.tensordot(probabilities, modes, dims=1)
+    return mean
 
 
-def scores(
-    samples: Float[Tensor, "sample pixel 3"],
-    modes: Float[Tensor, "mode pixel 3"],
-    probabilities: Float[Tensor, " mode"],
-) -> HiddenModeScores:
-    """Scores of one scene.
-
-    Args:
-        samples: renders of the region, the pixels of all its views in one row.
-        modes: its pixels in every mode.
-        probabilities: of the modes; they sum to 1.
+def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
+    """Scores of one scene; samples and modes are the region's pixels, those of all its views in one row.
 
     Raises:
         ValueError: no samples, or what `classify` refuses.
@@ -98,17 +85,10 @@ def scores(
     )
 
 
-def mean_scores(of_scenes: Iterable[HiddenModeScores]) -> HiddenModeScores:
-    """Every scene counts the same.
-
-    Raises:
-        ValueError: no scenes.
-    """
-    values = list(of_scenes)
-    if not values:
-        raise ValueError("needs a scene")
-    names = [field.name for field in fields(HiddenModeScores)]
-    return HiddenModeScores(**{name: sum(getattr(one, name) for one in values) / len(values) for name in names})
+def mean_scores(of_scenes: Sequence[HiddenModeScores]) -> HiddenModeScores:
+    """Every scene, of at least one, counts the same."""
+    means = (sum(values) / len(of_scenes) for values in zip(*map(astuple, of_scenes), strict=True))
+    return HiddenModeScores(*means)
 
 
 def draw_modes(
@@ -121,7 +101,7 @@ def draw_modes(
 
 def spread_and_error(
     samples: Float[Tensor, "sample *view 3 height width"], truth: Float[Tensor, "*view 3 height width"]
-) -> tuple[Float[Tensor, "*view height width"], Float[Tensor, "*view height width"]]:
+) -> tuple[PerPixel, PerPixel]:
     """Variance over the samples (unbiased) and squared error of their mean, each a mean over the three channels.
 
     Raises:
@@ -133,9 +113,7 @@ def spread_and_error(
 
 
 def bin_sums(
-    variance: Float[Tensor, "*view height width"],
-    squared_error: Float[Tensor, "*view height width"],
-    region: Bool[Tensor, "*view height width"],
+    variance: PerPixel, squared_error: PerPixel, region: Bool[Tensor, "*view height width"]
 ) -> Float[Tensor, "bin 3"]:
     """Number of pixels, sum of variances and sum of squared errors of the region's pixels, by bin of variance.
 
@@ -149,15 +127,10 @@ def bin_sums(
 
 def curve(sums: Float[Tensor, "bin 3"]) -> dict[str, Any]:
     """Means over all pixels and over those of each bin that has any; None where there are no pixels at all."""
-    total = sums.sum(0)
-    pixels = [row for row in sums.tolist() if row[0] > 0]
+    count, variance, error = sums.sum(0).tolist()
     return {
-        "pixels": int(total[0]),
-        "variance": _ratio(total[1], total[0]),
-        "squared_error": _ratio(total[2], total[0]),
-        "bins": [{"pixels": int(n), "variance": v / n, "squared_error": e / n} for n, v, e in pixels],
+        "pixels": int(count),
+        "variance": variance / count if count else None,
+        "squared_error": error / count if count else None,
+        "bins": [{"pixels": int(n), "variance": v / n, "squared_error": e / n} for n, v, e in sums.tolist() if n > 0],
     }
-
-
-def _ratio(value: Tensor, pixels: Tensor) -> float | None:
-    return (value / pixels).item() if pixels > 0 else None

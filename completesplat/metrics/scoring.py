@@ -1,9 +1,11 @@
-"""The protocol: per image, averaged over the views of a scene, then over scenes; errors of depth."""
+"""The protocol: per image, averaged over the views of a scene, then over scenes; several samples; errors of depth."""
 
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+from math import comb, isnan
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,23 +14,15 @@ from torch import Tensor
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError
 from completesplat.metrics.image_sets import ImageSets, SetMetric
-from completesplat.metrics.images import object_only, psnr, ssim
-from completesplat.metrics.missing import Missing
-from completesplat.metrics.samples import best, diversity, expected_best_curve
+from completesplat.metrics.images import Missing, object_only, psnr, ssim
 from completesplat.scene import SceneBatch, Views
 
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
+Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
 MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
-
-
-class DepthViews(NamedTuple):
-    """True depth of the reference and the targets (0: unknown), and their masks."""
-
-    depth: Float[Tensor, "view 1 height width"]
-    masks: Float[Tensor, "view 1 height width"]
 
 
 class Evaluation:
@@ -40,11 +34,10 @@ class Evaluation:
 
     Args:
         samples: drawn of each scene. With more than one there are three rows: `model` (the first sample), `best_of_k`
-            (the one that is best by `criterion`, an oracle, since it takes the truth to choose it) and `mean_of_k`.
-        criterion: metric by which the best is chosen: mean of the novel views, all pixels.
+            (the best by the metric `criterion` over all pixels of the novel views, an oracle) and `mean_of_k`.
         seed: of what is drawn; each scene has its own, which depends on its name only besides.
         perceptual: LPIPS, or why it is missing.
-        sets: metrics of whole sets of images, of the novel views; or why they are missing, by name.
+        sets: metrics of whole sets of novel views by name, or why they are missing.
     """
 
     def __init__(
@@ -59,17 +52,17 @@ class Evaluation:
         self.missing: dict[str, str] = {}
         if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
-        for absent in [perceptual, *(sets or {}).values()]:
+        given = list((sets or {}).values())
+        for absent in [perceptual, *given]:
             if isinstance(absent, Missing):
                 self.missing |= dict.fromkeys(absent.names, str(absent))
-        present = [metric for metric in (sets or {}).values() if metric is not None and not isinstance(metric, Missing)]
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
         if criterion not in self.metrics:
             said = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
             raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {said}")
         self.samples, self.criterion, self.seed = samples, criterion, seed
-        self.set_metrics = present
+        self.set_metrics = [one for one in given if one is not None and not isinstance(one, Missing)]
         self.reset()
 
     def reset(self) -> None:
@@ -78,8 +71,7 @@ class Evaluation:
         self.scores: dict[str, dict[str, Scores]] = defaultdict(dict)
         self.views: dict[str, int] = {}
         self.drawn: dict[str, dict[str, Any]] = {}
-        self.skipped = 0
-        """Scenes that could not be read."""
+        self.skipped = 0  # scenes that could not be read
 
     def scene_seed(self, name: str) -> int:
         """What is drawn for a scene: the same whichever scenes come before it."""
@@ -119,14 +111,12 @@ class Evaluation:
         return scores
 
     @torch.no_grad()
-    def update_depth(self, name: str, predicted: Float[Tensor, "view 1 height width"], true: DepthViews) -> None:
-        """Errors of the model's depth along the optical axes (its first sample's), where the truth is known.
-
-        They are called `depth_abs_rel`, `depth_rmse` (in the scene's units) and `depth_delta1`: see `depth_errors`.
-        """
+    def update_depth(self, name: str, predicted: Float[Tensor, "view 1 height width"], true: Views) -> None:
+        """Errors of the model's depth (its first sample's): `depth_abs_rel` and the others of `depth_errors`."""
+        assert true.depths is not None
         for region in REGIONS:
-            valid = true.depth > 0
-            errors = depth_errors(predicted, true.depth, valid & (true.masks > 0.5) if region == "object" else valid)
+            counted = true.masks > 0.5 if region == "object" else torch.ones_like(true.masks, dtype=torch.bool)
+            errors = depth_errors(predicted, true.depths.to(predicted), counted)
             for kind, views in (("reference", errors[:1]), ("novel", errors[1:])):
                 known = [found for found in views if found is not None]
                 for metric in known[0] if known else ():
@@ -145,7 +135,7 @@ class Evaluation:
 
     def gather(self) -> None:
         """Know what all processes scored; each of them must call it."""
-        own = self.scores, self.views, self.drawn, self.sets.state(), self.skipped
+        own = self.scores, self.views, self.drawn, self.sets.kept, self.skipped
         self.reset()
         for scores, views, drawn, sets, skipped in gathered(own):
             for predictor, scenes in scores.items():
@@ -162,9 +152,8 @@ class Evaluation:
             names = sorted(scenes)
             entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
             for region, view, metric in dict.fromkeys(key for name in names for key in scenes[name]):
-                values = [
-                    scenes[name][region, view, metric] for name in names if (region, view, metric) in scenes[name]
-                ]
+                found = (scenes[name].get((region, view, metric)) for name in names)
+                values = [value for value in found if value is not None]
                 entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
             for region in REGIONS:
                 entry[region]["novel"] |= self.sets.results(predictor, region)
@@ -177,36 +166,66 @@ class Evaluation:
         return results
 
 
-def _region(
-    images: Float[Tensor, "view 3 height width"], truth: Views, region: str
-) -> Float[Tensor, "view 3 height width"]:
+def _region(images: Tensor, truth: Views, region: str) -> Tensor:
     return object_only(images, truth.masks) if region == "object" else images
 
 
 def depth_errors(
-    predicted: Float[Tensor, "image 1 height width"],
-    true: Float[Tensor, "image 1 height width"],
-    valid: Bool[Tensor, "image 1 height width"],
+    predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 height width"]
 ) -> list[dict[str, float] | None]:
-    """For each image, over its valid pixels (Eigen et al. 2014, Section 4.2), without alignment of scale.
+    """For each image, over its valid pixels whose true depth is finite and above 0, without alignment of scale.
 
     `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
-    predicted / true and true / predicted are less than 1.25. None for an image without a valid pixel.
-
-    Args:
-        predicted: depth, in the unit of `true`; where nothing is predicted, 0.
-        true: depth; a pixel counts only where it is finite and above 0.
-        valid: pixels that count.
+    predicted / true and true / predicted are less than 1.25 (Eigen et al. 2014, Section 4.2). None for an image
+    without such a pixel. `predicted` is 0 where nothing is predicted.
     """
-    counted = valid & true.isfinite() & (true > 0)
-    return [_errors(p[c], t[c]) if c.any() else None for p, t, c in zip(predicted, true, counted, strict=True)]
+    errors: list[dict[str, float] | None] = []
+    for own, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
+        p, t = own[counted], depth[counted]
+        ratio, difference = torch.maximum(p / t, t / p), p - t
+        found = {
+            "abs_rel": (difference.abs() / t).mean().item(),
+            "rmse": difference.square().mean().sqrt().item(),
+            "delta1": ((ratio < 1.25) & (p > 0)).float().mean().item(),
+        }
+        errors.append(found if len(t) else None)
+    return errors
 
 
-def _errors(predicted: Float[Tensor, " pixel"], true: Float[Tensor, " pixel"]) -> dict[str, float]:
-    difference = predicted - true
-    ratio = torch.maximum(predicted / true, true / predicted)
-    return {
-        "abs_rel": (difference.abs() / true).mean().item(),
-        "rmse": difference.square().mean().sqrt().item(),
-        "delta1": ((ratio < 1.25) & (predicted > 0)).float().mean().item(),
-    }
+def best(scores: Sequence[float], higher_is_better: bool = True) -> int:
+    """The index of the best sample, the first of equals.
+
+    Raises:
+        ValueError: there is no score, or one is no number.
+    """
+    return scores.index(_worst_first(scores, higher_is_better)[-1])
+
+
+def expected_best_curve(scores: Sequence[float], higher_is_better: bool = True) -> list[float]:
+    """Entry j - 1 is the mean, over all choices of j of the k samples, of the best score among the j.
+
+    Of k scores from worst to best, the i-th is the best of C(i - 1, j - 1) of the C(k, j) choices.
+
+    Raises:
+        ValueError: there is no score, or one is no number.
+    """
+    worst_first, k = _worst_first(scores, higher_is_better), len(scores)
+    return [sum(comb(i, j) * score for i, score in enumerate(worst_first)) / comb(k, j + 1) for j in range(k)]
+
+
+def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]:
+    if not scores or any(isnan(score) for score in scores):
+        raise ValueError(f"needs scores that are numbers, not {list(scores)}")
+    return sorted(scores, reverse=not higher_is_better)
+
+
+def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
+    """Root mean square difference of two samples' renders, mean over all pairs of samples and all views.
+
+    Raises:
+        ValueError: less than two samples.
+    """
+    if len(images) < 2:
+        raise ValueError("needs two samples")
+    differences = [(one - other).square().mean((1, 2, 3)).sqrt() for one, other in combinations(images, 2)]
+    return torch.stack(differences).mean().item()

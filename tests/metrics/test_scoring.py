@@ -1,13 +1,17 @@
+"""How scores are averaged, samples chosen and depth measured: closed forms and brute force."""
+
 import math
+from dataclasses import replace
+from itertools import combinations
 
 import pytest
 import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras
-from completesplat.metrics.evaluation import DepthViews, Evaluation
 from completesplat.metrics.image_sets import Patches
-from completesplat.metrics.missing import Missing
+from completesplat.metrics.images import Missing
+from completesplat.metrics.scoring import Evaluation, best, depth_errors, diversity, expected_best_curve
 from completesplat.scene import SceneBatch, Views
 
 
@@ -25,7 +29,6 @@ def scenes(batch: int, targets: int, first: int = 0) -> SceneBatch:
 
 
 def test_views_are_averaged_within_scenes_before_scenes_are():
-    """One scene with 1 novel view at 20 dB and one with 3 at 40 dB average to 30 dB, not to 35."""
     evaluation = Evaluation()
     for targets, error in ((1, 0.1), (3, 0.01)):
         images = torch.full((1, 1 + targets, 3, 16, 16), 0.5 + error)
@@ -92,7 +95,6 @@ def test_of_several_samples_the_first_the_best_and_the_mean_are_told():
 
 
 def test_the_best_is_chosen_by_the_criterion():
-    """A sample with the right colours but the wrong structure has the higher PSNR, the other one the higher SSIM."""
     generator = torch.Generator().manual_seed(0)
     batch = scenes(1, 1)
     texture = 0.2 * torch.rand(1, 2, 3, 16, 16, generator=generator)
@@ -108,7 +110,7 @@ def test_the_best_is_chosen_by_the_criterion():
     assert chosen == {"psnr": True, "ssim": False}
 
 
-@pytest.mark.parametrize("count", range(1, 10))
+@pytest.mark.parametrize("count", [1, 2, 5])
 def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, count):
     def scored(names: list[int]) -> Evaluation:
         evaluation = Evaluation(samples=2, sets={"swd": Patches(patches=2)})
@@ -124,8 +126,8 @@ def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, 
     )
     second.skipped = 1
     second.update_samples("scene 0", torch.rand(2, 3, 3, 16, 16), scenes(1, 2).all_views()[0])  # padding, as it were
-    states = [(e.scores, e.views, e.drawn, e.sets.state(), e.skipped) for e in (second, first)]
-    monkeypatch.setattr("completesplat.metrics.evaluation.gathered", lambda own: states)
+    states = [(e.scores, e.views, e.drawn, e.sets.kept, e.skipped) for e in (second, first)]
+    monkeypatch.setattr("completesplat.metrics.scoring.gathered", lambda own: states)
     first.gather()
     assert first.results() == alone.results()
     assert first.results()["model"]["scenes"] == count
@@ -178,9 +180,92 @@ def test_depth_is_scored_where_the_truth_is_known():
     predicted[:, :, 8:] = 4.0
     predicted[1, :, :, 8:] = 99.0
     evaluation.update("model", torch.full((1, 3, 3, 16, 16), 0.5), scenes(1, 2))
-    evaluation.update_depth("scene 0", predicted, DepthViews(true, masks))
+    evaluation.update_depth("scene 0", predicted, replace(scenes(1, 2).all_views()[0], depths=true, masks=masks))
     full, of_object = (evaluation.results()["model"][region]["novel"] for region in ("full", "object"))
     assert full["depth_abs_rel"] == pytest.approx((0.1 + 1) / 2)
     assert of_object["depth_abs_rel"] == pytest.approx(0.1)
     assert (full["depth_delta1"], of_object["depth_delta1"]) == (pytest.approx(0.5), pytest.approx(1))
     assert evaluation.results()["model"]["object"]["reference"]["depth_rmse"] == pytest.approx(0.2)
+
+
+SCORES = [21.5, 19.0, 24.25, 19.0, 22.75, -3.0]
+
+
+@pytest.mark.parametrize(("higher_is_better", "chosen"), [(True, max), (False, min)])
+def test_the_curve_is_the_mean_best_of_all_choices(higher_is_better, chosen):
+    expected = []
+    for j in range(1, len(SCORES) + 1):
+        among = [chosen(choice) for choice in combinations(SCORES, j)]
+        expected.append(sum(among) / len(among))
+    assert expected_best_curve(SCORES, higher_is_better) == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_best_is_the_first_of_equals():
+    assert best(SCORES) == 2
+    assert best(SCORES, higher_is_better=False) == 5
+    assert best([1.0, 3.0, 3.0]) == 1
+    assert best([3.0, 1.0, 1.0], higher_is_better=False) == 1
+
+
+@pytest.mark.parametrize("scores", [[], [1.0, float("nan")]])
+@pytest.mark.parametrize("function", [best, expected_best_curve])
+def test_without_numbers_nothing_is_best(function, scores):
+    with pytest.raises(ValueError, match="scores that are numbers"):
+        function(scores)
+
+
+def test_diversity_is_the_mean_difference_of_all_pairs():
+    images = torch.tensor([0.1, 0.2, 0.5]).view(3, 1, 1, 1, 1).expand(3, 2, 3, 4, 4)
+    assert diversity(images) == pytest.approx((0.1 + 0.4 + 0.3) / 3)
+    assert diversity(images[:1].expand(3, 2, 3, 4, 4)) == 0
+
+
+def test_one_sample_has_no_diversity():
+    with pytest.raises(ValueError, match="two samples"):
+        diversity(torch.zeros(1, 2, 3, 4, 4))
+
+
+def images(*rows: list[float]) -> torch.Tensor:
+    return torch.tensor(rows)[:, None, None]
+
+
+def test_errors_are_those_of_a_worked_example():
+    true, predicted = images([1.0, 2.0, 4.0, 5.0]), images([1.5, 2.0, 3.0, 6.0])
+    (errors,) = depth_errors(predicted, true, torch.ones(1, 1, 1, 4, dtype=torch.bool))
+    assert errors["abs_rel"] == pytest.approx((0.5 + 0 + 0.25 + 0.2) / 4)
+    assert errors["rmse"] == pytest.approx(math.sqrt((0.25 + 0 + 1 + 1) / 4))
+    # Ratios 1.5, 1, 1.33 and 1.2.
+    assert errors["delta1"] == 0.5
+
+
+def test_a_common_scale_is_an_error_of_that_scale():
+    true = 1 + torch.rand(2, 1, 8, 8, generator=torch.Generator().manual_seed(0))
+    everywhere = torch.ones_like(true, dtype=torch.bool)
+    for scale, within in ((1.2, 1.0), (1 / 1.2, 1.0), (1.44, 0.0), (1 / 1.44, 0.0)):
+        for errors, depth in zip(depth_errors(scale * true, true, everywhere), true, strict=True):
+            assert errors["abs_rel"] == pytest.approx(abs(scale - 1), rel=1e-5)
+            assert errors["rmse"] == pytest.approx(abs(scale - 1) * depth.square().mean().sqrt().item(), rel=1e-5)
+            assert errors["delta1"] == within
+
+
+def test_pixels_that_do_not_count_may_hold_anything():
+    nan, inf = math.nan, math.inf
+    true = images([1.0, 2.0, nan, 0.0, inf, 3.0])
+    predicted = images([2.0, 2.0, 1.0, 1.0, 1.0, nan])
+    valid = torch.tensor([True, True, True, True, True, False])[None, None, None]
+    assert depth_errors(predicted, true, valid) == depth_errors(
+        predicted[..., :2], true[..., :2], torch.ones(1, 1, 1, 2, dtype=torch.bool)
+    )
+
+
+def test_an_image_without_valid_pixels_has_no_errors():
+    depth = torch.ones(3, 1, 2, 2)
+    valid = torch.zeros(3, 1, 2, 2, dtype=torch.bool)
+    valid[1] = True
+    assert depth_errors(depth, depth, valid) == [None, {"abs_rel": 0, "rmse": 0, "delta1": 1}, None]
+
+
+def test_a_pixel_without_prediction_is_wrong():
+    for nothing in (0.0, -1.0):
+        (errors,) = depth_errors(images([nothing]), images([1.0]), torch.ones(1, 1, 1, 1, dtype=torch.bool))
+        assert errors == {"abs_rel": 1 - nothing, "rmse": 1 - nothing, "delta1": 0}

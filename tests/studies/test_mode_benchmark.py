@@ -12,7 +12,7 @@ from completesplat.losses import WeightedSum
 from completesplat.losses.mse import MeanSquaredError
 from completesplat.rasterizers import Rendering
 from completesplat.scene import SceneBatch, Views
-from completesplat.studies.hidden_modes import in_region, measure, predictors, usable
+from completesplat.studies.mode_benchmark import in_region, measure, predictors, usable
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 

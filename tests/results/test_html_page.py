@@ -4,7 +4,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from completesplat.results.html_elements import Html, element, joined
+from completesplat.results.html_page import Html, element, joined
 
 
 def parsed(text: str) -> list:
