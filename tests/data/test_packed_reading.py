@@ -319,12 +319,11 @@ def test_a_shard_that_is_a_link_out_of_the_folder_is_refused(store: Path, tmp_pa
 
 
 def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> None:
-    manifest = read_manifest(store)
-    settings_must_match(manifest, {"image_size": SIZE})
+    settings_must_match(store, {"image_size": SIZE})
     with pytest.raises(DataError, match=r"image_size=16 \(asked for: 32\)"):
-        settings_must_match(manifest, {"image_size": 32})
+        settings_must_match(store, {"image_size": 32})
     with pytest.raises(DataError, match=r"crop=None \(asked for: central\)"):
-        settings_must_match(manifest, {"image_size": SIZE, "crop": "central"})
+        settings_must_match(store, {"image_size": SIZE, "crop": "central"})
 
 
 def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store: Path, tmp_path: Path) -> None:

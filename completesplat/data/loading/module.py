@@ -12,13 +12,13 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
-from completesplat.data.latent_cache.store import CachedTrainingScenes, LatentCache
+from completesplat.data.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.loader import EpochSampler, SceneLoader, check_policy
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
-from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
+from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
@@ -171,7 +171,7 @@ class SceneDataModule(LightningDataModule):
         """
         if split not in self._sources:
             if is_packed(self.root):
-                settings_must_match(read_manifest(self.root), self.packed_settings())
+                settings_must_match(self.root, self.packed_settings())
                 self._sources[split] = PackedSource(self.root, split)
             else:
                 self._sources |= self.open(split)
