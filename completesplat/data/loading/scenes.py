@@ -38,12 +38,10 @@ class Loaded(NamedTuple):
 
 
 class SceneStore:
-    """Makes scenes of some of a source's sequences.
+    """Makes scenes of some of a source's sequences, which `names` lists in order.
 
     Args:
-        names: the sequences, in order.
-        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay
-            probabilities.
+        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay.
         cache: keep decoded pictures (uint8) in memory, each from its first use on.
     """
 
@@ -75,11 +73,7 @@ class SceneStore:
         return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
-        """One picture.
-
-        Raises:
-            DataError: it cannot be read.
-        """
+        """One picture. Raises `DataError` if it cannot be read."""
         return self._picture(sequence, view).image
 
     def _picture(self, sequence: PosedSequence, view: int) -> Picture:
@@ -199,10 +193,11 @@ class EvaluationScenes(Dataset[Loaded]):
         except DataError as error:
             return Loaded(None, (error,))
         try:
-            depths = _depths(sequence, *views) if self.depths else None
+            if self.depths and sequence.read_depth is not None:
+                scene = _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (views[0], *views[1])]))
         except DataError as error:
             return Loaded(scene, (), (error,))
-        return Loaded(scene if depths is None else with_depths(scene, depths), ())
+        return Loaded(scene, ())
 
     def stackable(self) -> bool:
         """Whether all scenes have the same number of targets, as far as they can be read."""
@@ -213,21 +208,7 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(counts) <= 1
 
 
-def _depths(
-    sequence: PosedSequence, reference: int, targets: Sequence[int]
-) -> Float[Tensor, "view 1 height width"] | None:
-    """True depth of these frames, the reference first; None where the data have none.
-
-    Raises:
-        DataError: a depth map cannot be read.
-    """
-    if sequence.read_depth is None:
-        return None
-    return torch.stack([sequence.read_depth(view) for view in (reference, *targets)])
-
-
-def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
-    """One scene (without batch axis) with the depths of its reference and its targets."""
+def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
     reference, targets = replace(scene.reference, depths=depths[0]), replace(scene.targets, depths=depths[1:])
     return replace(scene, reference=reference, targets=targets)
 
@@ -235,8 +216,9 @@ def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"])
 def collate(items: Sequence[Loaded]) -> Loaded:
     """A batch of the scenes that are there; where only some of them have depths, those of the others are 0, unknown."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    if any(_has_depths(scene) for scene in scenes):
-        scenes = [scene if _has_depths(scene) else _with_unknown_depths(scene) for scene in scenes]
+    with_depths = [isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes]
+    if any(with_depths):
+        scenes = [scene if has else _with_unknown_depths(scene) for scene, has in zip(scenes, with_depths, strict=True)]
     return Loaded(
         stack(scenes) if scenes else None,
         tuple(error for item in items for error in item.refused),
@@ -244,9 +226,5 @@ def collate(items: Sequence[Loaded]) -> Loaded:
     )
 
 
-def _has_depths(scene: SceneBatch | CachedScene) -> bool:
-    return isinstance(scene, SceneBatch) and scene.reference.depths is not None
-
-
 def _with_unknown_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
-    return with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene
+    return _with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene

@@ -10,7 +10,14 @@ KINDS = {"objects": write_objects, "rooms": write_rooms}
 
 
 def write(
-    kind: str, out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
+    kind: str,
+    out: Path,
+    scenes: int,
+    frames: int,
+    size: int,
+    seed: int,
+    workers: int | None = None,
+    progress: bool = True,
 ) -> Path:
     """Write scenes of a kind (a key of `KINDS`); returns their folder.
 
