@@ -22,7 +22,6 @@ class HiddenModes(TensorDataclass):
         region: pixels of those views that differ between the modes.
         probabilities: of the modes, given the reference picture.
         unseen: pixels of all targets whose surface the reference picture does not show.
-        modes: names of the modes.
         true_mode: the mode that the data set's own pictures show.
     """
 

@@ -59,24 +59,14 @@ class CachedSequence:
 
 @dataclass(frozen=True)
 class Origin:
-    """What a store was made from. Another store with the same origin would hold the same.
+    """What a store was made from. Another store with the same origin would hold the same."""
 
-    Attributes:
-        encoder: fingerprint of the autoreconstructor's encoder.
-        conditioning: fingerprint of the frozen conditioning whose features are stored; None: pictures are.
-        data: fingerprint of the training set.
-        settings: of the data module: what pictures and splits depend on.
-        image_size: side of the pictures that were encoded.
-        frames: the largest number of frames of a sequence, evenly spaced; None: all.
-        precision: in which means, log-variances and features are stored.
-    """
-
-    encoder: str
-    conditioning: str | None
+    encoder: str  # fingerprints
+    conditioning: str | None  # the frozen one whose features are stored; None: pictures are
     data: str
-    settings: dict[str, Scalar]
+    settings: dict[str, Scalar]  # of the data module: what pictures and splits depend on
     image_size: int
-    frames: int | None
+    frames: int | None  # the largest number of frames of a sequence, evenly spaced; None: all
     precision: str
 
 
@@ -110,7 +100,7 @@ def is_latent_cache(root: Path) -> bool:
 
 
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
-    """`manifest.json` in the store's folder, there as a whole or not at all; it is written last."""
+    """Finish the store."""
     write_json(root / MANIFEST, manifest, HEADER)
 
 
@@ -196,16 +186,8 @@ class LatentCache:
         self.scale = self.manifest.scale
         self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
-
-    @property
-    def latent_shape(self) -> tuple[int, ...]:
-        """Channels, height and width."""
-        return self.manifest.arrays["mean"].shape[1:]
-
-    @property
-    def holds_pictures(self) -> bool:
-        """Whether the conditions are pictures rather than features."""
-        return self.origin.conditioning is None
+        self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
+        self.holds_pictures = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
         """The frame at a place in a sequence, without batch axis; features as they were stored, in float32.
@@ -227,22 +209,14 @@ class LatentCache:
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
-        """Refuse a store that was made from other pictures than `source` gives with these settings.
-
-        Raises:
-            DataError: another fingerprint, other settings, or other sequences.
-        """
+        """`must_be_of`, and refuse a store that was made with other settings too."""
         differing = differences(self.origin.settings, settings)
         if differing:
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
         self.must_be_of(source)
 
     def must_be_of(self, source: SequenceSource) -> None:
-        """Refuse a store that was made from another data set.
-
-        Raises:
-            DataError: another fingerprint, or other sequences.
-        """
+        """Refuse a store that was made from another data set, with `DataError`."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
@@ -258,14 +232,8 @@ class CachedTrainingScenes(TrainingScenes):
     """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
 
     Where only some frames of a sequence were encoded, the nearest of those that are there takes the reference's place
-    (the earlier one of two).
-
-    Args:
-        cache: where the items come from.
-        store: the training set, whose names and groups tell the order; it is not read.
-        choose: (number of a sequence's frames, random generator) -> views.
-        box_masks: hide parts of the pictures, as `augment` does; None for none.
-        references: items of a sequence in one epoch.
+    (the earlier one of two). The store's names and groups tell the order; it is not read. Box masks hide parts of the
+    pictures as `augment` does.
 
     Raises:
         CompleteSplatError: box masks, but the store holds features instead of pictures.

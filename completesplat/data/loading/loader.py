@@ -21,9 +21,6 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
     Lightning calls `set_epoch` before every epoch, also after a resume. Where several processes train, each has its
     own items, equally many (the last few may be left out).
-
-    Args:
-        groups: items that are best loaded one after the other.
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], seed: int) -> None:
@@ -55,7 +52,6 @@ class SceneLoader:
 
     Args:
         sampler: the order of a training epoch; None: as they are.
-        workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
     """

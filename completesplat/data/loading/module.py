@@ -193,11 +193,7 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def cached_latents(self) -> LatentCache:
-        """The cache in `latent_cache`, which must be those of this training set.
-
-        Raises:
-            DataError: there are none, or they are damaged, or of other data or made with other settings.
-        """
+        """The cache in `latent_cache`. Raises `DataError` if it is damaged, or not of this training set."""
         assert self.latent_cache is not None
         store = LatentCache(self.latent_cache)
         store.must_belong_to(self.source("train"), self.packed_settings())
@@ -218,11 +214,9 @@ class SceneDataModule(LightningDataModule):
         return TrainingScenes(*drawing, self.augment, *counting)
 
     def val_dataloader(self) -> SceneLoader:
-        """The validation sequences."""
         return self._evaluation_loader("val")
 
     def test_dataloader(self) -> SceneLoader:
-        """The test sequences."""
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
@@ -243,11 +237,7 @@ class SceneDataModule(LightningDataModule):
             logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
 
     def typical_camera(self) -> TypicalCamera:
-        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences.
-
-        Raises:
-            DataError: none of them can be read.
-        """
+        """See `mean_camera`."""
         with at(file=self.root):
             return mean_camera(self.store("train"))
 

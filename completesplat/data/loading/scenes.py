@@ -25,11 +25,9 @@ Choice = tuple[int, list[int]]  # reference, targets
 
 
 class Loaded(NamedTuple):
-    """A scene, or a batch of them, and what could not be read on the way.
+    """A scene, or a batch of them, and why others could not be read.
 
-    Attributes:
-        refused: why scenes could not be read.
-        refused_depths: why scenes are here without their true depth, although the data have it.
+    `refused_depths`: why scenes are here without their true depth, although the data have it.
     """
 
     scenes: SceneBatch | CachedScene | None
@@ -67,10 +65,9 @@ class SceneStore:
         if self.mask_threshold is not None:
             masks = (masks >= self.mask_threshold).float()
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
-        seen = Views(images, cameras, masks)
-        visible = torch.ones_like(masks[0])
-        frame = torch.tensor(reference)
-        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, frame, sequence.name)
+        seen, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
+        ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
+        return SceneBatch(seen[0], seen[1:], ranges, visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
         """One picture. Raises `DataError` if it cannot be read."""
@@ -96,10 +93,8 @@ class TrainingScenes(Dataset[Loaded]):
     An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
     only.
 
-    Args:
-        choose: (number of a sequence's frames, random generator) -> views.
-        augment: (scene, random generator) -> scene.
-        references: items of a sequence in one epoch.
+    `choose` is (number of a sequence's frames, random generator) -> views; `references` are items of a sequence in one
+    epoch.
     """
 
     def __init__(
@@ -149,11 +144,10 @@ class TrainingScenes(Dataset[Loaded]):
 
 
 class EvaluationScenes(Dataset[Loaded]):
-    """Every sequence once.
+    """Every sequence once, or those of some names.
 
     Args:
         choose: sequence -> views. Raises `DataError` where it has not got them.
-        names: the sequences; None: all.
         seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
         depths: read the true depth too, where the data have it.
     """

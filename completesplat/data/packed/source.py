@@ -22,11 +22,11 @@ class PackedSource:
     """
 
     def __init__(self, root: Path, split: str) -> None:
-        manifest = read_manifest(root)
-        if split not in manifest.splits:
-            there = ", ".join(manifest.splits) or "none"
+        splits = read_manifest(root).splits
+        if split not in splits:
+            there = ", ".join(splits) or "none"
             raise DataError(f"no split {split} in this packed store; there are: {there}", str(root))
-        entry = manifest.splits[split]
+        entry = splits[split]
         self.root = root
         self.shards = entry.shards
         self.names = list(entry.names)
@@ -40,7 +40,11 @@ class PackedSource:
         self._opened: dict[int, Any] = {}
         with at(file=root / MANIFEST):
             for shard in self.shards:
-                self._check_size(shard)
+                path = require_file(inside(root, shard.file))
+                size = path.stat().st_size
+                if size != shard.bytes:
+                    reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
+                    raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
         """One sequence: its cameras as they were prepared, its pictures decoded one by one when they are read.
@@ -74,13 +78,6 @@ class PackedSource:
                 advice = "remove it and prepare again into the same folder"
                 changed.append(ChangedFile(f"its checksum is no longer that of the manifest: {advice}", file.name))
         return changed
-
-    def _check_size(self, shard: Shard) -> None:
-        path = require_file(inside(self.root, shard.file))
-        size = path.stat().st_size
-        if size != shard.bytes:
-            reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
-            raise ChangedFile(reason, str(path))
 
     def __getstate__(self) -> dict[str, Any]:
         # Worker processes open the files themselves and share their pages.

@@ -6,7 +6,7 @@ import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -235,19 +235,12 @@ def prepare(
     """Write sequences into a packed store. The same input gives the same bytes, whatever the number of workers.
 
     An interrupted run continues when it is started again; a complete store of the same data is left as it is. A shard
-    that is missing or of another size is made again.
+    that is missing or of another size is made again. `workers` are processes, by default one for each core.
 
     Args:
-        sources: by split.
-        settings: what is baked into the pictures and cameras, for those who read them.
         codec: of the images, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are without loss, "jpeg" is not.
         sequences_per_shard: some hundred MB at 128 x 128 pixels and 200 frames.
-        workers: processes; by default one for each core.
-        on_bad: leave out frames and sequences that cannot be read, and record that; or raise.
-        max_bad_fraction: the largest share of frames, and of sequences, that may be left out so.
-
-    Returns:
-        The folder.
+        on_bad: leave out (and record) frames and sequences that cannot be read, up to a share of each; or raise.
 
     Raises:
         DataError: the folder holds something else, too little space, too much or (on_bad="raise") anything bad.
@@ -262,20 +255,21 @@ def prepare(
     if is_packed(out) and not missing:
         logger.info("%s already holds these sequences", out)
         return out
-    # What it says may no longer be so until it is written again.
-    (out / MANIFEST).unlink(missing_ok=True)
-    for path in out.glob(f"*{UNFINISHED}"):
-        path.unlink()
+    # What the manifest says may no longer be so until it is written again.
+    for path in (out / MANIFEST, *out.glob(f"*{UNFINISHED}")):
+        path.unlink(missing_ok=True)
     listed = [error for source in writer.sources.values() for error in source.refused]
     if on_bad == "raise" and listed:
         raise listed[0]
     if missing:
         _check_space(writer, missing)
-        records.update(zip(missing, _write_all(writer, missing, workers, progress), strict=True))
-    made = [record for record in records.values() if record is not None]
-    splits = {split: _split(source, [r for r in made if r.split == split]) for split, source in writer.sources.items()}
-    _check_share(splits, out, max_bad_fraction)
-    write_json(out / MANIFEST, PackedManifest(codec, dict(settings), splits), HEADER)
+        with Progress(disable=not progress) as bar:
+            task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in missing))
+            for plan, record in zip(missing, _write(writer, missing, workers), strict=True):
+                bar.advance(task, len(record.names))
+                records[plan] = record
+    splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
+    _finish(PackedManifest(codec, dict(settings), splits), out, max_bad_fraction)
     return out
 
 
@@ -321,7 +315,8 @@ def _write_in_worker(plan: ShardPlan) -> ShardRecord:
     return _writer.write(plan)
 
 
-def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int) -> Iterator[ShardRecord]:
+def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int | None) -> Iterator[ShardRecord]:
+    workers = min(workers or os.cpu_count() or 1, len(plans))
     if workers == 1:
         yield from map(writer.write, plans)
         return
@@ -336,18 +331,8 @@ def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int) -> Ite
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _write_all(
-    writer: ShardWriter, plans: Sequence[ShardPlan], workers: int | None, progress: bool
-) -> Iterator[ShardRecord]:
-    workers = min(workers or os.cpu_count() or 1, len(plans))
-    with Progress(disable=not progress) as bar:
-        task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in plans))
-        for record in _write(writer, plans, workers):
-            bar.advance(task, len(record.names))
-            yield record
-
-
-def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
+def _split(name: str, source: SequenceSource, made: Iterable[ShardRecord | None]) -> Split:
+    records = [record for record in made if record is not None and record.split == name]
     there = {name for record in records for name in record.shard.sequences}
     return Split(
         source.fingerprint(),
@@ -359,10 +344,10 @@ def _split(source: SequenceSource, records: Sequence[ShardRecord]) -> Split:
     )
 
 
-def _check_share(splits: Mapping[str, Split], out: Path, max_bad_fraction: float) -> None:
-    """Refuse a store with too little in it, and say what is in one that has enough."""
-    refused = [refusal for split in splits.values() for refusal in split.refused]
-    shards = [shard for split in splits.values() for shard in split.shards]
+def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> None:
+    """Refuse a store with too little in it, else write the manifest and say what is in it."""
+    refused = [refusal for split in manifest.splits.values() for refusal in split.refused]
+    shards = [shard for split in manifest.splits.values() for shard in split.shards]
     kept, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)
     counts = Counter(refusal.kind for refusal in refused)
     kinds = ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
@@ -375,6 +360,7 @@ def _check_share(splits: Mapping[str, Split], out: Path, max_bad_fraction: float
         remedy = "put the data right (then remove this folder) or raise data.max_bad_fraction"
         bad = f"{share:.1%} of the data are bad, at most {max_bad_fraction:.1%} may be ({kinds})"
         raise DataError(f"{bad}: see the .json beside the shards, and {remedy}", str(out))
+    write_json(out / MANIFEST, manifest, HEADER)
     size = decimal(sum(shard.bytes for shard in shards))
     held = f"{frames:,} frames of {kept:,} sequences, {size} in {len(shards):,} shards"
     logger.info("%s: %s; refused: %s", out, held, kinds)

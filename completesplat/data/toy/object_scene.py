@@ -25,6 +25,7 @@ from completesplat.geometry.cameras import invert_rigid, look_at
 
 P = TypeVar("P", bound="Part")
 Look = tuple[Array, Array]
+Point = tuple[float, float, float]
 
 DARK = np.full(3, 0.07)
 
@@ -121,19 +122,12 @@ def plain(shade: Array) -> Look:
     return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
 
 
-def _ball(center: tuple[float, float, float], half_sizes: object, look: Look, axes: Array | None = None) -> Part:
+def _ball(center: Point, half_sizes: object, look: Look, axes: Array | None = None) -> Part:
     sizes = np.broadcast_to(np.asarray(half_sizes, dtype=np.float64), 3)
     return Part(ELLIPSOID, np.array(center, dtype=np.float64), sizes, np.eye(3) if axes is None else axes, 0.0, *look)
 
 
-def _frustum(
-    center: tuple[float, float, float],
-    radius: float,
-    half_height: float,
-    look: Look,
-    taper: float = 0.0,
-    axis: str = "y",
-) -> Part:
+def _frustum(center: Point, radius: float, half_height: float, look: Look, taper: float = 0.0, axis: str = "y") -> Part:
     axes = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}[axis]
     return Part(
         FRUSTUM, np.array(center, dtype=np.float64), np.array([radius, half_height, radius]), axes, taper, *look

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from completesplat.data.toy.object_scene import UP, Look, Part, color, rotation_about
+from completesplat.data.toy.object_scene import UP, Look, Part, Point, color, rotation_about
 from completesplat.data.toy.raytracing import BOX, CHECKS, ELLIPSOID, PLAIN, RIPPLES, STRIPES, Array
 from completesplat.data.toy.room_raytracing import CEILING, FLOOR, WALLS, Room, trace_room
 from completesplat.geometry.cameras import invert_rigid, look_at
@@ -46,7 +46,7 @@ def _look(rng: np.random.Generator) -> Look:
     return np.stack([first, second]), np.array([pattern, rng.uniform(10, 22), rng.uniform(0, 2 * np.pi)])
 
 
-def _solid(kind: int, center: tuple[float, float, float], half: tuple[float, float, float], look: Look) -> Solid:
+def _solid(kind: int, center: Point, half: Point, look: Look) -> Solid:
     return Solid(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), np.eye(3), 0.0, *look)
 
 
@@ -141,6 +141,7 @@ LOWEST, HIGHEST = 1.0, 1.7
 STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
 WAYPOINTS = 4
+SAMPLES = 3
 FIELD_OF_VIEW = (55, 75)
 DENSE = 400
 ASPECT = 16 / 9
@@ -212,7 +213,8 @@ def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequenc
         times = np.interp(reached, lengths, dense)
         centers = np.polynomial.polynomial.polyval(times, cubic).T
         slopes = np.polynomial.polynomial.polyval(times, np.polynomial.polynomial.polyder(cubic)).T
-        if _is_free(centers, size, furniture) and _largest_turn(slopes) < LARGEST_TURN:
+        yaw = np.unwrap(np.arctan2(slopes[:, 0], slopes[:, 2]))
+        if _is_free(centers, size, furniture) and np.abs(np.diff(yaw)).max() < LARGEST_TURN:
             return np.ascontiguousarray(centers), slopes
         stride *= 0.99
 
@@ -223,9 +225,8 @@ def _waypoints(rng: np.random.Generator, size: Array, stride: float) -> Array:
     first = np.arctan2(-start[0], -start[1]) + rng.uniform(-np.pi / 4, np.pi / 4)
     heading = np.cumsum(np.append(first, rng.uniform(-np.pi / 3, np.pi / 3, WAYPOINTS - 2)))
     steps = stride * rng.uniform(0.7, 1.3, WAYPOINTS - 1)
-    x, z = np.cumsum(
-        np.stack([start, *np.stack([np.sin(heading), np.cos(heading)], axis=1) * steps[:, None]]), axis=0
-    ).T
+    moves = steps[:, None] * np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    x, z = np.cumsum(np.stack([start, *moves]), axis=0).T
     heights = rng.uniform(1.1, 1.6) + rng.normal(0, 0.05, WAYPOINTS)
     return np.stack([x, heights, z], axis=1)
 
@@ -234,16 +235,6 @@ def _is_free(centers: Array, size: Array, furniture: Sequence[Solid]) -> bool:
     inside = np.abs(centers[:, [0, 2]]) <= size[[0, 2]] / 2 - MARGIN
     high = (centers[:, 1] >= LOWEST) & (centers[:, 1] <= HIGHEST)
     return bool(inside.all() and high.all() and all((s.distances(centers) >= MARGIN).all() for s in furniture))
-
-
-def _largest_turn(tangents: Array) -> float:
-    yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2]))
-    return float(np.abs(np.diff(yaw)).max())
-
-
-SAMPLES = 3
-
-Decal = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -271,7 +262,9 @@ def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> 
 
 def _room(rng: np.random.Generator, size: Array, furniture: tuple[Solid, ...]) -> Room:
     colors, textures = _faces(rng)
-    decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, _decal_kinds(rng), strict=True)]
+    # One thing on each wall: always a window, a door and a picture, and one more picture or window.
+    kinds = rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))])
+    decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, kinds, strict=True)]
     places, decal_colors, decal_textures = (np.stack(parts) for parts in zip(*decals, strict=True))
     return Room(
         size=size,
@@ -306,12 +299,7 @@ def _faces(rng: np.random.Generator) -> tuple[Array, Array]:
     return colors, textures
 
 
-def _decal_kinds(rng: np.random.Generator) -> list[str]:
-    """One thing on each wall: always a window, a door and a picture, and one more picture or window."""
-    return list(rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))]))
-
-
-def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> Decal:
+def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> tuple[Array, Array, Array]:
     """Place [6], colours [3 3] and texture [3] of a rectangle on a wall."""
     half_width, low, high = {
         "window": (rng.uniform(0.4, 0.8), rng.uniform(0.8, 1.0), rng.uniform(1.8, 2.2)),
