@@ -25,43 +25,36 @@ def smooth_picture(seed: int, masked: bool, size: int = SIZE) -> Picture:
     return Picture(image, disc if masked else None)
 
 
-def make_sequence(name: str, frames: int = 4, masked: bool = True, size: int = SIZE) -> PosedSequence:
+def make_sequence(name: str, frames: int = 4, masked: bool = True, bad: tuple[int, ...] = ()) -> PosedSequence:
     """A camera on an arc around the origin; frames are numbered 10, 13, 16, ..."""
-    seed = sum(name.encode())
+    seed, size = sum(name.encode()), SIZE
     angles = torch.linspace(0.1, 1.3, frames, dtype=torch.float64) + seed / 7
     eyes = torch.stack([angles.cos(), torch.full_like(angles, 0.3), angles.sin()], dim=-1)
     up = torch.tensor([0, 1, 0], dtype=torch.float64)
     intrinsics = torch.tensor([[size / 3, 0, size / 2], [0, size / 3.1, size / 2.2], [0, 0, 1]], dtype=torch.float64)
     cameras = Cameras(look_at(eyes, torch.zeros_like(up), up), intrinsics.repeat(frames, 1, 1), (size, size))
     ranges = torch.stack([angles / 3, angles * 3], dim=-1).float()
-    read = partial(_read, name, seed, masked, size, tuple(range(frames)))
+    read = partial(_read, name, seed, masked, bad)
     return PosedSequence(name, tuple(range(10, 10 + 3 * frames, 3)), cameras, ranges, read)
 
 
-def _read(name: str, seed: int, masked: bool, size: int, there: tuple[int, ...], index: int) -> Picture:
-    if index not in there:
+def _read(name: str, seed: int, masked: bool, bad: tuple[int, ...], index: int) -> Picture:
+    if index in bad:
         raise BadPicture("cannot be decoded", f"{name}/{index}.jpg")
-    return smooth_picture(seed + index, masked, size)
+    return smooth_picture(seed + index, masked)
 
 
 @dataclass
 class ListedSource:
-    """Sequences made on the spot; some can fail.
-
-    Attributes:
-        bad_frames: indices of frames that cannot be read, by name.
-        bad_sequences: names that cannot be read at all.
-        stop_after: how many sequences are read before the person at the keyboard has enough.
-        group_size: how many sequences lie in one chunk.
-    """
+    """Sequences made on the spot; some can fail. The person at the keyboard has enough when `stop_after` are read."""
 
     names: list[str]
     frames: int = 4
     masked: bool = True
-    bad_frames: dict[str, list[int]] = field(default_factory=dict)
+    bad_frames: dict[str, list[int]] = field(default_factory=dict)  # indices
     bad_sequences: list[str] = field(default_factory=list)
     stop_after: int | None = None
-    group_size: int = 1
+    group_size: int = 1  # of a chunk
     content: str = "a"
     refused: list[DataError] = field(default_factory=list)
     left_out: dict[str, list[str]] = field(default_factory=dict)
@@ -75,10 +68,7 @@ class ListedSource:
         self.was_read.append(name)
         if name in self.bad_sequences:
             raise TooFewFrames("1 frame", f"{name}.txt")
-        sequence = make_sequence(name, self.frames, self.masked)
-        there = tuple(index for index in range(self.frames) if index not in self.bad_frames.get(name, []))
-        read = partial(_read, name, sum(name.encode()), self.masked, SIZE, there)
-        return PosedSequence(name, sequence.frames, sequence.cameras, sequence.depth_ranges, read)
+        return make_sequence(name, self.frames, self.masked, bad=tuple(self.bad_frames.get(name, ())))
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         """Chunks of neighbours."""

@@ -5,8 +5,9 @@ import logging
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 
 logger = logging.getLogger(__name__)
@@ -58,17 +59,35 @@ def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
     draw(sequences, out / "show.png", pictures, f"{data.root}, {split}: {len(sequences)} of {len(names)} sequences")
 
 
-def prepare(data: Any, splits: Sequence[str], out: Path, **settings: Any) -> None:
+def prepare(
+    data: Any,
+    splits: Sequence[str],
+    out: Path,
+    codec: str,
+    sequences_per_shard: Positive,
+    workers: int | None,
+    on_bad: Literal["raise", "skip"],
+    max_bad_fraction: float,
+) -> None:
     """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
     from completesplat.data.packed.manifest import is_packed
     from completesplat.data.packed.writing import prepare as prepare_sources
 
     if is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
-    prepare_sources(_sources(data, splits), data.packed_settings(), out, **settings)
+    sources, bad = _sources(data, splits), (on_bad, max_bad_fraction)
+    prepare_sources(sources, data.packed_settings(), out, codec, sequences_per_shard, workers, *bad)
 
 
-def latents(ckpt: str | Path, overrides: Sequence[str], conditioning: Any, out: Path, **settings: Any) -> None:
+def latents(
+    ckpt: str | Path,
+    overrides: Sequence[str],
+    conditioning: Any,
+    out: Path,
+    frames: Positive | None,
+    precision: Literal["float32", "float16"],
+    batch_size: Positive,
+) -> None:
     """Encode the training set of stage 1's run into `out`; see `completesplat.training.encoding`."""
     import torch
     from hydra.utils import instantiate
@@ -86,7 +105,7 @@ def latents(ckpt: str | Path, overrides: Sequence[str], conditioning: Any, out: 
     data = instantiate(run_config.data, _convert_="all")
     data.prepare_data()
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    store = encode_training_set(autoreconstructor, data, out, conditioning=conditioning, device=device, **settings)
+    store = encode_training_set(autoreconstructor, data, out, frames, precision, conditioning, batch_size, device)
     logger.info("scale of the latents: %.6g", store.scale)
 
 

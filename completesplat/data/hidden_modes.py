@@ -22,7 +22,6 @@ class HiddenModes(TensorDataclass):
         region: pixels of those views that differ between the modes.
         probabilities: of the modes, given the reference picture.
         unseen: pixels of all targets whose surface the reference picture does not show.
-        modes: names of the modes.
         true_mode: the mode that the data set's own pictures show.
     """
 
@@ -49,7 +48,6 @@ class HiddenModeScenes(Protocol):
             DataError: it is unreadable, its reference view tells the modes apart, or no view shows them well.
             CompleteSplatError: the files are not those that the data set made.
         """
-        ...
 
 
 @runtime_checkable
@@ -57,13 +55,7 @@ class KnowsHiddenModes(Protocol):
     """A data module that can tell what else could be where the reference picture shows nothing."""
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """All test scenes.
-
-        Args:
-            views: the largest number of views that show the modes; those that show them best are taken.
-            spread_views: number of further targets, evenly spread over the sequence.
-        """
-        ...
+        """All test scenes: at most `views` views that show the modes best, and further targets evenly spread."""
 
 
 def hidden_modes(data: Any, views: int, spread_views: int) -> HiddenModeScenes:

@@ -19,15 +19,16 @@ from completesplat import __version__
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache.manifest import (
+from completesplat.data.latent_cache import (
     Array,
+    ArrayWriter,
     CachedSequence,
+    LatentCache,
     LatentCacheManifest,
     Origin,
     is_latent_cache,
     write_manifest,
 )
-from completesplat.data.latent_cache.store import ArrayWriter, LatentCache
 from completesplat.data.loading.module import SceneDataModule
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space

@@ -4,7 +4,7 @@ import pytest
 import torch
 from support import SMALL, strict_json
 
-from completesplat.data.latent_cache.store import LatentCache
+from completesplat.data.latent_cache import LatentCache
 from completesplat.generation import CompleteSplat
 
 
@@ -39,7 +39,7 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, packed_toys, 
     [
         ("diffusion", "frames=2", "not of stage 1"),
         ("var", "conditioning=learned", "needs pictures"),
-        ("var", "precision=float8", "needs precision"),
+        ("var", "precision=float8", "precision=float8: choose one of float32, float16"),
         ("var", "ckpt=gone.ckpt", "no such checkpoint"),
         ("var", "overrides=[]", "run `completesplat data prepare` first"),
     ],

@@ -3,26 +3,24 @@
 import json
 import pickle
 import shutil
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import numpy as np
 import pytest
 from latent_caches import rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.latent_cache.store import ArrayWriter, LatentCache, open_array
+from completesplat.data.latent_cache import ArrayWriter, LatentCache, open_array
 from completesplat.errors import DataError
 from completesplat.training.encoding import encode_training_set
-
-ARRAYS = ("mean", "log_variance", "condition")
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("cache")
-    encode_training_set(
-        small_autoreconstructor(), rooms(sound_rooms(folder / "root")), folder / "store", progress=False
-    )
-    return folder / "store"
+    data = rooms(sound_rooms(folder / "root"))
+    return encode_training_set(small_autoreconstructor(), data, folder / "store", progress=False).folder
 
 
 @pytest.fixture
@@ -30,30 +28,23 @@ def copy(sound, tmp_path) -> Path:
     return Path(shutil.copytree(sound, tmp_path / "copy"))
 
 
-@pytest.mark.parametrize("name", ARRAYS)
-@pytest.mark.parametrize("damage", ["cut", "header", "longer", "gone", "empty"])
-def test_a_damaged_array_is_refused_by_its_name(copy, name, damage):
-    path = copy / f"{name}.npy"
+@pytest.mark.parametrize("damage", ["cut", "header", "longer", "gone", "empty", "other", "objects"])
+def test_a_damaged_array_is_refused_by_its_name(copy, damage):
+    path = copy / "log_variance.npy"
     content = path.read_bytes()
     changed = {"cut": content[:-1], "header": content[:40], "longer": content + b"x", "empty": b""}
-    path.unlink() if damage == "gone" else path.write_bytes(changed[damage])
+    if damage in changed:
+        path.write_bytes(changed[damage])
+    else:
+        path.unlink()
+    if damage == "other":
+        np.save(path, np.zeros((3, 4), np.float32))
+    elif damage == "objects":
+        np.save(path, np.array([{}, []], dtype=object), allow_pickle=True)
     with pytest.raises(DataError) as caught:
         LatentCache(copy)
     assert caught.value.file == str(path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ARRAYS)
-def test_another_array_of_the_same_name_is_refused(copy, name):
-    np.save(copy / f"{name}.npy", np.zeros((3, 4), np.float32))
-    with pytest.raises(DataError, match="not the array that the manifest describes"):
-        LatentCache(copy)
-
-
-def test_arrays_of_objects_are_not_loaded(copy):
-    np.save(copy / "mean.npy", np.array([{}, []], dtype=object), allow_pickle=True)
-    with pytest.raises(DataError):
-        LatentCache(copy)
 
 
 @pytest.mark.parametrize(
@@ -61,33 +52,24 @@ def test_arrays_of_objects_are_not_loaded(copy):
     [
         (("format",), 99),
         (("kind",), "prepared"),
-        (("scale",), "1.0"),
         (("scale",), -1.0),
-        (("sequences",), {}),
         (("sequences", 0, "stored"), [0, 0]),
-        (("sequences", 0, "stored"), [1]),
         (("sequences", 0, "stored"), []),
         (("sequences", 0, "frames"), 2),
         (("sequences", 0, "first"), 10**6),
-        (("sequences", 0, "first"), -1),
-        (("sequences", 0, "name"), "c1"),
-        (("sequences", 1, "name"), None),
+        (("sequences", 0, "name"), "taken"),
         (("arrays", "mean", "file"), "../mean.npy"),
         (("arrays", "mean", "dtype"), "object"),
         (("arrays", "mean", "shape"), [20, 4, 2]),
         (("arrays", "condition"), None),
         (("origin", "frames"), "all"),
-        (("origin",), None),
     ],
 )
 def test_a_manifest_that_cannot_be_true_is_refused(copy, place, value):
     path = copy / "manifest.json"
     content = json.loads(path.read_text())
-    names = sorted(entry["name"] for entry in content["sequences"])
-    entry = content
-    for key in place[:-1]:
-        entry = entry[key]
-    entry[place[-1]] = names[1] if value == "c1" and content["sequences"][0]["name"] != names[1] else value
+    taken = content["sequences"][1]["name"]
+    reduce(getitem, place[:-1], content)[place[-1]] = taken if value == "taken" else value
     path.write_text(json.dumps(content))
     with pytest.raises(DataError):
         LatentCache(copy)

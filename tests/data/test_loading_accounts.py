@@ -15,12 +15,12 @@ KEYS = [f"c{i}" for i in range(9)]
 
 def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
     """Clips of which some have broken pictures, others broken cameras."""
-    clips = [make_clip(key, frames=3) for key in KEYS]
-    for clip in clips:
-        if clip.key in pictures:
-            clip.pictures = [clip.pictures[0], b"<html>", b"<html>"]
-        if clip.key in cameras:
-            clip.rows[1, 0] = 0
+    clips = {key: make_clip(key, frames=3) for key in KEYS}
+    for key in pictures:
+        clips[key].pictures[1:] = [b"<html>", b"<html>"]
+    for key in cameras:
+        clips[key].rows[1, 0] = 0
+    clips = list(clips.values())
     return write_tree(root, "text", clips, clips)
 
 
@@ -36,7 +36,6 @@ def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
     assert caught.value.sequence in ("c2", "c5")
 
 
-@pytest.mark.slow
 def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog):
     data = module(make_tree(tmp_path, ["c5"], ["c2"]), val_fraction=0.0, max_bad_fraction=1.0)
     loader = data.train_dataloader()
@@ -53,9 +52,8 @@ def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog
 
 
 def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
-    loader = module(
-        make_tree(tmp_path, ["c5"], ["c2"]), max_bad_fraction=0.5, evaluation_batch_size=2
-    ).test_dataloader()
+    data = module(make_tree(tmp_path, ["c5"], ["c2"]), max_bad_fraction=0.5, evaluation_batch_size=2)
+    loader = data.test_dataloader()
     assert [name for batch in loader for name in batch.names] == [key for key in KEYS if key not in ("c2", "c5")]
     assert [error.sequence for error in loader.refused] == ["c2", "c5"]
     assert [r.getMessage()[:20] for r in caplog.records if r.levelno >= logging.WARNING] == ["skipped 2 of 9 items"]
@@ -63,26 +61,18 @@ def test_evaluation_drops_what_cannot_be_read_and_says_so(tmp_path, caplog):
 
 def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     root = make_tree(tmp_path, ["c5"], ["c2", "c6"])
-    loader = module(root, max_bad_fraction=0.25).test_dataloader()
-    with pytest.raises(
-        DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"
-    ) as caught:
-        list(loader)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"):
+        list(module(root, max_bad_fraction=0.25).test_dataloader())
     assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
 
 
 def test_one_bad_item_is_no_share(tmp_path):
-    assert (
-        len(list(module(make_tree(tmp_path, ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1).test_dataloader()))
-        == 8
-    )
+    data = module(make_tree(tmp_path, ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1)
+    assert len(list(data.test_dataloader())) == 8
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("max_bad_fraction", [0.1, 100.0])
-def test_nothing_that_can_be_read_is_an_error(tmp_path, workers, max_bad_fraction):
-    data = module(make_tree(tmp_path, KEYS), max_bad_fraction=max_bad_fraction, workers=workers)
+def test_nothing_that_can_be_read_is_an_error(tmp_path):
+    data = module(make_tree(tmp_path, KEYS), max_bad_fraction=100.0)
     for loader in (data.train_dataloader(), data.test_dataloader()):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
@@ -90,7 +80,7 @@ def test_nothing_that_can_be_read_is_an_error(tmp_path, workers, max_bad_fractio
 
 def test_an_unknown_policy_is_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
-        module(make_tree(tmp_path, []), on_bad="ignore").train_dataloader()
+        module(tmp_path, on_bad="ignore")
 
 
 class Listener(LightningModule):
@@ -105,7 +95,6 @@ class Listener(LightningModule):
 
 @pytest.mark.parametrize("limit", [1.0, 3])
 def test_lightning_hears_it_at_the_end_of_each_epoch(tmp_path, caplog, limit):
-    """Lightning stops after the number of batches it knows of, and never looks whether there is another."""
     data = module(make_tree(tmp_path, [], ["c1", "c2", "c5"]), val_fraction=0.0, max_bad_fraction=10.0, batch_size=2)
     trainer = Trainer(
         max_epochs=2, limit_train_batches=limit, accelerator="cpu", logger=False, enable_checkpointing=False,

@@ -3,7 +3,8 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,8 @@ SHARD = "train-00000-of-00003.arrow"
 
 
 def make(out: Path, masked: bool = True, **options: Any) -> Path:
-    source = ListedSource(NAMES, masked=masked)
-    return prepare(
-        {"train": source}, {"image_size": SIZE}, out, sequences_per_shard=3, workers=1, progress=False, **options
-    )
+    sources, settings = {"train": ListedSource(NAMES, masked=masked)}, {"image_size": SIZE}
+    return prepare(sources, settings, out, sequences_per_shard=3, workers=1, progress=False, **options)
 
 
 @pytest.fixture
@@ -45,11 +44,8 @@ def store(tmp_path: Path) -> Path:
 
 
 def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 0) -> None:
-    assert (found.name, found.frames, found.cameras.image_size) == (
-        expected.name,
-        expected.frames,
-        expected.cameras.image_size,
-    )
+    assert (found.name, found.frames) == (expected.name, expected.frames)
+    assert found.cameras.image_size == expected.cameras.image_size
     for part in ("world_to_camera", "intrinsics"):
         one, other = getattr(found.cameras, part), getattr(expected.cameras, part)
         assert one.dtype == other.dtype == torch.float64
@@ -62,10 +58,9 @@ def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 
         assert mask is None or torch.equal(mask, expected_mask)
 
 
-@pytest.mark.parametrize("codec", ["png", "bmp"])
-@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize(("codec", "masked"), [("png", True), ("bmp", False)])
 def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Path) -> None:
-    source: SequenceSource = PackedSource(make(tmp_path / "store", masked, codec=codec), "train")
+    source = PackedSource(make(tmp_path / "store", masked, codec=codec), "train")
     assert isinstance(source, SequenceSource)
     assert source.names == NAMES
     assert (source.refused, source.left_out, source.fingerprint()) == ([], {}, "a")
@@ -75,22 +70,18 @@ def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Pat
 
 def test_jpeg_keeps_cameras_and_masks_and_changes_colours_by_little(tmp_path: Path) -> None:
     source = PackedSource(make(tmp_path / "store", codec="jpeg"), "train")
-    for name in NAMES:
-        expected = make_sequence(name)
-        assert_same(source.read(name), expected, tolerance=16)
-        differences = [source.read(name).read(index).image.float() - expected.read(index).image for index in range(4)]
-        assert 0 < torch.stack(differences).abs().mean() < 2
+    expected, found = make_sequence("s3"), source.read("s3")
+    assert_same(found, expected, tolerance=16)
+    differences = [found.read(index).image.float() - expected.read(index).image for index in range(4)]
+    assert 0 < torch.stack(differences).abs().mean() < 2
 
 
 def test_masks_of_some_frames_only_stay_with_them() -> None:
-    sequence = make_sequence("s", frames=2)
-    pictures = [EncodedPicture(encode(smooth_picture(0, False).image, "png"), None)] * 2
-    mask = smooth_picture(1, True).mask
-    assert mask is not None
-    pictures[1] = EncodedPicture(pictures[1].image, encode(mask, "png"))
-    read = from_row(to_row(sequence, [0, 1], pictures), "file", "s").read
+    image, mask = smooth_picture(1, True)
+    pictures = [EncodedPicture(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
+    read = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "file", "s").read
     assert read(0).mask is None
-    assert torch.equal(read(1).mask, mask)  # type: ignore[arg-type]
+    assert torch.equal(read(1).mask, mask)
 
 
 def test_names_keep_the_order_of_the_source_though_chunks_lie_together(tmp_path: Path) -> None:
@@ -114,12 +105,9 @@ def test_a_source_travels_to_other_processes_without_the_files_it_has_open(store
     assert_same(pickle.loads(small).read("s0"), make_sequence("s0"))
 
 
-def test_a_split_that_is_not_there_is_named_with_those_that_are(store: Path) -> None:
+def test_only_a_complete_store_and_the_splits_in_it_open(store: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no split test .* there are: train"):
         PackedSource(store, "test")
-
-
-def test_only_a_complete_store_is_one(store: Path, tmp_path: Path) -> None:
     assert is_packed(store)
     assert not is_packed(tmp_path)
     with pytest.raises(MissingFile):
@@ -134,6 +122,9 @@ def test_opening_notices_shards_that_are_missing_or_of_another_size(store: Path)
     (store / SHARD).unlink()
     with pytest.raises(MissingFile, match=SHARD):
         PackedSource(store, "train")
+    (store / SHARD).symlink_to(store.parent / "elsewhere")
+    with pytest.raises(OutsidePath):
+        PackedSource(store, "train")
 
 
 def test_verifying_finds_the_shard_with_a_changed_bit(store: Path) -> None:
@@ -145,56 +136,48 @@ def test_verifying_finds_the_shard_with_a_changed_bit(store: Path) -> None:
     assert [error.file for error in source.verify()] == [str(store / SHARD)]
 
 
-def refused_or_same(source: PackedSource, name: str) -> DataError | None:
-    """The refusal, if there is one; fails on anything but the same sequence."""
-    try:
-        assert_same(source.read(name), make_sequence(name))
-    except DataError as error:
-        return error
-    return None
-
-
 def test_wherever_a_byte_of_a_shard_changes_its_sequences_are_refused_or_the_same(store: Path) -> None:
     content = (store / SHARD).read_bytes()
-    refusals: list[DataError | None] = []
+    places, intact = set(), 0
     for position in np.random.default_rng(0).choice(len(content), 30, replace=False):
         damaged = bytearray(content)
         damaged[position] ^= 0xFF
         # Never in place: pages of an earlier round may still be mapped.
         (store / "damaged").write_bytes(damaged)
         (store / "damaged").replace(store / SHARD)
-        refusals += [refused_or_same(PackedSource(store, "train"), name) for name in NAMES[:3]]
-    places = {(error.file, error.sequence) for error in refusals if error}
+        for name in NAMES[:3]:
+            try:
+                assert_same(PackedSource(store, "train").read(name), make_sequence(name))
+                intact += 1
+            except DataError as error:
+                places.add((error.file, error.sequence))
     assert places == {(str(store / SHARD), name) for name in NAMES[:3]}
-    assert None in refusals
+    assert intact
 
 
-@pytest.mark.parametrize("content", [b"", b"no arrow file", b"\xff\xff\xff\xff\x10\0\0\0" + b"\7" * 90])
-def test_a_file_that_is_no_arrow_file_is_refused(content: bytes, store: Path) -> None:
+def other_columns(store: Path) -> bytes:
+    table, stream = pa.table({"name": ["s3", "s1", "s4"]}), pa.BufferOutputStream()
+    with pa.ipc.new_stream(stream, table.schema) as writer:
+        writer.write_table(table)
+    return stream.getvalue().to_pybytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "reason"),
+    [
+        (lambda store: b"", UnreadableFile, SHARD),
+        (lambda store: b"\xff\xff\xff\xff\x10\0\0\0" + b"\7" * 90, UnreadableFile, SHARD),
+        (other_columns, UnreadableFile, "columns"),
+        (lambda store: (store / "train-00001-of-00003.arrow").read_bytes(), BadAnnotation, "in its place"),
+        (lambda store: (store / "train-00002-of-00003.arrow").read_bytes(), BadAnnotation, "1 sequences, the manifest"),
+    ],
+)
+def test_a_shard_that_is_another_file_is_refused_when_it_is_read(content, kind, reason, store: Path) -> None:
     source = PackedSource(store, "train")
-    (store / SHARD).write_bytes(content)
-    with pytest.raises(UnreadableFile, match=SHARD) as caught:
+    (store / SHARD).write_bytes(content(store))
+    with pytest.raises(kind, match=reason) as caught:
         source.read("s3")
     assert caught.value.sequence == "s3"
-
-
-def test_a_shard_with_other_columns_is_refused(store: Path) -> None:
-    source = PackedSource(store, "train")
-    table = pa.table({"name": ["s3", "s1", "s4"]})
-    with pa.ipc.new_stream(str(store / SHARD), table.schema) as writer:
-        writer.write_table(table)
-    with pytest.raises(UnreadableFile, match="columns"):
-        source.read("s3")
-
-
-def test_a_shard_in_the_place_of_another_is_refused(store: Path) -> None:
-    source = PackedSource(store, "train")
-    full, last = [(store / shard.file).read_bytes() for shard in source.shards[1:]]
-    for content, reason in [(full, "in its place"), (last, "1 sequences, the manifest says 3")]:
-        (store / SHARD).unlink()
-        (store / SHARD).write_bytes(content)
-        with pytest.raises(BadAnnotation, match=reason):
-            pickle.loads(pickle.dumps(source)).read("s3")
 
 
 def change(row: pa.Table, column: str, value: object) -> pa.Table:
@@ -210,21 +193,12 @@ def change(row: pa.Table, column: str, value: object) -> pa.Table:
         ("world_to_camera", [float("nan")] * 32, BadAnnotation),
         ("world_to_camera", [1.0] * 32, ChangedFile),
         ("world_to_camera", None, BadAnnotation),
-        ("intrinsics", [1.0] * 9, BadAnnotation),
-        ("intrinsics", [float("inf")] * 18, BadAnnotation),
         ("intrinsics", [None] * 18, BadAnnotation),
-        ("depth_ranges", [1.0, 2.0, 3.0], BadAnnotation),
         ("frames", [], BadAnnotation),
-        ("frames", [10, 14], ChangedFile),
         ("images", [b""], BadAnnotation),
-        ("masks", [], BadAnnotation),
-        ("masks", None, BadAnnotation),
         ("picture_checksums", [1], BadAnnotation),
-        ("size", 0, ChangedFile),
         ("size", None, ChangedFile),
-        ("size", 17, ChangedFile),
         ("name", "other", BadAnnotation),
-        ("name", None, BadAnnotation),
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: object, kind: type[DataError]) -> None:
@@ -244,7 +218,7 @@ def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: o
         lambda image: b"GIF89a" + image,
     ],
 )
-def test_bytes_that_are_not_the_picture_are_refused_with_their_place(change_image: Callable[[bytes], bytes]) -> None:
+def test_bytes_that_are_not_the_picture_are_refused_with_their_place(change_image) -> None:
     image = encode(smooth_picture(0, True).image, "png")
     # The checksum is that of the wrong bytes, so that decoding them has to notice.
     pictures = [EncodedPicture(image, None), EncodedPicture(change_image(image), None)]
@@ -267,64 +241,37 @@ def test_pixels_that_decode_differently_from_what_was_written_are_refused() -> N
         read(1)
 
 
-def set_at(path: list[Any], value: object) -> Callable[[dict], None]:
-    def edit(content: dict) -> None:
-        for key in path[:-1]:
-            content = content[key]
-        content[path[-1]] = value
-
-    return edit
-
-
-FIRST = ["splits", "train", "shards", 0]
+FIRST = ("splits", "train", "shards", 0)
 
 
 @pytest.mark.parametrize(
-    ("edit", "kind"),
+    ("place", "value", "kind"),
     [
-        (set_at(["format"], 1), UnreadableFile),
-        (set_at(["format"], "1"), BadAnnotation),
-        (set_at(["codec"], None), BadAnnotation),
-        (set_at(["settings"], []), BadAnnotation),
-        (set_at(["settings"], {"image_size": [1]}), BadAnnotation),
-        (set_at(["splits"], []), BadAnnotation),
-        (set_at(["splits", "train"], []), BadAnnotation),
-        (set_at(["splits", "train", "names"], ["s3"]), BadAnnotation),
-        (set_at(["splits", "train", "names", 0], 3), BadAnnotation),
-        (set_at(["splits", "train", "listed"], None), BadAnnotation),
-        (set_at(["splits", "train", "left_out"], {"x": "1"}), BadAnnotation),
-        (set_at(["splits", "train", "refused"], [{}]), BadAnnotation),
-        (set_at([*FIRST, "file"], "../secret.arrow"), OutsidePath),
-        (set_at([*FIRST, "file"], "/etc/passwd"), OutsidePath),
-        (set_at([*FIRST, "bytes"], -1.5), BadAnnotation),
-        (set_at([*FIRST, "sequences"], "s3"), BadAnnotation),
-        (lambda content: content.pop("splits"), BadAnnotation),
+        (["format"], 1, UnreadableFile),
+        (["format"], "1", BadAnnotation),
+        (["settings"], {"image_size": [1]}, BadAnnotation),
+        (["splits"], None, BadAnnotation),
+        (["splits", "train"], [], BadAnnotation),
+        (["splits", "train", "names"], ["s3"], BadAnnotation),
+        (["splits", "train", "names", 0], 3, BadAnnotation),
+        (["splits", "train", "left_out"], {"x": "1"}, BadAnnotation),
+        (["splits", "train", "refused"], [{}], BadAnnotation),
+        ([*FIRST, "file"], "../secret.arrow", OutsidePath),
+        ([*FIRST, "bytes"], True, BadAnnotation),
     ],
 )
-def test_a_manifest_that_does_not_fit_is_refused(
-    edit: Callable[[dict], None], kind: type[DataError], store: Path
-) -> None:
+def test_a_manifest_that_does_not_fit_is_refused(place: list, value: object, kind: type, store: Path) -> None:
     content = json.loads((store / "manifest.json").read_text())
-    edit(content)
+    reduce(getitem, place[:-1], content)[place[-1]] = value
     (store / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(kind, match=r"manifest\.json"):
         PackedSource(store, "train")
 
 
-def test_a_shard_that_is_a_link_out_of_the_folder_is_refused(store: Path, tmp_path: Path) -> None:
-    (store / SHARD).rename(tmp_path / "elsewhere")
-    (store / SHARD).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OutsidePath):
-        PackedSource(store, "train")
-
-
 def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> None:
-    manifest = read_manifest(store)
-    settings_must_match(manifest, {"image_size": SIZE})
-    with pytest.raises(DataError, match=r"image_size=16 \(asked for: 32\)"):
-        settings_must_match(manifest, {"image_size": 32})
-    with pytest.raises(DataError, match=r"crop=None \(asked for: central\)"):
-        settings_must_match(manifest, {"image_size": SIZE, "crop": "central"})
+    settings_must_match(store, {"image_size": float(SIZE)})
+    with pytest.raises(DataError, match=r"crop=None \(asked for: central\), image_size=16 \(asked for: 32\)"):
+        settings_must_match(store, {"image_size": 32, "crop": "central"})
 
 
 def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store: Path, tmp_path: Path) -> None:
@@ -335,12 +282,11 @@ def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store:
         f"root = Path({str(store)!r})\n"
         "print(*PackedSource(root, 'train').read('s0').read(0).image.shape)\n"
     )
-    home = tmp_path / "home"
+    home, variables = tmp_path / "home", ("HF_HOME", "HF_DATASETS_CACHE", "XDG_CACHE_HOME")
     home.mkdir()
-    environment = {**os.environ, "HOME": str(home), "HF_HUB_OFFLINE": "1"}
-    for variable in ("HF_HOME", "HF_DATASETS_CACHE", "XDG_CACHE_HOME"):
-        environment.pop(variable, None)
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    environment = {key: value for key, value in os.environ.items() if key not in variables}
+    environment |= {"HOME": str(home), "HF_HUB_OFFLINE": "1"}
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == ["3", str(SIZE), str(SIZE)]
     assert list(home.rglob("*")) == []

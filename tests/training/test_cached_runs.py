@@ -7,7 +7,7 @@ import pytest
 import torch
 from support import SMALL, call
 
-from completesplat.data.latent_cache.store import LatentCache
+from completesplat.data.latent_cache import LatentCache
 
 STEPS = 3
 QUICK = [

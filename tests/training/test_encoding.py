@@ -14,7 +14,7 @@ from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache.store import LatentCache
+from completesplat.data.latent_cache import LatentCache
 from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene

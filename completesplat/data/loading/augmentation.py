@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from kornia import enhance
 from torch import Tensor
@@ -13,8 +14,6 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror
 from completesplat.scene import SceneBatch, Views
-
-FLIP_PROBABILITY = 0.5
 
 
 @dataclass(frozen=True)
@@ -48,38 +47,34 @@ class ColorJitter:
     def __call__(
         self, images: Float[Tensor, "view 3 height width"], rng: np.random.Generator
     ) -> Float[Tensor, "view 3 height width"]:
-        """Pictures (sRGB, 0 to 1) with one draw of all changes; pixels that leave 0 to 1 are clamped.
-
-        The number of draws is the same for all strengths.
-        """
+        """Pictures (sRGB, 0 to 1) with one draw of all changes, as many for all strengths; clamped to 0 to 1."""
         strengths = (self.brightness, self.contrast, self.saturation)
         factors = [rng.uniform(max(0.0, 1 - strength), 1 + strength) for strength in strengths]
-        angle = 2 * math.pi * rng.uniform(-self.hue, self.hue)
-        changes = [
-            (enhance.adjust_brightness_accumulative, self.brightness, factors[0]),
-            (enhance.adjust_contrast_with_mean_subtraction, self.contrast, factors[1]),
-            (enhance.adjust_saturation_with_gray_subtraction, self.saturation, factors[2]),
-            (enhance.adjust_hue, self.hue, angle),
-        ]
+        factors.append(2 * math.pi * rng.uniform(-self.hue, self.hue))
+        functions = (
+            enhance.adjust_brightness_accumulative,
+            enhance.adjust_contrast_with_mean_subtraction,
+            enhance.adjust_saturation_with_gray_subtraction,
+            enhance.adjust_hue,
+        )
+        changes = list(zip(functions, (*strengths, self.hue), factors, strict=True))
         # All views on top of each other as one picture: this is what makes the mean that of the scene.
-        column = images.transpose(0, 1).flatten(1, 2)
+        column = rearrange(images, "view channel height width -> channel (view height) width")
         for index in rng.permutation(len(changes)):
             change, strength, factor = changes[index]
             if strength > 0:
                 column = change(column, factor).clamp(0, 1)
-        return column.unflatten(1, (images.shape[0], images.shape[2])).transpose(0, 1).contiguous()
+        return rearrange(
+            column, "channel (view height) width -> view channel height width", view=len(images)
+        ).contiguous()
 
 
 @dataclass(frozen=True)
 class BoxMasks:
     """Boxes that hide parts of the reference picture from the conditioning (paper, masked diffusion).
 
-    The paper gives the probability; number and sizes of the boxes are choices of this implementation.
-
-    Args:
-        probability: of hiding anything.
-        boxes: fewest and most boxes.
-        sides: shortest and longest side of a box, as a share of the picture's; height and width are drawn apart.
+    The paper gives the probability of hiding anything; the fewest and most boxes, and the shortest and longest side (in
+    shares of the picture's; height and width are drawn apart), are choices of this implementation.
 
     Raises:
         CompleteSplatError: probability or sides outside of 0 to 1, or a range that is empty.
@@ -120,20 +115,17 @@ def augment(
     box_masks: BoxMasks | None,
     horizontal_flip: bool,
 ) -> SceneBatch:
-    """One scene (without batch axis), changed at random.
+    """One scene (without batch axis), changed at random: colours of all views, a flip in half of all cases, `visible`.
 
     Jitter, flip and boxes draw from three generators spawned from `rng` in this order, so that none of them
     depends on whether the others are switched on, nor on what was drawn from `rng` before. `rng` itself draws nothing.
-
-    Args:
-        color_jitter: for the reference and all targets alike; None for none.
-        box_masks: sets `visible`; None leaves it as it is.
-        horizontal_flip: mirror the scene with probability 0.5.
     """
     jitter_rng, flip_rng, boxes_rng = rng.spawn(3)
     if color_jitter is not None:
-        scene = _jittered(scene, color_jitter, jitter_rng)
-    if horizontal_flip and flip_rng.random() < FLIP_PROBABILITY:
+        images = color_jitter(scene.all_views().images, jitter_rng)
+        reference, targets = replace(scene.reference, images=images[0]), replace(scene.targets, images=images[1:])
+        scene = replace(scene, reference=reference, targets=targets)
+    if horizontal_flip and flip_rng.random() < 0.5:
         scene = mirrored(scene)
     if box_masks is not None:
         height, width = scene.reference.cameras.image_size
@@ -143,20 +135,14 @@ def augment(
 
 def mirrored(scene: SceneBatch) -> SceneBatch:
     """The scene in a mirror: pictures, masks and cameras swap left and right, the reference's frame stays the world."""
-    return replace(
-        scene,
-        reference=_mirrored_views(scene.reference),
-        targets=_mirrored_views(scene.targets),
-        visible=scene.visible.flip(-1),
+    parts = (scene.reference, scene.targets)
+    reference, targets = (
+        Views(
+            views.images.flip(-1),
+            mirror(views.cameras),
+            views.masks.flip(-1),
+            None if views.depths is None else views.depths.flip(-1),
+        )
+        for views in parts
     )
-
-
-def _mirrored_views(views: Views) -> Views:
-    depths = None if views.depths is None else views.depths.flip(-1)
-    return Views(views.images.flip(-1), mirror(views.cameras), views.masks.flip(-1), depths)
-
-
-def _jittered(scene: SceneBatch, color_jitter: ColorJitter, rng: np.random.Generator) -> SceneBatch:
-    images = color_jitter(scene.all_views().images, rng)
-    reference, targets = replace(scene.reference, images=images[0]), replace(scene.targets, images=images[1:])
-    return replace(scene, reference=reference, targets=targets)
+    return replace(scene, reference=reference, targets=targets, visible=scene.visible.flip(-1))

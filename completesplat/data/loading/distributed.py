@@ -26,11 +26,9 @@ def gathered(value: Any) -> list[Any]:
 
 
 def batch_per_process(batch_size: int, count: int, accumulated: int) -> int:
-    """Scenes of one batch of one process, so that an optimizer step sees `batch_size` scenes.
+    """Scenes of one batch of one of `count` processes, so that an optimizer step sees `batch_size` scenes.
 
-    Args:
-        count: training processes (devices x nodes).
-        accumulated: batches of each whose gradients make one step.
+    `accumulated` batches of each process make one step.
 
     Raises:
         CompleteSplatError: `batch_size` cannot be divided so.

@@ -11,9 +11,7 @@ from torch.utils.data import DataLoader, Sampler
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.loading.view_selection import draws
-from completesplat.errors import CompleteSplatError, DataError
-
-ON_BAD = ("skip", "raise")
+from completesplat.errors import DataError
 
 logger = logging.getLogger(__name__)
 
@@ -23,9 +21,6 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
     Lightning calls `set_epoch` before every epoch, also after a resume. Where several processes train, each has its
     own items, equally many (the last few may be left out).
-
-    Args:
-        groups: items that are best loaded one after the other.
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], seed: int) -> None:
@@ -50,16 +45,6 @@ class EpochSampler(Sampler[tuple[int, int]]):
         return iter([(self.epoch, int(index)) for index in own[self.start :]])
 
 
-def check_policy(on_bad: str) -> None:
-    """Refuse what is neither "skip" nor "raise".
-
-    Raises:
-        CompleteSplatError: it is something else.
-    """
-    if on_bad not in ON_BAD:
-        raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of {', '.join(ON_BAD)}")
-
-
 class SceneLoader:
     """Iterates over batches of scenes, and keeps account of what could not be read.
 
@@ -67,7 +52,6 @@ class SceneLoader:
 
     Args:
         sampler: the order of a training epoch; None: as they are.
-        workers: processes that load; 0: none.
         on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
     """
@@ -81,7 +65,6 @@ class SceneLoader:
         on_bad: str = "skip",
         max_bad_fraction: float = 0.1,
     ) -> None:
-        check_policy(on_bad)
         self.dataset = scenes
         self.batch_size = batch_size
         self.sampler = sampler
@@ -106,6 +89,10 @@ class SceneLoader:
 
     def __len__(self) -> int:
         return len(self._loader)
+
+    @property
+    def _items(self) -> int:  # of this process in an epoch
+        return len(self.dataset if self.sampler is None else self.sampler)
 
     def __iter__(self) -> Iterator[Any]:
         """The batches of an epoch (`SceneBatch`, or `CachedScene`), or the rest of it after `load_state_dict`.
@@ -144,11 +131,6 @@ class SceneLoader:
         self._loader._iterator = iterator
 
     @property
-    def _items(self) -> int:
-        """Of this process in an epoch."""
-        return len(self.dataset if self.sampler is None else self.sampler)
-
-    @property
     def _epoch(self) -> int:
         return self.sampler.epoch if self.sampler is not None else 0
 
@@ -169,16 +151,12 @@ class SceneLoader:
         nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
         if too_many or nothing:
             limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"
-            reason = limit if too_many else "and nothing in their place"
-            raise DataError(
-                f"{len(self.refused)} of {self._items} items cannot be read, {reason}; see `completesplat data check`; "
-                f"the last one: {self.refused[-1]}"
-            )
+            what = f"{len(self.refused)} of {self._items} items cannot be read"
+            advice = f"see `completesplat data check`; the last one: {self.refused[-1]}"
+            raise DataError(f"{what}, {limit if too_many else 'and nothing in their place'}; {advice}")
 
     def _report(self) -> None:
         if self.refused:
             kinds = ", ".join(f"{count} {kind}" for kind, count in Counter(e.kind for e in self.refused).most_common())
-            logger.warning(
-                "skipped %d of %d items (%s); the first: %s",
-                *(len(self.refused), self._items, kinds, self.refused[0]),
-            )
+            count, first = f"{len(self.refused)} of {self._items}", self.refused[0]
+            logger.warning("skipped %s items (%s); the first: %s", count, kinds, first)

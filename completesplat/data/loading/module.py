@@ -12,13 +12,13 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
-from completesplat.data.latent_cache.store import CachedTrainingScenes, LatentCache
+from completesplat.data.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
-from completesplat.data.loading.loader import EpochSampler, SceneLoader, check_policy
+from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
-from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
+from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
@@ -29,23 +29,19 @@ SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test
 logger = logging.getLogger(__name__)
 
 
-def check_settings(targets: int, mask_threshold: float | None, latent_cache: str | None, changed: bool) -> None:
-    """Refuse them; see `SceneDataModule`.
-
-    Args:
-        latent_cache: its folder; an empty name is one that is still to be given.
-        changed: whether training pictures are augmented.
-
-    Raises:
-        CompleteSplatError: one of them is out of its range, or encoded pictures are to be changed.
-    """
+def _check_settings(
+    targets: int, mask_threshold: float | None, latent_cache: str | None, augmented: bool, on_bad: str
+) -> None:
+    """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
+    if on_bad not in ("skip", "raise"):
+        raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of skip, raise")
     if targets < 0:
         raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
     if mask_threshold is not None and not 0 < mask_threshold <= 1:
         raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
     if latent_cache == "":
         raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
-    if latent_cache is not None and changed:
+    if latent_cache is not None and augmented:
         unchanged = "data.color_jitter=null data.horizontal_flip=false"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
@@ -57,15 +53,12 @@ class SceneDataModule(LightningDataModule):
 
     Args:
         root: folder of the data set, or of its prepared form.
-        image_size: side of the square pictures.
         batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
-        targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which has no use
-            for them.
+        targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which needs none.
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
         references_per_sequence: training items of a sequence in one epoch.
         mask_threshold: masks are cut at this probability; None: they stay soft.
-        color_jitter: settings of `ColorJitter`; None: no augmentation of colours.
-        box_masks: settings of `BoxMasks`; None: the reference pictures are seen completely.
+        color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: none.
         horizontal_flip: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none.
         cache: keep decoded pictures in memory.
@@ -95,8 +88,8 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        check_policy(on_bad)
-        check_settings(targets, mask_threshold, latent_cache, color_jitter is not None or horizontal_flip)
+        augmented = color_jitter is not None or horizontal_flip
+        _check_settings(targets, mask_threshold, latent_cache, augmented, on_bad)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -171,7 +164,7 @@ class SceneDataModule(LightningDataModule):
         """
         if split not in self._sources:
             if is_packed(self.root):
-                settings_must_match(read_manifest(self.root), self.packed_settings())
+                settings_must_match(self.root, self.packed_settings())
                 self._sources[split] = PackedSource(self.root, split)
             else:
                 self._sources |= self.open(split)
@@ -200,11 +193,7 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def cached_latents(self) -> LatentCache:
-        """The cache in `latent_cache`, which must be those of this training set.
-
-        Raises:
-            DataError: there are none, or they are damaged, or of other data or made with other settings.
-        """
+        """The cache in `latent_cache`. Raises `DataError` if it is damaged, or not of this training set."""
         assert self.latent_cache is not None
         store = LatentCache(self.latent_cache)
         store.must_belong_to(self.source("train"), self.packed_settings())
@@ -225,11 +214,9 @@ class SceneDataModule(LightningDataModule):
         return TrainingScenes(*drawing, self.augment, *counting)
 
     def val_dataloader(self) -> SceneLoader:
-        """The validation sequences."""
         return self._evaluation_loader("val")
 
     def test_dataloader(self) -> SceneLoader:
-        """The test sequences."""
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
@@ -250,11 +237,7 @@ class SceneDataModule(LightningDataModule):
             logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
 
     def typical_camera(self) -> TypicalCamera:
-        """The mean camera of the training frames: of at most 8,192, in the first 400 sequences.
-
-        Raises:
-            DataError: none of them can be read.
-        """
+        """See `mean_camera`."""
         with at(file=self.root):
             return mean_camera(self.store("train"))
 

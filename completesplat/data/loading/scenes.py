@@ -25,11 +25,9 @@ Choice = tuple[int, list[int]]  # reference, targets
 
 
 class Loaded(NamedTuple):
-    """A scene, or a batch of them, and what could not be read on the way.
+    """A scene, or a batch of them, and why others could not be read.
 
-    Attributes:
-        refused: why scenes could not be read.
-        refused_depths: why scenes are here without their true depth, although the data have it.
+    `refused_depths`: why scenes are here without their true depth, although the data have it.
     """
 
     scenes: SceneBatch | CachedScene | None
@@ -38,12 +36,10 @@ class Loaded(NamedTuple):
 
 
 class SceneStore:
-    """Makes scenes of some of a source's sequences.
+    """Makes scenes of some of a source's sequences, which `names` lists in order.
 
     Args:
-        names: the sequences, in order.
-        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay
-            probabilities.
+        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay.
         cache: keep decoded pictures (uint8) in memory, each from its first use on.
     """
 
@@ -69,17 +65,12 @@ class SceneStore:
         if self.mask_threshold is not None:
             masks = (masks >= self.mask_threshold).float()
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
-        seen = Views(images, cameras, masks)
-        visible = torch.ones_like(masks[0])
-        frame = torch.tensor(reference)
-        return SceneBatch(seen[0], seen[1:], sequence.depth_ranges[reference], visible, frame, sequence.name)
+        seen, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
+        ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
+        return SceneBatch(seen[0], seen[1:], ranges, visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
-        """One picture.
-
-        Raises:
-            DataError: it cannot be read.
-        """
+        """One picture. Raises `DataError` if it cannot be read."""
         return self._picture(sequence, view).image
 
     def _picture(self, sequence: PosedSequence, view: int) -> Picture:
@@ -102,10 +93,8 @@ class TrainingScenes(Dataset[Loaded]):
     An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
     only.
 
-    Args:
-        choose: (number of a sequence's frames, random generator) -> views.
-        augment: (scene, random generator) -> scene.
-        references: items of a sequence in one epoch.
+    `choose` is (number of a sequence's frames, random generator) -> views; `references` are items of a sequence in one
+    epoch.
     """
 
     def __init__(
@@ -155,11 +144,10 @@ class TrainingScenes(Dataset[Loaded]):
 
 
 class EvaluationScenes(Dataset[Loaded]):
-    """Every sequence once.
+    """Every sequence once, or those of some names.
 
     Args:
         choose: sequence -> views. Raises `DataError` where it has not got them.
-        names: the sequences; None: all.
         seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
         depths: read the true depth too, where the data have it.
     """
@@ -199,10 +187,11 @@ class EvaluationScenes(Dataset[Loaded]):
         except DataError as error:
             return Loaded(None, (error,))
         try:
-            depths = _depths(sequence, *views) if self.depths else None
+            if self.depths and sequence.read_depth is not None:
+                scene = _with_depths(scene, torch.stack([sequence.read_depth(view) for view in (views[0], *views[1])]))
         except DataError as error:
             return Loaded(scene, (), (error,))
-        return Loaded(scene if depths is None else with_depths(scene, depths), ())
+        return Loaded(scene, ())
 
     def stackable(self) -> bool:
         """Whether all scenes have the same number of targets, as far as they can be read."""
@@ -213,21 +202,7 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(counts) <= 1
 
 
-def _depths(
-    sequence: PosedSequence, reference: int, targets: Sequence[int]
-) -> Float[Tensor, "view 1 height width"] | None:
-    """True depth of these frames, the reference first; None where the data have none.
-
-    Raises:
-        DataError: a depth map cannot be read.
-    """
-    if sequence.read_depth is None:
-        return None
-    return torch.stack([sequence.read_depth(view) for view in (reference, *targets)])
-
-
-def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
-    """One scene (without batch axis) with the depths of its reference and its targets."""
+def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]) -> SceneBatch:
     reference, targets = replace(scene.reference, depths=depths[0]), replace(scene.targets, depths=depths[1:])
     return replace(scene, reference=reference, targets=targets)
 
@@ -235,8 +210,9 @@ def with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"])
 def collate(items: Sequence[Loaded]) -> Loaded:
     """A batch of the scenes that are there; where only some of them have depths, those of the others are 0, unknown."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    if any(_has_depths(scene) for scene in scenes):
-        scenes = [scene if _has_depths(scene) else _with_unknown_depths(scene) for scene in scenes]
+    with_depths = [isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes]
+    if any(with_depths):
+        scenes = [scene if has else _with_unknown_depths(scene) for scene, has in zip(scenes, with_depths, strict=True)]
     return Loaded(
         stack(scenes) if scenes else None,
         tuple(error for item in items for error in item.refused),
@@ -244,9 +220,5 @@ def collate(items: Sequence[Loaded]) -> Loaded:
     )
 
 
-def _has_depths(scene: SceneBatch | CachedScene) -> bool:
-    return isinstance(scene, SceneBatch) and scene.reference.depths is not None
-
-
 def _with_unknown_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
-    return with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene
+    return _with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene

@@ -18,12 +18,8 @@ SEQUENCES, PICTURES = 400, 8192
 
 
 class TypicalCamera(NamedTuple):
-    """Means over the training pictures.
-
-    Attributes:
-        fov_degrees: horizontal field of view.
-        depth_range: near and far, in scene units.
-        up: the direction away from the ground in the camera's frame, a unit vector.
+    """Means over the training pictures: horizontal field of view, near and far in scene units, and the direction away
+    from the ground in the camera's frame, a unit vector.
     """
 
     fov_degrees: float

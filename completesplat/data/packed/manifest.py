@@ -1,28 +1,21 @@
-"""What a packed store says of itself: `manifest.json`, written last."""
+"""What a packed store says of itself, in a `manifest.json` that is written last; reading and writing any manifest."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from completesplat.atomic import atomic_path
-from completesplat.data.validation import (
-    BadAnnotation,
-    UnreadableFile,
-    at,
-    field,
-    inside,
-    list_field,
-    optional_field,
-    read_json,
-)
+from completesplat.atomic import write_text
+from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json
 from completesplat.errors import DataError
 
-FORMAT = 2
 MANIFEST = "manifest.json"
+HEADER = {"format": 2}
 
 Scalar = str | int | float | bool | None
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,12 +61,16 @@ class Split:
     refused: tuple[Refusal, ...]
     left_out: dict[str, int]
 
+    def __post_init__(self) -> None:
+        stored = sorted(name for shard in self.shards for name in shard.sequences)
+        if len(set(self.names)) < len(self.names) or stored != sorted(self.names):
+            raise BadAnnotation("the names of a split are not those of its shards")
+
 
 @dataclass(frozen=True)
 class PackedManifest:
     """A whole store; `settings` are what was baked into its pictures and cameras."""
 
-    root: Path
     codec: str
     settings: dict[str, Scalar]
     splits: dict[str, Split]
@@ -85,64 +82,63 @@ def is_packed(root: Path) -> bool:
 
 
 def read_manifest(root: Path) -> PackedManifest:
-    """The manifest of a store.
+    """The manifest of a store. Raises `DataError` as `read_as`."""
+    return read_as(PackedManifest, root / MANIFEST, HEADER, "prepare the data again")
+
+
+def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: str) -> T:
+    """A JSON file that starts with `header` as an instance of a dataclass.
 
     Raises:
-        DataError: it is missing, no JSON, of another version of the format, incomplete, or names files elsewhere.
+        DataError: it is missing, no JSON, has another header (then it names the remedy), or is incomplete.
     """
-    path = root / MANIFEST
     with at(file=path):
         content = read_json(path)
-        check_format(content, FORMAT, "prepare the data again")
-        splits = field(content, "splits", dict)
-        settings = field(content, "settings", dict)
-        if not all(value is None or isinstance(value, str | int | float) for value in settings.values()):
-            raise BadAnnotation("settings must be plain values")
-        return PackedManifest(
-            root,
-            field(content, "codec", str),
-            settings,
-            {name: _split(root, field(splits, name, dict)) for name in splits},
-        )
+        for key, readable in header.items():
+            found = field(content, key, type(readable))
+            if found != readable:
+                raise UnreadableFile(f"{key} {found}, this version reads {readable}: {remedy}")
+        manifest: T = parsed(kind, content)
+        return manifest
 
 
-def write_manifest(manifest: PackedManifest) -> None:
-    """`manifest.json` in the store's folder, there as a whole or not at all."""
-    content = asdict(manifest)
-    del content["root"]
-    write_json(manifest.root / MANIFEST, {"format": FORMAT, **content})
-
-
-def check_format(content: object, readable: int, remedy: str) -> None:
-    """Refuse a manifest of another version of its format.
+def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
+    """A value of JSON as a dataclass, tuple, dictionary, union or plain type says.
 
     Raises:
-        UnreadableFile: of another version.
-        BadAnnotation: it does not say of which.
+        BadAnnotation: it is of another type (true is no `int`), or a field is missing.
     """
-    found = field(content, "format", int)
-    if found != readable:
-        raise UnreadableFile(f"format {found}, this version reads {readable}: {remedy}")
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is tuple and type(value) is list:
+        return tuple(parsed(arguments[0], item, name) for item in value)
+    if origin is dict and type(value) is dict:
+        return {key: parsed(arguments[1], item, key) for key, item in value.items()}
+    if isinstance(kind, type) and is_dataclass(kind) and type(value) is dict:
+        hints = get_type_hints(kind)
+        if missing := hints.keys() - value.keys():
+            raise BadAnnotation(f"no {', '.join(sorted(missing))} in {name}")
+        return kind(**{key: parsed(hint, value[key], key) for key, hint in hints.items()})
+    if type(value) in (arguments if origin is UnionType else (kind,)):
+        return value
+    raise BadAnnotation(f"{name} must be {getattr(kind, '__name__', kind)}, not of type {type(value).__name__}")
 
 
-def write_json(path: Path, content: object) -> None:
-    """A JSON file that is there as a whole or not at all."""
-    with atomic_path(path) as unfinished:
-        unfinished.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None = None) -> None:
+    """A JSON file of a dictionary or a dataclass, there as a whole or not at all."""
+    entries = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
+    write_text(path, json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n")
 
 
-def settings_must_match(manifest: PackedManifest, settings: Mapping[str, Scalar]) -> None:
+def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
     """Refuse a store that was made with other settings than these.
 
     Raises:
         DataError: names every setting that differs.
     """
-    differing = differences(manifest.settings, settings)
+    differing = differences(read_manifest(root).settings, settings)
     if differing:
-        raise DataError(
-            f"prepared with {differing}: set these as they were, or prepare the data again into another folder",
-            str(manifest.root),
-        )
+        advice = "set these as they were, or prepare the data again into another folder"
+        raise DataError(f"prepared with {differing}: {advice}", str(root))
 
 
 def differences(found: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> str:
@@ -150,47 +146,3 @@ def differences(found: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> st
     # JSON makes no difference between 1 and 1.0, nor does anything that the settings are used for.
     keys = [key for key in sorted({*found, *wanted}) if found.get(key) != wanted.get(key)]
     return ", ".join(f"{key}={found.get(key)} (asked for: {wanted.get(key)})" for key in keys)
-
-
-def shard_from_json(root: Path, entry: object) -> Shard:
-    """A shard's entry in the manifest or in its record.
-
-    Raises:
-        DataError: malformed, or its file lies elsewhere.
-    """
-    file = field(entry, "file", str)
-    inside(root, file)
-    size, frames = field(entry, "bytes", int), field(entry, "frames", int)
-    return Shard(file, field(entry, "sha256", str), size, frames, list_field(entry, "sequences", str))
-
-
-def refusal_from_json(entry: object) -> Refusal:
-    """A refusal's entry.
-
-    Raises:
-        BadAnnotation: malformed.
-    """
-    return Refusal(
-        field(entry, "kind", str),
-        field(entry, "reason", str),
-        optional_field(entry, "file", str),
-        optional_field(entry, "sequence", str),
-        optional_field(entry, "frame", int),
-    )
-
-
-def _split(root: Path, entry: dict[str, Any]) -> Split:
-    names = list_field(entry, "names", str)
-    shards = tuple(shard_from_json(root, shard) for shard in field(entry, "shards", list))
-    if len(set(names)) < len(names) or sorted(name for shard in shards for name in shard.sequences) != sorted(names):
-        raise BadAnnotation("the names of a split are not those of its shards")
-    refused = tuple(refusal_from_json(refusal) for refusal in field(entry, "refused", list))
-    left_out = field(entry, "left_out", dict)
-    return Split(
-        field(entry, "fingerprint", str),
-        field(entry, "listed", int),
-        names,
-        shards,
-        refused,
-        {key: field(left_out, key, int) for key in left_out},
-    )

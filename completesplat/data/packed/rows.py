@@ -25,7 +25,8 @@ CODECS: dict[str, dict[str, Any]] = {
     "jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
     "bmp": {"format": "BMP"},
 }
-MATRIX, INTRINSICS, RANGE = 16, 9, 2
+# Numbers of a frame in the columns that `checksum` covers.
+WIDTHS = {"frames": 1, "world_to_camera": 16, "intrinsics": 9, "depth_ranges": 2}
 
 
 def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
@@ -110,12 +111,7 @@ def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPi
 
 
 def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[EncodedPicture]) -> pa.Table:
-    """A table of one row with some frames of a sequence.
-
-    Args:
-        kept: indices of the frames.
-        pictures: theirs.
-    """
+    """A table of one row with the frames of these indices and their pictures."""
     indices, cameras = list(kept), sequence.cameras
     numbers = {
         "frames": np.array([sequence.frames[index] for index in indices], dtype=np.int64),
@@ -139,12 +135,8 @@ def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[Enco
 def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
     """The sequence of a table with one row; pictures are decoded when they are read.
 
-    Args:
-        file: where the row lies, for messages.
-        name: of the sequence that it should be.
-
     Raises:
-        DataError: damaged, another sequence, columns of different lengths, or numbers that are not finite.
+        DataError: damaged, another sequence than `name`, columns of different lengths, or numbers that are not finite.
     """
     with at(file=file, sequence=name):
         try:
@@ -155,23 +147,17 @@ def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
         if found != name:
             raise BadAnnotation(f"holds sequence {found!r} in its place")
         count = len(_values(row, "frames"))
-        numbers = {
-            "frames": _numbers(row, "frames", count, 1),
-            "world_to_camera": _numbers(row, "world_to_camera", count, MATRIX),
-            "intrinsics": _numbers(row, "intrinsics", count, INTRINSICS),
-            "depth_ranges": _numbers(row, "depth_ranges", count, RANGE),
-        }
+        numbers = {column: _numbers(row, column, count * width) for column, width in WIDTHS.items()}
         if not isinstance(size, int) or size < 1 or checksum != _checksum(name, size, numbers):
             raise ChangedFile("its cameras are no longer what was written")
         frames = tuple(numbers["frames"].tolist())
         world_to_camera = torch.from_numpy(numbers["world_to_camera"]).view(count, 4, 4)
         cameras = Cameras(world_to_camera, torch.from_numpy(numbers["intrinsics"]).view(count, 3, 3), (size, size))
         depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
-        checksums = _numbers(row, "picture_checksums", count, 1)
-        images, masks = _files(row, "images", count), _files(row, "masks", count)
-        return PosedSequence(
-            name, frames, cameras, depth_ranges, _Pictures(images, masks, checksums, size, (file, name), frames)
-        )
+        images, masks = _values(row, "images", count), _values(row, "masks", count)
+        checksums = _numbers(row, "picture_checksums", count)
+        pictures = _Pictures(images, masks, checksums, size, (file, name), frames)
+        return PosedSequence(name, frames, cameras, depth_ranges, pictures)
 
 
 @dataclass(frozen=True)
@@ -194,28 +180,21 @@ class _Pictures:
             return Picture(decode(encoded.image, 3, self.size), mask)
 
 
-def _values(row: pa.Table, column: str) -> pa.Array:
+def _values(row: pa.Table, column: str, count: int | None = None) -> pa.Array:
     values = row.column(column)[0].values
-    if values is None:
-        raise BadAnnotation(f"no {column}")
+    if values is None or len(values) != (len(values) if count is None else count):
+        raise BadAnnotation(f"{column} must have {'some' if count is None else count} values")
     return values
 
 
-def _numbers(row: pa.Table, column: str, count: int, width: int) -> np.ndarray:
-    values = _values(row, column)
-    if len(values) != count * width or values.null_count:
-        raise BadAnnotation(f"{column} must be {count} x {width} numbers, not {len(values)}")
-    numbers = values.to_numpy().copy()  # The map cannot be written to.
+def _numbers(row: pa.Table, column: str, count: int) -> np.ndarray:
+    values = _values(row, column, count)
+    if values.null_count:
+        raise BadAnnotation(f"{column} must be numbers")
+    numbers: np.ndarray = values.to_numpy().copy()  # The map cannot be written to.
     if not np.isfinite(numbers).all():
         raise BadAnnotation(f"{column} is not finite")
     return numbers
-
-
-def _files(row: pa.Table, column: str, count: int) -> pa.LargeBinaryArray:
-    values = _values(row, column)
-    if len(values) != count:
-        raise BadAnnotation(f"{column} must be {count} pictures, not {len(values)}")
-    return values
 
 
 def _checksum(name: str, size: int, numbers: dict[str, np.ndarray]) -> int:

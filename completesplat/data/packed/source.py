@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from completesplat.data.packed.manifest import Shard, read_manifest
+from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
 from completesplat.data.packed.rows import features, from_row
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
@@ -22,12 +22,12 @@ class PackedSource:
     """
 
     def __init__(self, root: Path, split: str) -> None:
-        manifest = read_manifest(root)
-        if split not in manifest.splits:
-            there = ", ".join(manifest.splits) or "none"
+        splits = read_manifest(root).splits
+        if split not in splits:
+            there = ", ".join(splits) or "none"
             raise DataError(f"no split {split} in this packed store; there are: {there}", str(root))
-        entry = manifest.splits[split]
-        self.manifest = manifest
+        entry = splits[split]
+        self.root = root
         self.shards = entry.shards
         self.names = list(entry.names)
         self.refused: list[DataError] = []
@@ -38,8 +38,13 @@ class PackedSource:
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
         }
         self._opened: dict[int, Any] = {}
-        for shard in self.shards:
-            check_size(root, shard)
+        with at(file=root / MANIFEST):
+            for shard in self.shards:
+                path = require_file(inside(root, shard.file))
+                size = path.stat().st_size
+                if size != shard.bytes:
+                    reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
+                    raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
         """One sequence: its cameras as they were prepared, its pictures decoded one by one when they are read.
@@ -49,7 +54,7 @@ class PackedSource:
         """
         number, row = self._places[name]
         shard = self.shards[number]
-        path = self.manifest.root / shard.file
+        path = self.root / shard.file
         if number not in self._opened:
             with at(sequence=name):
                 self._opened[number] = open_shard(path, shard)
@@ -67,7 +72,7 @@ class PackedSource:
         """The shards of this split that are no longer those whose checksums are in the manifest; reads all of them."""
         changed = []
         for shard in self.shards:
-            with require_file(self.manifest.root / shard.file).open("rb") as file:
+            with require_file(self.root / shard.file).open("rb") as file:
                 found = hashlib.file_digest(file, "sha256").hexdigest()
             if found != shard.sha256:
                 advice = "remove it and prepare again into the same folder"
@@ -77,20 +82,6 @@ class PackedSource:
     def __getstate__(self) -> dict[str, Any]:
         # Worker processes open the files themselves and share their pages.
         return {**self.__dict__, "_opened": {}}
-
-
-def check_size(root: Path, shard: Shard) -> None:
-    """Refuse a shard that is not there as it was written, as far as a glance shows.
-
-    Raises:
-        DataError: missing, elsewhere, or of another size.
-    """
-    path = require_file(inside(root, shard.file))
-    size = path.stat().st_size
-    if size != shard.bytes:
-        raise ChangedFile(
-            f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder", str(path)
-        )
 
 
 def open_shard(path: Path, shard: Shard) -> Any:

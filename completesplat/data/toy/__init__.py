@@ -1,7 +1,6 @@
 """Procedural scenes, ray-traced and written to disk in the layouts of the real data sets."""
 
 from pathlib import Path
-from typing import Any
 
 from completesplat.data.toy.objects import write_objects
 from completesplat.data.toy.rooms import write_rooms
@@ -10,7 +9,16 @@ from completesplat.errors import DataError
 KINDS = {"objects": write_objects, "rooms": write_rooms}
 
 
-def write(kind: str, out: Path, **settings: Any) -> Path:
+def write(
+    kind: str,
+    out: Path,
+    scenes: int,
+    frames: int,
+    size: int,
+    seed: int,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Path:
     """Write scenes of a kind (a key of `KINDS`); returns their folder.
 
     Raises:
@@ -18,7 +26,7 @@ def write(kind: str, out: Path, **settings: Any) -> Path:
     """
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
-    return KINDS[kind](out, **settings)
+    return KINDS[kind](out, scenes, frames, size, seed, workers, progress)
 
 
 __all__ = ["write", "write_objects", "write_rooms"]

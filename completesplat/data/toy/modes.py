@@ -16,12 +16,12 @@ from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.pictures.crop import cut_square, principal_square
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
-from completesplat.data.toy.objects import CATEGORY, FORMAT_VERSION
+from completesplat.data.toy.objects import CATEGORY
 from completesplat.data.toy.raytracing import trace
+from completesplat.data.toy.writing import FORMAT_VERSION
 from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
-from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
 
 # Of the distance: what is seen at this much less is something else, in front.
@@ -40,7 +40,8 @@ def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tenso
     rays = (offsets / distances[:, None]) @ other.world_to_camera[:3, :3].mT
     pose = scene.camera_to_world[reference]
     met = trace(scene.geometry, scene.surroundings, scene.patch, pose, np.ascontiguousarray(rays.numpy()[:, None]))[2]
-    return ~(within & (torch.from_numpy(met) > (1 - CLOSER) * distances)).unflatten(0, (size, size))
+    shown: Tensor = within & (torch.from_numpy(met) > (1 - CLOSER) * distances)
+    return ~shown.view(size, size)
 
 
 def frame_camera(scene: ToyScene, frame: int, size: int) -> Cameras:
@@ -62,14 +63,9 @@ Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "
 
 
 class ToyHiddenModes:
-    """The test scenes of a set of toy objects with all their modes.
+    """The scenes of a store, the toy objects in `root`, with all their modes; see `KnowsHiddenModes.hidden_modes`.
 
-    Args:
-        root: folder of the category.
-        store: its test scenes.
-        choose: sequence -> reference and targets, of which the reference counts.
-        image_size: side of the store's pictures.
-        views, spread_views: see `KnowsHiddenModes.hidden_modes`.
+    Of what `choose` gives for a sequence the reference counts.
 
     Raises:
         DataError: `root` holds no complete set that was written by this version.
@@ -103,7 +99,6 @@ class ToyHiddenModes:
         return len(self.store.names)
 
     def __getitem__(self, index: int) -> HiddenModes:
-        """See `HiddenModeScenes`."""
         name = self.store.names[index]
         toy, sequence = self._drawn_again(name), self.store.source.read(name)
         reference, _ = self.choose(sequence)
@@ -111,10 +106,16 @@ class ToyHiddenModes:
         if self._differs(self._truths(toy, frames[reference]), LEAK).any():
             raise DataError("the reference view tells the patch's colour", sequence=name)
         behind, truths, region = self._from_behind(toy, name, frames, reference)
-        targets = sorted({*behind, *self._spread(frames, reference)})
+        others = [view for view in range(len(frames)) if view != reference]
+        spread = [others[place - 1] for place in evaluation_views(len(frames), self.spread_views)[1]]
+        targets = sorted({*behind, *spread})
         scene = stack([self.store.scene(sequence, reference, targets)])
         true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
-        self._check_pictures(toy, scene, frames[reference], truths[true_mode], views)
+        # The drawn scene must be the one on the disk.
+        drawn = torch.cat([self._render(toy, frames[reference])[None], truths[true_mode]])
+        stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
+        if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
+            raise self._other_set(name)
         hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
         colors = tuple(PATCH_COLORS)
         # `draw_scene` chooses among the colours uniformly, whatever else is in the scene.
@@ -129,9 +130,8 @@ class ToyHiddenModes:
         return scene
 
     def _other_set(self, name: str) -> CompleteSplatError:
-        return CompleteSplatError(
-            f"{self.folder}: {name} is not the scene that toy.json describes: write the set again"
-        )
+        reason = "is not the scene that toy.json describes: write the set again"
+        return CompleteSplatError(f"{self.folder}: {name} {reason}")
 
     def _truths(self, scene: ToyScene, frame: int) -> Float[Tensor, "mode 3 size size"]:
         """The picture of a frame in every mode, in the pixels of the set's own pictures."""
@@ -145,10 +145,7 @@ class ToyHiddenModes:
         return cut_square(picture, square, self.image_size).float() / 255
 
     def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
-        """Up to `views` views that show enough of the patch, with their truths and the patch's pixels.
-
-        Those that look at it most directly come first.
-        """
+        """The views that show enough of the patch, the most direct ones first, with their truths and its pixels."""
         toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
         facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
         chosen: list[int] = []
@@ -169,21 +166,3 @@ class ToyHiddenModes:
     @staticmethod
     def _differs(truths: Float[Tensor, "mode 3 size size"], by: float) -> Bool[Tensor, "size size"]:
         return ((truths.amax(0) - truths.amin(0)) > by).any(0)
-
-    def _spread(self, frames: tuple[int, ...], reference: int) -> list[int]:
-        others = [view for view in range(len(frames)) if view != reference]
-        return [others[place - 1] for place in evaluation_views(len(frames), self.spread_views)[1]]
-
-    def _check_pictures(
-        self,
-        toy: ToyScene,
-        scene: SceneBatch,
-        frame: int,
-        truth: Float[Tensor, "view 3 size size"],
-        views: tuple[int, ...],
-    ) -> None:
-        """That the drawn scene is the one on the disk: the reference picture and those that show the modes."""
-        drawn = torch.cat([self._render(toy, frame)[None], truth])
-        stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
-        if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
-            raise self._other_set(scene.names[0])

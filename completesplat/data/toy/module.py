@@ -17,13 +17,8 @@ class ToyObjectsDataModule(CO3DDataModule):
 
     Scenes that are already there are taken as they are, however many they are.
 
-    Args:
-        root: where the scenes are, or will be.
-        scenes, frames, data_seed: what to make where there is nothing yet.
-        subset: see `CO3DDataModule`; the only one that is written.
-        depth_before: see `CO3DDataModule`; closer than there, as in `conf/data/toy_objects.yaml`: a model knows the
-            depth range that it was trained with.
-        **reading: settings of `CO3DDataModule`.
+    `scenes`, `frames` and `data_seed` are of what to make; the others are settings of `CO3DDataModule`. `depth_before`
+    is closer than there, as in `conf/data/toy_objects.yaml`: a model knows the depth range that it was trained with.
     """
 
     def __init__(
@@ -42,7 +37,6 @@ class ToyObjectsDataModule(CO3DDataModule):
         self.data_seed = data_seed
 
     def describe(self) -> dict[str, str | None]:
-        """See `SceneDataModule`."""
         return super().describe() | {"data_set": CATEGORY}
 
     def prepare_data(self) -> None:
@@ -66,11 +60,8 @@ class ToyRoomsDataModule(RE10KDataModule):
 
     Clips that are already there are taken as they are, however many they are.
 
-    Args:
-        root: where the rooms are, or will be.
-        form: "text" or "chunks", of RealEstate10K's two forms: both hold the same.
-        scenes, frames, height, data_seed: what to make where there is nothing yet; pictures are wider than high.
-        **reading: settings of `RE10KDataModule`.
+    `form` is "text" or "chunks", of RealEstate10K's two forms: both hold the same. `scenes`, `frames`, `height` and
+    `data_seed` are of what to make; the others are settings of `RE10KDataModule`.
     """
 
     def __init__(
@@ -89,7 +80,6 @@ class ToyRoomsDataModule(RE10KDataModule):
         self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
 
     def describe(self) -> dict[str, str]:
-        """See `SceneDataModule`."""
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:

@@ -3,17 +3,18 @@
 import colorsys
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from completesplat.data.toy.raytracing import (
-    BANDS,
     CHECKS,
     ELLIPSOID,
     FRUSTUM,
-    SOLID,
-    WAVES,
+    PLAIN,
+    RIPPLES,
+    STRIPES,
     Array,
     Geometry,
     Patch,
@@ -21,6 +22,10 @@ from completesplat.data.toy.raytracing import (
     trace,
 )
 from completesplat.geometry.cameras import invert_rigid, look_at
+
+P = TypeVar("P", bound="Part")
+Look = tuple[Array, Array]
+Point = tuple[float, float, float]
 
 DARK = np.full(3, 0.07)
 
@@ -47,7 +52,7 @@ class Part:
         unit = 1.0 if self.kind == ELLIPSOID else float(np.hypot(1 + abs(self.taper), 1.0))
         return float(np.linalg.norm(self.center) + unit * self.half_sizes.max())
 
-    def moved(self, rotation: Array, shift: Array, scale: float) -> "Part":
+    def moved(self: P, rotation: Array, shift: Array, scale: float = 1.0) -> P:
         """After rotation, then shift, then scaling of the object."""
         center = scale * (rotation @ self.center + shift)
         return replace(self, center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
@@ -98,41 +103,31 @@ class _Painter:
         self.hue = rng.uniform()
         self.accent = self.hue + rng.uniform(0.25, 0.75)
 
-    def body(self) -> tuple[Array, Array]:
+    def body(self) -> Look:
         """Colours and texture of a large part."""
         first = color(self.hue, self.rng.uniform(0.5, 0.85), self.rng.uniform(0.7, 0.95))
         second = color(self.hue + self.rng.uniform(-0.1, 0.1), self.rng.uniform(0.35, 0.7), self.rng.uniform(0.4, 0.65))
-        pattern = self.rng.choice([SOLID, BANDS, CHECKS, WAVES])
+        pattern = self.rng.choice([PLAIN, STRIPES, CHECKS, RIPPLES])
         frequency, phase = self.rng.uniform(5.0, 9.0), self.rng.uniform(0, 2 * np.pi)
         return np.stack([first, second]), np.array([pattern, frequency, phase])
 
-    def detail(self) -> tuple[Array, Array]:
+    def detail(self) -> Look:
         """Colours and texture of a small part, each its own shade of the accent."""
         shade = color(self.accent + self.rng.uniform(-0.08, 0.08), self.rng.uniform(0.5, 0.9), self.rng.uniform(0.6, 1))
         return plain(shade)
 
 
-def plain(shade: Array) -> tuple[Array, Array]:
+def plain(shade: Array) -> Look:
     """One colour, no pattern."""
-    return np.stack([shade, shade]), np.array([SOLID, 0.0, 0.0])
+    return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
 
 
-Look = tuple[Array, Array]
-
-
-def _ball(center: tuple[float, float, float], half_sizes: object, look: Look, axes: Array | None = None) -> Part:
+def _ball(center: Point, half_sizes: object, look: Look, axes: Array | None = None) -> Part:
     sizes = np.broadcast_to(np.asarray(half_sizes, dtype=np.float64), 3)
     return Part(ELLIPSOID, np.array(center, dtype=np.float64), sizes, np.eye(3) if axes is None else axes, 0.0, *look)
 
 
-def _frustum(
-    center: tuple[float, float, float],
-    radius: float,
-    half_height: float,
-    look: Look,
-    taper: float = 0.0,
-    axis: str = "y",
-) -> Part:
+def _frustum(center: Point, radius: float, half_height: float, look: Look, taper: float = 0.0, axis: str = "y") -> Part:
     axes = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}[axis]
     return Part(
         FRUSTUM, np.array(center, dtype=np.float64), np.array([radius, half_height, radius]), axes, taper, *look
@@ -151,7 +146,7 @@ def bear(rng: np.random.Generator) -> Blueprint:
     parts = [
         _ball((0, 0, 0), (wide, tall, deep), fur),
         _ball((0, -0.04, 0.09), (0.72 * wide, 0.74 * tall, 0.82 * deep), light),
-        _ball((0, top, 0.04), skull, (fur[0], np.array([SOLID, 0.0, 0.0]))),
+        _ball((0, top, 0.04), skull, (fur[0], np.array([PLAIN, 0.0, 0.0]))),
         _ball((0, top - 0.28 * skull, 0.04 + 0.85 * skull), (0.48 * skull, 0.36 * skull, 0.4 * skull), light),
         _ball((0, top - 0.16 * skull, 0.04 + 1.22 * skull), 0.15 * skull, plain(DARK)),
     ]
@@ -243,7 +238,7 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     facing, heights = away / np.linalg.norm(away), np.array(blueprint.patch_heights)
     patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights)
     surroundings = _surroundings(rng)
-    parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3), 1.0) for part in blueprint.parts)
+    parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3)) for part in blueprint.parts)
     points, point_colors = _surface(rng, parts, surroundings, patch)
     center = points.mean(axis=0)
     scale = OBJECT_HALF_SIZE / np.abs(points - center).max()
@@ -281,7 +276,8 @@ def _camera_rays(fov_degrees: float, size: int) -> Array:
     centers = (np.arange(size * SAMPLES) + 0.5) / SAMPLES - size / 2
     v, u = (axis.reshape(size, SAMPLES, size, SAMPLES).swapaxes(1, 2) for axis in np.meshgrid(centers, centers)[::-1])
     rays = np.stack([u, v, np.full_like(u, 0.5 * size / np.tan(np.radians(fov_degrees) / 2))], axis=-1)
-    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(size * size, SAMPLES**2, 3)
+    units: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    return units.reshape(size * size, SAMPLES**2, 3)
 
 
 def _orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
@@ -306,7 +302,7 @@ def _surroundings(rng: np.random.Generator) -> Surroundings:
     return Surroundings(
         ground=-np.inf,
         ground_colors=np.stack([color(floor, 0.3, 0.9), color(floor + rng.uniform(-0.06, 0.06), 0.45, 0.55)]),
-        ground_texture=np.array([rng.choice([BANDS, CHECKS]), rng.uniform(3, 5), rng.uniform(0, np.pi)]),
+        ground_texture=np.array([rng.choice([STRIPES, CHECKS]), rng.uniform(3, 5), rng.uniform(0, np.pi)]),
         dome_radius=DOME_RADIUS,
         hue=hue,
         turn=rng.uniform(0, 2 * np.pi),

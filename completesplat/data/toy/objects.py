@@ -13,35 +13,14 @@ from plyfile import PlyData, PlyElement
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.writing import in_processes, write_once
-from completesplat.errors import DataError
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
 TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
 FRAMES_PER_SECOND = 10.0
 CATEGORY = "toy_objects"
+SUBSET = "fewview_train"
 
-
-def write_sequence(
-    category: Path, name: str, scene: ToyScene, size: int, split: str
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Write pictures, masks, depth and point cloud to `category`/`name`.
-
-    Returns:
-        The frames' annotations and the sequence's; their paths start with the category's name.
-    """
-    for folder in ("images", "masks", "depths", "depth_masks"):
-        (category / name / folder).mkdir(parents=True)
-    frames = [_write_frame(category, name, scene, frame, size, split) for frame in range(len(scene.camera_to_world))]
-    _write_point_cloud(category / name / "pointcloud.ply", scene)
-    cloud = {"path": f"{CATEGORY}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": len(scene.points)}
-    sequence = {
-        "sequence_name": name,
-        "category": CATEGORY,
-        "video": None,
-        "point_cloud": cloud,
-        "viewpoint_quality_score": 1.0,
-    }
-    return frames, sequence
+Annotations = tuple[str, list[dict[str, Any]], dict[str, Any]]
 
 
 def _write_frame(category: Path, name: str, scene: ToyScene, frame: int, size: int, split: str) -> dict[str, Any]:
@@ -94,18 +73,8 @@ def _viewpoint(scene: ToyScene, frame: int) -> dict[str, Any]:
 def _write_point_cloud(path: Path, scene: ToyScene) -> None:
     points, colors = scene.unit * scene.points + scene.origin, _to_bytes(scene.point_colors)
     types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-    vertices = np.empty(len(points), dtype=types)
-    for axis, column in zip("xyz", points.T, strict=True):
-        vertices[axis] = column
-    for channel, column in zip(("red", "green", "blue"), colors.T, strict=True):
-        vertices[channel] = column
+    vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
-
-
-SUBSET = "fewview_train"
-FORMAT_VERSION = 1
-
-Annotations = tuple[str, list[dict[str, Any]], dict[str, Any]]
 
 
 def write_objects(
@@ -113,26 +82,20 @@ def write_objects(
 ) -> Path:
     """Write `scenes` sequences of `frames` square pictures with masks, depth, point clouds and annotations.
 
-    The bytes depend on `scenes`, `frames`, `size` and `seed` only, not on `workers` (processes; by default one a
-    core). The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json`
-    reveals the family and the colour of the patch on the back. A folder that holds the same set already is kept.
-
-    Returns:
-        The category's folder, `out`/toy_objects.
+    The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
+    family and the colour of the patch on the back. See `write_once`, which takes the numbers; `workers` are processes
+    (by default one a core). Returns the category's folder, `out`/toy_objects.
 
     Raises:
         DataError: a number that is too small, or a category folder with other content.
     """
-    if scenes < 1 or frames < 2 or size < 8:
-        raise DataError(f"toy objects need scenes >= 1, frames >= 2 and size >= 8, not {scenes}, {frames} and {size}")
-    parameters = {"format": FORMAT_VERSION, "scenes": scenes, "frames": frames, "size": size, "seed": seed}
 
     def fill(category: Path) -> None:
         write = partial(_write_scene, category, frames, size, seed)
         written = in_processes(write, _splits(scenes), workers, "Rendering toy objects", progress)
         _write_lists(category, list(written))
 
-    return write_once(out / CATEGORY, parameters, fill, progress)
+    return write_once(out / CATEGORY, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
 
 
 def _splits(scenes: int) -> list[str]:
@@ -146,10 +109,15 @@ def _write_scene(category: Path, frames: int, size: int, seed: int, index: int, 
     """One sequence, from a random generator of its own; returns its split and annotations."""
     scene = draw_scene(np.random.default_rng([seed, index]), frames)
     name = f"{index:05d}_{scene.family}"
-    frame_annotations, sequence_annotation = write_sequence(category, name, scene, size, split)
+    for folder in ("images", "masks", "depths", "depth_masks"):
+        (category / name / folder).mkdir(parents=True)
+    annotations = [_write_frame(category, name, scene, frame, size, split) for frame in range(frames)]
+    _write_point_cloud(category / name / "pointcloud.ply", scene)
     hidden = {"family": scene.family, "patch_color": scene.patch_color}
     (category / name / "toy.json").write_text(json.dumps(hidden) + "\n")
-    return split, frame_annotations, sequence_annotation
+    cloud = {"path": f"{CATEGORY}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": len(scene.points)}
+    sequence = {"sequence_name": name, "category": CATEGORY, "video": None, "point_cloud": cloud}
+    return split, annotations, sequence | {"viewpoint_quality_score": 1.0}
 
 
 def _write_lists(category: Path, written: list[Annotations]) -> None:

@@ -9,8 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-ELLIPSOID, FRUSTUM = 0, 1
-SOLID, BANDS, CHECKS, WAVES = 0, 1, 2, 3
+ELLIPSOID, FRUSTUM, BOX = 0, 1, 2
+# What the first number of a texture says; the others are its frequency (radians per unit of length) and phase.
+PLAIN, STRIPES, CHECKS, RIPPLES = 0, 1, 2, 3
 
 Array = NDArray[np.float64]
 
@@ -67,14 +68,52 @@ PATCH_EDGE = 0.72
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: Callable[..., Any]) -> Any:
     """Compiled on the first call and kept on disk; a run-time type checker's wrapper is taken off first."""
     return njit(cache=True, **OPTIONS)(inspect.unwrap(function))
 
 
-def inlined(function: Callable) -> Callable:
+def inlined(function: Callable[..., Any]) -> Any:
     """Part of a kernel: passing a tuple of arrays to a numba function costs as much as meeting a sphere."""
     return njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
+
+
+@inlined
+def turned(m, x, y, z):
+    """A direction after the linear part of a map [3 4]."""
+    return (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
+
+
+@inlined
+def moved(m, x, y, z):
+    """A point after a map [3 4]."""
+    x, y, z = turned(m, x, y, z)
+    return x + m[0, 3], y + m[1, 3], z + m[2, 3]
+
+
+@inlined
+def world_normal(m, x, y, z):
+    """The unit normal of a surface whose normal in the local frame, into which `m` maps, is given."""
+    # Normals transform by the transpose of the map into the local frame.
+    x, y, z = turned(m[:, :3].T, x, y, z)
+    norm = math.sqrt(x * x + y * y + z * z)
+    return x / norm, y / norm, z / norm
+
+
+@inlined
+def soft_sign(x):
+    """-1 to 1, with the slope 1 at 0."""
+    return x / math.sqrt(1 + x * x)
+
+
+@inlined
+def mixed(a, b, w):
+    """A colour between two."""
+    return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
 
 
 @inlined
@@ -101,7 +140,7 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
 
 
 @inlined
-def _hit_ball(ox, oy, oz, dx, dy, dz):
+def hit_ball(ox, oy, oz, dx, dy, dz):
     """Nearest hit (distance, normal) of the unit ball, from outside."""
     a = dx * dx + dy * dy + dz * dz
     b = ox * dx + oy * dy + oz * dz
@@ -121,42 +160,28 @@ def hit_object(geometry, ox, oy, oz, dx, dy, dz):
         return nearest, part, nx, ny, nz
     m = geometry.to_local
     for i in range(len(geometry.kinds)):
-        px = m[i, 0, 0] * ox + m[i, 0, 1] * oy + m[i, 0, 2] * oz + m[i, 0, 3]
-        py = m[i, 1, 0] * ox + m[i, 1, 1] * oy + m[i, 1, 2] * oz + m[i, 1, 3]
-        pz = m[i, 2, 0] * ox + m[i, 2, 1] * oy + m[i, 2, 2] * oz + m[i, 2, 3]
-        qx = m[i, 0, 0] * dx + m[i, 0, 1] * dy + m[i, 0, 2] * dz
-        qy = m[i, 1, 0] * dx + m[i, 1, 1] * dy + m[i, 1, 2] * dz
-        qz = m[i, 2, 0] * dx + m[i, 2, 1] * dy + m[i, 2, 2] * dz
+        px, py, pz = moved(m[i], ox, oy, oz)
+        qx, qy, qz = turned(m[i], dx, dy, dz)
         if geometry.kinds[i] == ELLIPSOID:
-            t, lx, ly, lz = _hit_ball(px, py, pz, qx, qy, qz)
+            t, lx, ly, lz = hit_ball(px, py, pz, qx, qy, qz)
         else:
             t, lx, ly, lz = _hit_frustum(px, py, pz, qx, qy, qz, geometry.tapers[i])
         if t < nearest:
-            nearest, part = t, i
-            # Normals transform by the transpose of the map into the local frame.
-            nx = m[i, 0, 0] * lx + m[i, 1, 0] * ly + m[i, 2, 0] * lz
-            ny = m[i, 0, 1] * lx + m[i, 1, 1] * ly + m[i, 2, 1] * lz
-            nz = m[i, 0, 2] * lx + m[i, 1, 2] * ly + m[i, 2, 2] * lz
+            nearest, part, nx, ny, nz = t, i, lx, ly, lz
     if part >= 0:
-        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / norm, ny / norm, nz / norm
+        nx, ny, nz = world_normal(m[part], nx, ny, nz)
     return nearest, part, nx, ny, nz
-
-
-@inlined
-def _soft_sign(x):
-    return x / math.sqrt(1 + x * x)
 
 
 @inlined
 def _pattern(kind, frequency, phase, x, y, z):
     """Mixing weight of the second colour, 0 to 1, at a local point."""
-    if kind == BANDS:
-        return 0.5 + 0.5 * _soft_sign(5 * math.sin(frequency * y + phase))
+    if kind == STRIPES:
+        return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * y + phase))
     if kind == CHECKS:
         around = math.sin(round(frequency / 2) * math.atan2(x, z) + phase)
-        return 0.5 + 0.5 * _soft_sign(8 * around * math.sin(frequency * y + phase))
-    if kind == WAVES:
+        return 0.5 + 0.5 * soft_sign(8 * around * math.sin(frequency * y + phase))
+    if kind == RIPPLES:
         first = math.sin(frequency * (x + 0.6 * z) + phase)
         return 0.5 + 0.25 * (first + math.sin(1.3 * frequency * (y - 0.5 * x + 0.3 * z) + 2 * phase))
     return 0.0
@@ -164,10 +189,7 @@ def _pattern(kind, frequency, phase, x, y, z):
 
 @inlined
 def _object_color(geometry, patch, part, x, y, z, nx, nz):
-    m = geometry.to_local
-    lx = m[part, 0, 0] * x + m[part, 0, 1] * y + m[part, 0, 2] * z + m[part, 0, 3]
-    ly = m[part, 1, 0] * x + m[part, 1, 1] * y + m[part, 1, 2] * z + m[part, 1, 3]
-    lz = m[part, 2, 0] * x + m[part, 2, 1] * y + m[part, 2, 2] * z + m[part, 2, 3]
+    lx, ly, lz = moved(geometry.to_local[part], x, y, z)
     if part == patch.part and patch.heights[0] < ly < patch.heights[1]:
         facing = nx * patch.facing[0] + nz * patch.facing[2]
         if facing > PATCH_EDGE:
@@ -175,12 +197,7 @@ def _object_color(geometry, patch, part, x, y, z, nx, nz):
             rim = facing < 0.8 or abs(ly - middle) > 0.4 * (patch.heights[1] - patch.heights[0])
             return (0.95, 0.95, 0.95) if rim else (patch.color[0], patch.color[1], patch.color[2])
     w = _pattern(geometry.textures[part, 0], geometry.textures[part, 1], geometry.textures[part, 2], lx, ly, lz)
-    c = geometry.colors
-    return (
-        c[part, 0, 0] + w * (c[part, 1, 0] - c[part, 0, 0]),
-        c[part, 0, 1] + w * (c[part, 1, 1] - c[part, 0, 1]),
-        c[part, 0, 2] + w * (c[part, 1, 2] - c[part, 0, 2]),
-    )
+    return mixed(geometry.colors[part, 0], geometry.colors[part, 1], w)
 
 
 @inlined
@@ -190,9 +207,8 @@ def _ground_color(around, x, z):
     wave = math.sin(frequency * (cos * x + sin * z))
     if kind == CHECKS:
         wave *= math.sin(frequency * (cos * z - sin * x))
-    w = 0.5 + 0.5 * _soft_sign(6 * wave)
-    c = around.ground_colors
-    return c[0, 0] + w * (c[1, 0] - c[0, 0]), c[0, 1] + w * (c[1, 1] - c[0, 1]), c[0, 2] + w * (c[1, 2] - c[0, 2])
+    w = 0.5 + 0.5 * soft_sign(6 * wave)
+    return mixed(around.ground_colors[0], around.ground_colors[1], w)
 
 
 @inlined
@@ -203,7 +219,7 @@ def _dome_color(around, x, y, z):
     sin_fourfold = 4 * sin * cos * (1 - 2 * sin * sin)
     hue = 2 * math.pi * (around.hue + 0.17 * sin)
     rise = max(0.0, min(1.0, (y - around.ground) / around.dome_radius))
-    value = 0.68 + 0.1 * _soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
+    value = 0.68 + 0.1 * soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
     cos_hue, sin_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue), 0.2 * (1 - 0.5 * rise) * math.sin(hue)
     # A third of a turn apart: red, green, blue.
     half_root_3 = 0.8660254037844386
@@ -251,10 +267,7 @@ def trace(geometry, around, patch, pose, rays):
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     for pixel in range(pixels):
         for sample in range(samples):
-            x, y, z = rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2]
-            dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
-            dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
-            dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
+            dx, dy, dz = turned(pose, rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2])
             red, green, blue, distance, seen = _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz)
             colors[pixel, 0] += red / samples
             colors[pixel, 1] += green / samples

@@ -6,11 +6,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from completesplat.data.toy.raytracing import SELF_INTERSECTION, Array, inlined, kernel
+from completesplat.data.toy.raytracing import (
+    CHECKS,
+    ELLIPSOID,
+    RIPPLES,
+    SELF_INTERSECTION,
+    STRIPES,
+    Array,
+    hit_ball,
+    inlined,
+    kernel,
+    mixed,
+    moved,
+    soft_sign,
+    turned,
+    world_normal,
+)
 
-BOX, BALL = 0, 1
-# What the first number of a texture says; the others are its frequency (radians per unit of length) and phase.
-PLAIN, STRIPES, TILES, RIPPLES = 0, 1, 2, 3
 FLOOR, CEILING = 2, 3
 WALLS = (0, 1, 4, 5)
 SHADOW = 0.45
@@ -60,35 +72,21 @@ def _hit_cube(ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def _hit_ball(ox, oy, oz, dx, dy, dz):
-    """Nearest hit (distance) of the unit ball, from outside."""
-    a = dx * dx + dy * dy + dz * dz
-    b = ox * dx + oy * dy + oz * dz
-    square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
-    t = (-b - math.sqrt(square)) / a if square > 0 else -1.0
-    return t if t > SELF_INTERSECTION else np.inf
-
-
-@inlined
 def _hit_solid(room, ox, oy, oz, dx, dy, dz):
     """Nearest solid along a ray: distance, solid (or -1), axis of the face of a box."""
     nearest, solid, face = np.inf, -1, 0
-    m, balls = room.to_local, room.bounding_balls
+    balls = room.bounding_balls
     square = dx * dx + dy * dy + dz * dz
     for i in range(len(room.solid_kinds)):
         cx, cy, cz = balls[i, 0] - ox, balls[i, 1] - oy, balls[i, 2] - oz
         along = cx * dx + cy * dy + cz * dz
         if (cx * cx + cy * cy + cz * cz - balls[i, 3]) * square > along * along:
             continue
-        px = m[i, 0, 0] * ox + m[i, 0, 1] * oy + m[i, 0, 2] * oz + m[i, 0, 3]
-        py = m[i, 1, 0] * ox + m[i, 1, 1] * oy + m[i, 1, 2] * oz + m[i, 1, 3]
-        pz = m[i, 2, 0] * ox + m[i, 2, 1] * oy + m[i, 2, 2] * oz + m[i, 2, 3]
-        qx = m[i, 0, 0] * dx + m[i, 0, 1] * dy + m[i, 0, 2] * dz
-        qy = m[i, 1, 0] * dx + m[i, 1, 1] * dy + m[i, 1, 2] * dz
-        qz = m[i, 2, 0] * dx + m[i, 2, 1] * dy + m[i, 2, 2] * dz
+        px, py, pz = moved(room.to_local[i], ox, oy, oz)
+        qx, qy, qz = turned(room.to_local[i], dx, dy, dz)
         axis = 0
-        if room.solid_kinds[i] == BALL:
-            t = _hit_ball(px, py, pz, qx, qy, qz)
+        if room.solid_kinds[i] == ELLIPSOID:
+            t = hit_ball(px, py, pz, qx, qy, qz)[0]
         else:
             t, axis = _hit_cube(px, py, pz, qx, qy, qz)
         if t < nearest:
@@ -111,23 +109,17 @@ def _hit_room(room, ox, oy, oz, dx, dy, dz):
 
 
 @inlined
-def _soft_sign(x):
-    return x / math.sqrt(1 + x * x)
-
-
-@inlined
-def _mixed(colors, first, texture, u, v):
+def _textured(colors, first, texture, u, v):
     """Colours `first` and `first` + 1 mixed by a texture's pattern."""
     kind, frequency, phase = texture[0], texture[1], texture[2]
     w = 0.0
     if kind == STRIPES:
-        w = 0.5 + 0.5 * _soft_sign(5 * math.sin(frequency * u + phase))
-    elif kind == TILES:
-        w = 0.5 + 0.5 * _soft_sign(8 * math.sin(frequency * u + phase) * math.sin(frequency * v + phase))
+        w = 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * u + phase))
+    elif kind == CHECKS:
+        w = 0.5 + 0.5 * soft_sign(8 * math.sin(frequency * u + phase) * math.sin(frequency * v + phase))
     elif kind == RIPPLES:
         w = 0.5 + 0.25 * (math.sin(frequency * (u + 0.4 * v) + phase) + math.sin(frequency * (v - 0.3 * u) + 2 * phase))
-    a, b = colors[first], colors[first + 1]
-    return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
+    return mixed(colors[first], colors[first + 1], w)
 
 
 @inlined
@@ -140,32 +132,26 @@ def _face_color(room, face, x, y, z):
             if min(u - decal[1], decal[2] - u, v - decal[3], decal[4] - v) < decal[5]:
                 rim = room.decal_colors[i, 0]
                 return rim[0], rim[1], rim[2]
-            return _mixed(room.decal_colors[i], 1, room.decal_textures[i], u, v)
-    return _mixed(room.colors[face], 0, room.textures[face], u, v)
+            return _textured(room.decal_colors[i], 1, room.decal_textures[i], u, v)
+    return _textured(room.colors[face], 0, room.textures[face], u, v)
 
 
 @inlined
 def _solid_look(room, solid, face, x, y, z):
     """Colour and normal of a point on a solid."""
     m, half = room.to_local[solid], room.solid_half_sizes[solid]
-    lx = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]
-    ly = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]
-    lz = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    lx, ly, lz = moved(m, x, y, z)
     u, v = lx * half[0], ly * half[1]
-    if room.solid_kinds[solid] != BALL:
+    if room.solid_kinds[solid] != ELLIPSOID:
         if face == 0:
             u, lx, ly, lz = lz * half[2], math.copysign(1.0, lx), 0.0, 0.0
         elif face == 1:
             v, lx, ly, lz = lz * half[2], 0.0, math.copysign(1.0, ly), 0.0
         else:
             lx, ly, lz = 0.0, 0.0, math.copysign(1.0, lz)
-    # Normals transform by the transpose of the map into the local frame.
-    nx = m[0, 0] * lx + m[1, 0] * ly + m[2, 0] * lz
-    ny = m[0, 1] * lx + m[1, 1] * ly + m[2, 1] * lz
-    nz = m[0, 2] * lx + m[1, 2] * ly + m[2, 2] * lz
-    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-    red, green, blue = _mixed(room.solid_colors[solid], 0, room.solid_textures[solid], u, v)
-    return red, green, blue, nx / norm, ny / norm, nz / norm
+    nx, ny, nz = world_normal(m, lx, ly, lz)
+    red, green, blue = _textured(room.solid_colors[solid], 0, room.solid_textures[solid], u, v)
+    return red, green, blue, nx, ny, nz
 
 
 @inlined
@@ -207,9 +193,7 @@ def trace_room(room, pose, intrinsics, height, width, samples):
             for sample in range(samples * samples):
                 x = (column + (sample % samples + 0.5) / samples - intrinsics[2]) / intrinsics[0]
                 y = (row + (sample // samples + 0.5) / samples - intrinsics[3]) / intrinsics[1]
-                dx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]
-                dy = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2]
-                dz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2]
+                dx, dy, dz = turned(pose, x, y, 1.0)
                 # The direction's component along the optical axis is 1, so its length in t is the depth.
                 red, green, blue, t = _shade(room, ox, oy, oz, dx, dy, dz)
                 colors[row, column, 0] += red / samples**2

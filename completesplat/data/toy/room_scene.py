@@ -1,26 +1,14 @@
 """Draws one toy room: size, looks, furniture, and how a camera moves through it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from completesplat.data.toy.object_scene import color, rotation_about
-from completesplat.data.toy.raytracing import Array
-from completesplat.data.toy.room_raytracing import (
-    BALL,
-    BOX,
-    CEILING,
-    FLOOR,
-    PLAIN,
-    RIPPLES,
-    STRIPES,
-    TILES,
-    WALLS,
-    Room,
-    trace_room,
-)
+from completesplat.data.toy.object_scene import UP, Look, Part, Point, color, rotation_about
+from completesplat.data.toy.raytracing import BOX, CHECKS, ELLIPSOID, PLAIN, RIPPLES, STRIPES, Array
+from completesplat.data.toy.room_raytracing import CEILING, FLOOR, WALLS, Room, trace_room
 from completesplat.geometry.cameras import invert_rigid, look_at
 
 GAP = 0.05
@@ -28,20 +16,8 @@ ATTEMPTS = 100
 
 
 @dataclass(frozen=True)
-class Solid:
-    """One box or ellipsoid: its centre, half sizes, turn about the vertical, its look."""
-
-    kind: int
-    center: Array
-    half_sizes: Array
-    yaw: float
-    colors: Array
-    texture: Array
-
-    def to_local(self) -> Array:
-        """[3 4] map from the room's frame to the unit shape's."""
-        linear = rotation_about("y", self.yaw).T / self.half_sizes[:, None]
-        return np.concatenate([linear, -linear @ self.center[:, None]], axis=1)
+class Solid(Part):
+    """One box or ellipsoid that is turned about the vertical."""
 
     def bounding_ball(self) -> Array:
         """Centre and squared radius [4]."""
@@ -49,33 +25,29 @@ class Solid:
 
     def distances(self, points: Array) -> Array:
         """How far the points [n 3] are from the (bounding) box; 0 inside."""
-        outside = np.abs((points - self.center) @ rotation_about("y", self.yaw)) - self.half_sizes
-        return np.linalg.norm(outside.clip(0), axis=-1)
+        outside = np.abs((points - self.center) @ self.axes) - self.half_sizes
+        distances: Array = np.linalg.norm(outside.clip(0), axis=-1)
+        return distances
 
     def ground_extent(self) -> tuple[Array, Array]:
         """Lower and upper corner (x, z) of the rectangle that its shadow at noon lies in."""
-        reach = np.abs(rotation_about("y", self.yaw)) @ self.half_sizes
+        reach = np.abs(self.axes) @ self.half_sizes
         return (self.center - reach)[[0, 2]], (self.center + reach)[[0, 2]]
-
-    def moved(self, yaw: float, shift: Array) -> "Solid":
-        """After a turn about the vertical axis through the origin, then a shift."""
-        return replace(self, center=rotation_about("y", yaw) @ self.center + shift, yaw=self.yaw + yaw)
 
 
 Piece = list[Solid]
-Look = tuple[Array, Array]
 
 
 def _look(rng: np.random.Generator) -> Look:
     hue, saturation = rng.uniform(), rng.uniform(0.2, 0.8)
     first = color(hue, saturation, rng.uniform(0.6, 0.95))
     second = color(hue + rng.uniform(-0.08, 0.08), saturation, rng.uniform(0.3, 0.55))
-    pattern = rng.choice([PLAIN, STRIPES, TILES, RIPPLES])
+    pattern = rng.choice([PLAIN, STRIPES, CHECKS, RIPPLES])
     return np.stack([first, second]), np.array([pattern, rng.uniform(10, 22), rng.uniform(0, 2 * np.pi)])
 
 
-def _solid(kind: int, center: tuple[float, float, float], half: tuple[float, float, float], look: Look) -> Solid:
-    return Solid(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), 0.0, *look)
+def _solid(kind: int, center: Point, half: Point, look: Look) -> Solid:
+    return Solid(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), np.eye(3), 0.0, *look)
 
 
 def cabinet(rng: np.random.Generator) -> Piece:
@@ -108,7 +80,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 def pouf(rng: np.random.Generator) -> Piece:
     """An ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
-    return [_solid(BALL, (0, half[1], 0), half, _look(rng))]
+    return [_solid(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 
 
 def lamp(rng: np.random.Generator) -> Piece:
@@ -119,7 +91,7 @@ def lamp(rng: np.random.Generator) -> Piece:
         _solid(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look),
         _solid(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look),
     ]
-    return [*foot, _solid(BALL, (0, top + shade[1], 0), shade, _look(rng))]
+    return [*foot, _solid(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
 
 
 PIECES = (cabinet, table, sofa, pouf, lamp)
@@ -151,15 +123,16 @@ def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
     """With the back to a wall in four cases of five, anywhere and turned freely otherwise; it may overlap others."""
     along_wall = rng.uniform() < 0.8
     yaw = float(rng.integers(4) * np.pi / 2) if along_wall else float(rng.uniform(0, 2 * np.pi))
-    turned = [solid.moved(yaw, np.zeros(3)) for solid in piece]
+    rotation = rotation_about("y", yaw)
+    turned = [solid.moved(rotation, np.zeros(3)) for solid in piece]
     low, high = _ground_extent(turned)
     free = size[[0, 2]] / 2 - GAP
     shift = rng.uniform(-free - low, free - high)
     if along_wall:
-        back = rotation_about("y", yaw)[[0, 2], 2] * -1
+        back = rotation[[0, 2], 2] * -1
         axis = int(np.abs(back).argmax())
         shift[axis] = free[axis] - high[axis] if back[axis] > 0 else -free[axis] - low[axis]
-    return [solid.moved(0.0, np.array([shift[0], 0.0, shift[1]])) for solid in turned]
+    return [solid.moved(np.eye(3), np.array([shift[0], 0.0, shift[1]])) for solid in turned]
 
 
 MARGIN = 0.3
@@ -168,10 +141,10 @@ LOWEST, HIGHEST = 1.0, 1.7
 STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
 WAYPOINTS = 4
+SAMPLES = 3
 FIELD_OF_VIEW = (55, 75)
 DENSE = 400
 ASPECT = 16 / 9
-UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -240,7 +213,8 @@ def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequenc
         times = np.interp(reached, lengths, dense)
         centers = np.polynomial.polynomial.polyval(times, cubic).T
         slopes = np.polynomial.polynomial.polyval(times, np.polynomial.polynomial.polyder(cubic)).T
-        if _is_free(centers, size, furniture) and _largest_turn(slopes) < LARGEST_TURN:
+        yaw = np.unwrap(np.arctan2(slopes[:, 0], slopes[:, 2]))
+        if _is_free(centers, size, furniture) and np.abs(np.diff(yaw)).max() < LARGEST_TURN:
             return np.ascontiguousarray(centers), slopes
         stride *= 0.99
 
@@ -251,9 +225,8 @@ def _waypoints(rng: np.random.Generator, size: Array, stride: float) -> Array:
     first = np.arctan2(-start[0], -start[1]) + rng.uniform(-np.pi / 4, np.pi / 4)
     heading = np.cumsum(np.append(first, rng.uniform(-np.pi / 3, np.pi / 3, WAYPOINTS - 2)))
     steps = stride * rng.uniform(0.7, 1.3, WAYPOINTS - 1)
-    x, z = np.cumsum(
-        np.stack([start, *np.stack([np.sin(heading), np.cos(heading)], axis=1) * steps[:, None]]), axis=0
-    ).T
+    moves = steps[:, None] * np.stack([np.sin(heading), np.cos(heading)], axis=1)
+    x, z = np.cumsum(np.stack([start, *moves]), axis=0).T
     heights = rng.uniform(1.1, 1.6) + rng.normal(0, 0.05, WAYPOINTS)
     return np.stack([x, heights, z], axis=1)
 
@@ -262,16 +235,6 @@ def _is_free(centers: Array, size: Array, furniture: Sequence[Solid]) -> bool:
     inside = np.abs(centers[:, [0, 2]]) <= size[[0, 2]] / 2 - MARGIN
     high = (centers[:, 1] >= LOWEST) & (centers[:, 1] <= HIGHEST)
     return bool(inside.all() and high.all() and all((s.distances(centers) >= MARGIN).all() for s in furniture))
-
-
-def _largest_turn(tangents: Array) -> float:
-    yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2]))
-    return float(np.abs(np.diff(yaw)).max())
-
-
-SAMPLES = 3
-
-Decal = tuple[Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -293,12 +256,15 @@ def draw_room_scene(rng: np.random.Generator, frames: int) -> RoomScene:
 def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> tuple[Array, Array]:
     """Picture [height width 3] and depth [height width], along the optical axis in room lengths, of one frame."""
     intrinsics = scene.move.intrinsics(height, width) * np.array([width, height, width, height])
-    return trace_room(scene.room, scene.move.camera_to_room[frame], intrinsics, height, width, SAMPLES)
+    picture, depth = trace_room(scene.room, scene.move.camera_to_room[frame], intrinsics, height, width, SAMPLES)
+    return picture, depth
 
 
 def _room(rng: np.random.Generator, size: Array, furniture: tuple[Solid, ...]) -> Room:
     colors, textures = _faces(rng)
-    decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, _decal_kinds(rng), strict=True)]
+    # One thing on each wall: always a window, a door and a picture, and one more picture or window.
+    kinds = rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))])
+    decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, kinds, strict=True)]
     places, decal_colors, decal_textures = (np.stack(parts) for parts in zip(*decals, strict=True))
     return Room(
         size=size,
@@ -328,17 +294,12 @@ def _faces(rng: np.random.Generator) -> tuple[Array, Array]:
         saturation = {FLOOR: 0.5, CEILING: 0.06}.get(face, 0.25) * rng.uniform(0.6, 1.4)
         darker = 0.93 if face == CEILING else rng.uniform(0.6, 0.8)
         colors[face] = color(own, saturation, value), color(own + 0.05, 1.3 * saturation, darker * value)
-        pattern = rng.choice([STRIPES, TILES] if face in (FLOOR, CEILING) else [STRIPES, TILES, RIPPLES])
+        pattern = rng.choice([STRIPES, CHECKS] if face in (FLOOR, CEILING) else [STRIPES, CHECKS, RIPPLES])
         textures[face] = pattern, rng.uniform(6, 13), rng.uniform(0, 2 * np.pi)
     return colors, textures
 
 
-def _decal_kinds(rng: np.random.Generator) -> list[str]:
-    """One thing on each wall: always a window, a door and a picture, and one more picture or window."""
-    return list(rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))]))
-
-
-def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> Decal:
+def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> tuple[Array, Array, Array]:
     """Place [6], colours [3 3] and texture [3] of a rectangle on a wall."""
     half_width, low, high = {
         "window": (rng.uniform(0.4, 0.8), rng.uniform(0.8, 1.0), rng.uniform(1.8, 2.2)),
@@ -353,6 +314,6 @@ def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> Decal
         "door": (np.full(3, 0.3), color(0.08, 0.6, rng.uniform(0.4, 0.8)), color(0.08, 0.6, 0.4)),
         "picture": (color(hue + 0.5, 0.5, 0.25), color(hue, 0.8, 0.95), color(hue + rng.uniform(0.2, 0.8), 0.8, 0.8)),
     }[kind]
-    pattern = {"window": RIPPLES, "door": PLAIN, "picture": rng.choice([STRIPES, TILES, RIPPLES])}[kind]
+    pattern = {"window": RIPPLES, "door": PLAIN, "picture": rng.choice([STRIPES, CHECKS, RIPPLES])}[kind]
     place = np.array([wall, middle - half_width, middle + half_width, low, high, 0.05])
     return place, np.stack([rim, first, second]), np.array([pattern, rng.uniform(4, 14), rng.uniform(0, 2 * np.pi)])

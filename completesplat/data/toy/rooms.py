@@ -14,8 +14,9 @@ from PIL import Image
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.writing import in_processes, write_once
-from completesplat.errors import DataError
 
+ROOMS = "toy_rooms"
+LATEST_START = 9000
 FRAMES_PER_SECOND = 30
 MICROSECONDS = 1_000_000
 CLIPS_PER_CHUNK = 16
@@ -36,8 +37,7 @@ class ClipFiles:
     cameras: NDArray[np.float32]
 
     @property
-    def url(self) -> str:
-        """An address that is nobody's video."""
+    def url(self) -> str:  # nobody's video
         return f"https://example.com/toy/{self.key}"
 
     def picture(self, frame: int) -> Path:
@@ -72,12 +72,9 @@ def write_picture(path: Path, image: Array) -> None:
 def write_chunks(folder: Path, clips: list[ClipFiles]) -> None:
     """Write `folder`/NNNNNN.torch from the text form's frames, and `folder`/index.json."""
     folder.mkdir(parents=True)
-    index: dict[str, str] = {}
-    for number, first in enumerate(range(0, len(clips), CLIPS_PER_CHUNK)):
-        members = clips[first : first + CLIPS_PER_CHUNK]
-        name = f"{number:06d}.torch"
-        torch.save([_chunk_entry(clip) for clip in members], folder / name)
-        index |= {clip.key: name for clip in members}
+    index = {clip.key: f"{number // CLIPS_PER_CHUNK:06d}.torch" for number, clip in enumerate(clips)}
+    for name in sorted(set(index.values())):
+        torch.save([_chunk_entry(clip) for clip in clips if index[clip.key] == name], folder / name)
     (folder / "index.json").write_text(json.dumps(index) + "\n")
 
 
@@ -92,30 +89,18 @@ def _chunk_entry(clip: ClipFiles) -> dict[str, Any]:
     }
 
 
-ROOMS = "toy_rooms"
-FORMAT_VERSION = 1
-LATEST_START = 9000
-
-
 def write_rooms(
     out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
 ) -> Path:
     """Write `scenes` clips of `frames` pictures, `size` high and 16 / 9 as wide, with poses and intrinsics.
 
     `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg, `chunks`/<split>/ the same clips in NNNNNN.torch with
-    index.json. Every tenth clip, from the first, is in the split `test`, the others in `train`. The bytes depend on
-    `scenes`, `frames`, `size` and `seed` only, not on `workers` (processes; by default one a core). A folder that holds
-    the same set already is kept.
-
-    Returns:
-        The folder, `out`/toy_rooms.
+    index.json. Every tenth clip, from the first, is in the split `test`, the others in `train`. See `write_once`, which
+    takes the numbers; `workers` are processes (by default one a core). Returns the folder, `out`/toy_rooms.
 
     Raises:
         DataError: a number that is too small, or a folder with other content.
     """
-    if scenes < 2 or frames < 2 or size < 8:
-        raise DataError(f"toy rooms need scenes >= 2, frames >= 2 and size >= 8, not {scenes}, {frames} and {size}")
-    parameters = {"format": FORMAT_VERSION, "scenes": scenes, "frames": frames, "size": size, "seed": seed}
     splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
 
     def fill(folder: Path) -> None:
@@ -124,7 +109,7 @@ def write_rooms(
         for split in ("train", "test"):
             write_chunks(folder / "chunks" / split, [clip for clip in clips if clip.folder.name == split])
 
-    return write_once(out / ROOMS, parameters, fill, progress)
+    return write_once(out / ROOMS, fill, progress, 2, scenes=scenes, frames=frames, size=size, seed=seed)
 
 
 def _write_clip(text: Path, frames: int, size: int, seed: int, index: int, split: str) -> ClipFiles:

@@ -15,19 +15,31 @@ from rich.progress import track
 
 from completesplat.errors import DataError
 
+FORMAT_VERSION = 1
+
 Result = TypeVar("Result")
 
 
-def write_once(folder: Path, parameters: dict[str, int], fill: Callable[[Path], None], progress: bool) -> Path:
-    """Make `folder` and let `fill` write into it; `toy.json` in it, written last, holds the parameters.
+def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewest: int, **numbers: int) -> Path:
+    """Make `folder` and let `fill` write into it; `toy.json` in it, written last, holds the numbers.
 
-    A folder that was made with the same parameters is kept as it is.
+    The bytes depend on nothing but `scenes` (at least `fewest`), `frames`, `size` and `seed`. A folder that was made
+    with the same numbers is kept as it is.
 
     Raises:
-        DataError: the folder holds something else.
+        DataError: a number that is too small, or the folder holds something else.
     """
+    least = {"scenes": fewest, "frames": 2, "size": 8}
+    if any(numbers[name] < number for name, number in least.items()):
+        raise DataError(f"{folder.name} need at least {least}, not {numbers}")
+    parameters = {"format": FORMAT_VERSION, **numbers}
     if folder.exists():
-        _check_same(folder, parameters)
+        try:
+            found = json.loads((folder / "toy.json").read_text())
+        except (OSError, ValueError):
+            found = None
+        if found != parameters:
+            raise DataError(f"{folder} already holds something else: remove it or choose another folder")
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
@@ -39,15 +51,6 @@ def write_once(folder: Path, parameters: dict[str, int], fill: Callable[[Path], 
     (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
     unfinished.rename(folder)
     return folder
-
-
-def _check_same(folder: Path, parameters: dict[str, int]) -> None:
-    try:
-        found = json.loads((folder / "toy.json").read_text())
-    except (OSError, ValueError):
-        found = None
-    if found != parameters:
-        raise DataError(f"{folder} already holds something else: remove it or choose another folder")
 
 
 def in_processes(

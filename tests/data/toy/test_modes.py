@@ -4,20 +4,22 @@ import json
 import shutil
 from itertools import combinations
 
+import numpy as np
 import pytest
 import torch
 
 from completesplat.data.hidden_modes import hidden_modes
-from completesplat.data.toy.modes import DIFFERENCE, SAME_PICTURE
+from completesplat.data.toy.modes import DIFFERENCE, SAME_PICTURE, frame_camera, unseen
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
-from completesplat.data.toy.object_scene import PATCH_COLORS
+from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import pixel_centers, project, unproject
 
 
-def scenes_of(root, views=2, spread_views=3, **settings):
-    module = ToyObjectsDataModule(str(root), **{"image_size": 32} | settings)
+def scenes_of(root, views=2, image_size=32):
+    module = ToyObjectsDataModule(str(root), image_size=image_size)
     module.setup("test")
-    return hidden_modes(module, views, spread_views), module
+    return hidden_modes(module, views, spread_views=3), module
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +61,7 @@ def test_the_reference_does_not_show_the_patch(scene):
 
 
 def test_views_look_at_the_back(toy_root):
-    scene = scenes_of(toy_root, views=1, spread_views=3)[0][0]
+    scene = scenes_of(toy_root, views=1)[0][0]
     (view,) = scene.views
     # In the frame of the reference, which looks along z.
     axes = scene.scene.targets.cameras.world_to_camera[0, :, 2, :3]
@@ -75,30 +77,55 @@ def test_a_front_that_tells_the_colour_is_refused(toy_root):
         scenes[0]
 
 
-def test_other_data_are_refused(tmp_path):
-    rooms = ToyRoomsDataModule(str(tmp_path))
+def test_other_data_are_refused(toy_root, tmp_path):
     with pytest.raises(CompleteSplatError, match="needs data whose hidden parts are known: toy objects"):
-        hidden_modes(rooms, 1, 1)
-
-
-def changed(toy_root, tmp_path, **parameters):
-    shutil.copytree(toy_root, tmp_path / "copy")
-    path = tmp_path / "copy/toy_objects/toy.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | parameters))
-    return tmp_path / "copy"
-
-
-def test_scenes_of_other_numbers_are_refused(toy_root, tmp_path):
-    scenes, _ = scenes_of(changed(toy_root, tmp_path, seed=6))
+        hidden_modes(ToyRoomsDataModule(str(tmp_path)), 1, 1)
+    copy = shutil.copytree(toy_root, tmp_path / "copy")
+    path = copy / "toy_objects/toy.json"
+    numbers = json.loads(path.read_text())
+    path.write_text(json.dumps(numbers | {"seed": 6}))
+    scenes, _ = scenes_of(copy)
     with pytest.raises(CompleteSplatError, match=r"not the scene that toy\.json describes") as refusal:
         scenes[0]
     assert not isinstance(refusal.value, DataError)  # which would be skipped
-
-
-def test_another_version_or_nothing_written_down_is_refused(toy_root, tmp_path):
-    copy = changed(toy_root, tmp_path, format=0)
+    path.write_text(json.dumps(numbers | {"format": 0}))
     with pytest.raises(DataError, match="another version"):
         scenes_of(copy)
-    (copy / "toy_objects/toy.json").unlink()
+    path.unlink()
     with pytest.raises(DataError, match=r"no toy\.json"):
         scenes_of(copy)
+
+
+SIZE, FRAMES = 48, 8
+SCENE = draw_scene(np.random.default_rng([5, 1]), FRAMES)
+
+
+def test_a_frame_shows_all_of_itself():
+    assert not unseen(SCENE, 3, 3, SIZE).any()
+
+
+def seen_in(frame: int, reference: int) -> tuple[torch.Tensor, ...]:
+    """Of the points that a frame shows: their colours, and where and how far ahead the reference has them."""
+    camera, other = (frame_camera(SCENE, index, SIZE) for index in (frame, reference))
+    colors, _, depth = (torch.from_numpy(part) for part in render_frame(SCENE, frame, SIZE))
+    points = unproject(camera, pixel_centers(SIZE, SIZE, dtype=torch.float64).flatten(0, 1), depth.flatten())
+    pixels, ahead = project(other, points)
+    within = (ahead > 0) & (pixels >= 0).all(-1) & (pixels < SIZE).all(-1)
+    columns, rows = pixels.clamp(0, SIZE - 1e-6).floor().long().unbind(-1)
+    return colors.flatten(0, 1), rows, columns, ahead, within
+
+
+def test_what_is_seen_looks_the_same_in_both_frames_and_what_is_not_does_not():
+    colors, rows, columns, _, _ = seen_in(1, reference=0)
+    differences = (torch.from_numpy(render_frame(SCENE, 0, SIZE)[0])[rows, columns] - colors).abs().amax(-1)
+    hidden = unseen(SCENE, 0, 1, SIZE).flatten()
+    assert 0.1 < hidden.float().mean() < 0.9
+    assert differences[~hidden].median() < 0.02
+    assert differences[hidden].median() > 0.05
+
+
+def test_visibility_agrees_with_a_comparison_of_depth_maps_save_at_edges():
+    _, rows, columns, ahead, within = seen_in(2, reference=0)
+    nearest = torch.from_numpy(render_frame(SCENE, 0, SIZE)[2])[rows, columns]
+    by_depth = ~(within & (ahead < 1.05 * nearest))
+    assert (by_depth == unseen(SCENE, 0, 2, SIZE).flatten()).float().mean() > 0.95

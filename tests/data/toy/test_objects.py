@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,11 +45,6 @@ def test_bytes_depend_on_the_seed_and_not_on_the_workers(tmp_path):
     assert not {trees["one"][path] for path in pictures} & set(trees["other"].values())
 
 
-def test_more_scenes_begin_with_the_same_scenes():
-    first, again = (draw_scene(np.random.default_rng([0, 5]), frames=3) for _ in range(2))
-    assert np.array_equal(render_frame(first, 1, 16)[0], render_frame(again, 1, 16)[0])
-
-
 def test_a_complete_set_is_kept_and_other_content_refused(tmp_path, capsys):
     settings = {"scenes": 1, "frames": 2, "size": 8, "seed": 0, "workers": 1}
     category = write_objects(tmp_path, **settings, progress=False)
@@ -58,8 +54,6 @@ def test_a_complete_set_is_kept_and_other_content_refused(tmp_path, capsys):
     assert {path: path.stat().st_mtime_ns for path in category.rglob("*")} == before
     with pytest.raises(DataError, match="toy_objects"):
         write_objects(tmp_path, **{**settings, "seed": 1}, progress=False)
-    with pytest.raises(DataError, match="frames"):
-        write_objects(tmp_path / "new", **{**settings, "frames": 1}, progress=False)
 
 
 def test_an_interrupted_run_is_made_anew(tmp_path):
@@ -81,7 +75,6 @@ def test_splits_share_no_sequence_and_list_every_frame(toy_root):
 
 
 def test_depth_of_one_view_predicts_another_views_depth(tmp_path):
-    """Points seen in one frame project into the next at a depth between those stored around there, unless hidden."""
     write_objects(tmp_path, scenes=2, frames=12, size=48, seed=5, workers=1, progress=False)
     annotations = annotations_of(tmp_path)
     for first, second in ((annotations[3], annotations[4]), (annotations[20], annotations[19])):
@@ -100,7 +93,6 @@ def test_depth_of_one_view_predicts_another_views_depth(tmp_path):
 
 
 def test_points_lie_on_the_object(toy_root):
-    """Where the mask is full, the nearest depth of the projected point cloud is the depth map's."""
     annotation = annotations_of(toy_root)[0]
     camera = camera_from_viewpoint(annotation["viewpoint"], annotation["image"]["size"])
     depth, folder = read_depth(toy_root, annotation), toy_root / "toy_objects" / annotation["sequence_name"]
@@ -125,15 +117,14 @@ def test_masks_are_soft_at_the_outline_and_mass_is_their_sum(toy_root):
         assert annotation["mask"]["mass"] == pytest.approx(mask.sum(), abs=0.002 * mask.size)
 
 
-@pytest.mark.parametrize("index", range(12))
+@pytest.mark.parametrize("index", range(6))
 def test_the_patch_is_hidden_from_the_first_frame_and_seen_from_another(index):
-    """The patch is found by rendering a scene twice, with two patch colours."""
     scene = draw_scene(np.random.default_rng([1, index]), frames=12)
-    repainted = scene.patch._replace(color=1 - scene.patch.color)
+    repainted = replace(scene, patch=scene.patch._replace(color=1 - scene.patch.color))
 
     def changed(frame: int) -> int:
-        other = render_frame(type(scene)(**{**vars(scene), "patch": repainted}), frame, 32)[0]
-        return int((np.abs(other - render_frame(scene, frame, 32)[0]).max(axis=-1) > 0.05).sum())
+        one, other = (render_frame(each, frame, 32)[0] for each in (scene, repainted))
+        return int((np.abs(other - one).max(axis=-1) > 0.05).sum())
 
     assert changed(0) == 0
     assert max(changed(frame) for frame in (5, 6, 7)) > 10
@@ -141,7 +132,6 @@ def test_the_patch_is_hidden_from_the_first_frame_and_seen_from_another(index):
 
 
 def test_all_sides_of_an_object_differ():
-    """From behind, an object is far from its front picture: more than a tenth of its pixels change strongly."""
     for index in range(4):
         scene = draw_scene(np.random.default_rng([2, index]), frames=4)
         (front, mask, _), (back, _, _) = render_frame(scene, 0, 32), render_frame(scene, 2, 32)
@@ -149,13 +139,14 @@ def test_all_sides_of_an_object_differ():
 
 
 def test_both_families_and_all_patch_colors_occur():
-    scenes = [draw_scene(np.random.default_rng([0, index]), frames=2) for index in range(40)]
+    scenes = [draw_scene(np.random.default_rng([0, index]), frames=2) for index in range(20)]
     assert {scene.family for scene in scenes} == {"bear", "hydrant"}
     assert {scene.patch_color for scene in scenes} == set(PATCH_COLORS)
 
 
 def test_the_hidden_attribute_is_recorded(toy_root):
-    folders = {annotation["sequence_name"] for annotation in annotations_of(toy_root)}
-    records = {name: json.loads((toy_root / "toy_objects" / name / "toy.json").read_text()) for name in folders}
-    assert all(name.endswith(record["family"]) for name, record in records.items())
-    assert all(record["patch_color"] in PATCH_COLORS for record in records.values())
+    for annotation in annotations_of(toy_root):
+        name = annotation["sequence_name"]
+        record = json.loads((toy_root / "toy_objects" / name / "toy.json").read_text())
+        assert name.endswith(record["family"])
+        assert record["patch_color"] in PATCH_COLORS

@@ -10,13 +10,8 @@ import torch
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.rooms import (
-    CLIPS_PER_CHUNK,
-    clip_files,
-    write_chunks,
-    write_picture,
-    write_text,
-)
+from completesplat.data.toy.module import ToyRoomsDataModule
+from completesplat.data.toy.rooms import CLIPS_PER_CHUNK, clip_files, write_chunks, write_picture, write_text
 from completesplat.errors import DataError
 
 FRAMES = 4
@@ -57,27 +52,14 @@ def test_a_longer_set_begins_with_the_same_clips(rooms, tmp_path):
     assert sorted(path.stem for path in longer.glob("text/test/*.txt")) == ["room00000", "room00010"]
 
 
-def test_a_complete_set_is_kept_and_other_content_refused(rooms):
-    settings = {"scenes": 3, "frames": FRAMES, "size": 18, "seed": 0, "workers": 1, "progress": False}
-    before = {path: path.stat().st_mtime_ns for path in rooms.rglob("*")}
-    assert write_rooms(rooms.parent, **settings) == rooms
-    assert {path: path.stat().st_mtime_ns for path in rooms.rglob("*")} == before
-    with pytest.raises(DataError, match="toy_rooms already holds something else"):
-        write_rooms(rooms.parent, **{**settings, "frames": 5})
-    assert {path: path.stat().st_mtime_ns for path in rooms.rglob("*")} == before
+def test_the_folder_says_what_was_made_and_something_else_is_left_alone(rooms, tmp_path):
     description = json.loads((rooms / "toy.json").read_text())
     assert description == {"format": 1, "scenes": 3, "frames": FRAMES, "size": 18, "seed": 0}
-
-
-def test_a_folder_of_something_else_is_refused_and_an_interrupted_run_made_anew(tmp_path):
     (tmp_path / "toy_rooms").mkdir()
     (tmp_path / "toy_rooms" / "mine.txt").write_text("mine")
     with pytest.raises(DataError, match="choose another folder"):
         write_rooms(tmp_path, scenes=2, frames=2, size=8, seed=0, workers=1, progress=False)
     assert files_of(tmp_path) == {"toy_rooms/mine.txt": b"mine"}
-    (tmp_path / "new/.toy_rooms.unfinished/text/train/room00001").mkdir(parents=True)
-    folder = write_rooms(tmp_path / "new", scenes=2, frames=2, size=8, seed=0, workers=1, progress=False)
-    assert [path.name for path in folder.parent.iterdir()] == ["toy_rooms"]
 
 
 @pytest.mark.parametrize("small", [{"scenes": 1}, {"frames": 1}, {"size": 7}])
@@ -87,7 +69,6 @@ def test_numbers_that_are_too_small_are_refused(tmp_path, small):
 
 
 def test_text_form_is_as_published(rooms):
-    """Address, then lines of 19 numbers; 30 frames a second; a picture for each line; rotations are rotations."""
     for split, keys in SPLITS.items():
         folder = rooms / "text" / split
         assert sorted(path.name for path in folder.iterdir()) == sorted([*keys, *(f"{key}.txt" for key in keys)])
@@ -105,7 +86,6 @@ def test_text_form_is_as_published(rooms):
 
 
 def test_chunks_hold_what_the_text_form_holds(rooms):
-    """Same addresses, timestamps, cameras (to the last bit of float32) and bytes of pictures."""
     for split, keys in SPLITS.items():
         index = json.loads((rooms / "chunks" / split / "index.json").read_text())
         assert index == dict.fromkeys(keys, "000000.torch")
@@ -135,8 +115,24 @@ def test_many_clips_fill_several_chunks(tmp_path):
     index = json.loads((tmp_path / "chunks" / "index.json").read_text())
     files = sorted(set(index.values()))
     assert files == ["000000.torch", "000001.torch", "000002.torch"]
-    found = [
-        (clip["key"], name) for name in files for clip in torch.load(tmp_path / "chunks" / name, weights_only=True)
-    ]
-    assert found == list(index.items())
+    chunks = {name: torch.load(tmp_path / "chunks" / name, weights_only=True) for name in files}
+    assert [(clip["key"], name) for name, chunk in chunks.items() for clip in chunk] == list(index.items())
     assert list(index) == names
+
+
+SMALL = {"scenes": 4, "frames": 8, "height": 18, "image_size": 16, "batch_size": 2, "targets": 2, "evaluation_gap": 5}
+
+
+@pytest.mark.slow
+def test_a_module_makes_its_rooms_on_first_use_and_both_forms_hold_the_same(tmp_path):
+    scenes = []
+    for form, settings in (("text", SMALL), ("chunks", SMALL | {"scenes": 5})):
+        module = ToyRoomsDataModule(str(tmp_path), form=form, **settings)
+        module.prepare_data()
+        assert json.loads((tmp_path / "toy_rooms/toy.json").read_text())["scenes"] == 4
+        module.setup("test")
+        scenes.append(next(iter(module.test_dataloader())))
+    text, chunks = scenes
+    assert text.names == chunks.names
+    assert torch.equal(text.targets.images, chunks.targets.images)
+    torch.testing.assert_close(text.targets.cameras.world_to_camera, chunks.targets.cameras.world_to_camera)

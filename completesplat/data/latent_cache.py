@@ -2,7 +2,8 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -12,23 +13,101 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from completesplat.data.latent_cache.manifest import Array, CachedSequence, is_latent_cache, read_manifest
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
-from completesplat.data.packed.manifest import Scalar, differences
+from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as, write_json
 from completesplat.data.sequences import SequenceSource
-from completesplat.data.validation import ChangedFile, MissingFile, UnreadableFile, at, require_file
+from completesplat.data.validation import (
+    BadAnnotation,
+    ChangedFile,
+    MissingFile,
+    UnreadableFile,
+    at,
+    inside,
+    require_file,
+)
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene
 
+HEADER: dict[str, str | int] = {"format": 2, "kind": "latent_cache"}
+ARRAYS = ("mean", "log_variance", "condition")
+
+
+@dataclass(frozen=True)
+class Array:
+    """One `.npy` file; its first axis is the store's rows, one for each encoded picture."""
+
+    file: str
+    dtype: str
+    shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class CachedSequence:
+    """The rows of one sequence: from `first` on, one for each of the frames `stored` (places in the sequence)."""
+
+    name: str
+    frames: int
+    first: int
+    stored: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        # Strictly increasing from 0 on and below `frames`.
+        if not self.stored or any(b <= a for a, b in pairwise((-1, *self.stored, self.frames))):
+            raise BadAnnotation("stored frames must be places in the sequence, in order")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a store was made from. Another store with the same origin would hold the same."""
+
+    encoder: str  # fingerprints
+    conditioning: str | None  # the frozen one whose features are stored; None: pictures are
+    data: str
+    settings: dict[str, Scalar]  # of the data module: what pictures and splits depend on
+    image_size: int
+    frames: int | None  # the largest number of frames of a sequence, evenly spaced; None: all
+    precision: str
+
+
+@dataclass(frozen=True)
+class LatentCacheManifest:
+    """A whole store; `sequences` are those of the training set, in its order; `scale` is 1 / std of a latent."""
+
+    version: str
+    origin: Origin
+    scale: float
+    arrays: dict[str, Array]
+    sequences: tuple[CachedSequence, ...]
+
+    def __post_init__(self) -> None:
+        rows, shapes = sum(len(s.stored) for s in self.sequences), {n: a.shape for n, a in self.arrays.items()}
+        for true, reason in [
+            (set(shapes) == set(ARRAYS), f"arrays other than {', '.join(ARRAYS)}"),
+            (all(len(s) == 4 and s[0] == rows for s in shapes.values()), f"arrays without {rows} rows of 3 axes"),
+            (shapes.get("mean") == shapes.get("log_variance"), "means and log-variances of different shapes"),
+            (all(0 <= s.first <= rows - len(s.stored) for s in self.sequences), "rows outside of the arrays"),
+            (len({s.name for s in self.sequences}) == len(self.sequences), "two sequences of one name"),
+            (self.scale > 0, f"scale must be above 0, not {self.scale}"),
+        ]:
+            if not true:
+                raise BadAnnotation(reason)
+
+
+def is_latent_cache(root: Path) -> bool:
+    """Whether a folder holds a finished store."""
+    return (root / MANIFEST).is_file()
+
+
+def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
+    """Finish the store."""
+    write_json(root / MANIFEST, manifest, HEADER)
+
 
 class ArrayWriter:
-    """Writes rows of one shape behind each other; leaving the context puts their number into the header.
+    """Writes rows of the shape `row` behind each other; leaving the context puts their number into the header.
 
     After an exception the file is removed.
-
-    Args:
-        row: shape of a row.
     """
 
     def __init__(self, path: Path, row: tuple[int, ...], dtype: str) -> None:
@@ -74,8 +153,9 @@ def open_array(root: Path, array: Array) -> np.memmap:
     Raises:
         DataError: missing, cut short, or with another shape or type than the manifest says.
     """
-    path = require_file(root / array.file)
-    with at(file=path):
+    with at(file=root / MANIFEST):
+        path = inside(root, array.file)
+    with at(file=require_file(path)):
         try:
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
@@ -90,9 +170,8 @@ def open_array(root: Path, array: Array) -> np.memmap:
 class LatentCache:
     """The latent cache of a training set, opened.
 
-    Attributes:
-        scale: 1 / standard deviation of a latent drawn from the posteriors, over all elements of all stored frames.
-        arrays: memory-mapped "mean", "log_variance" and "condition", one row for each picture.
+    `scale` is 1 / standard deviation of a latent drawn from the posteriors, over all elements of all stored frames;
+    `arrays` are memory-mapped, with one row for each picture.
 
     Raises:
         DataError: no finished store, or one that is damaged.
@@ -102,32 +181,24 @@ class LatentCache:
         if not is_latent_cache(folder):
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
-        self.manifest = read_manifest(folder)
+        self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the pictures again")
         self.origin = self.manifest.origin
         self.scale = self.manifest.scale
         self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
-
-    @property
-    def latent_shape(self) -> tuple[int, ...]:
-        """Channels, height and width."""
-        return self.manifest.arrays["mean"].shape[1:]
-
-    @property
-    def holds_pictures(self) -> bool:
-        """Whether the conditions are pictures rather than features."""
-        return self.origin.conditioning is None
+        self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
+        self.holds_pictures = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
-        """One encoded frame, without batch axis; features as they were stored, in float32.
-
-        Args:
-            frame: place in the sequence.
+        """The frame at a place in a sequence, without batch axis; features as they were stored, in float32.
 
         Raises:
             DataError: it is not in the store.
         """
-        row = self._row(self.sequences[name], frame)
+        sequence = self.sequences[name]
+        if frame not in sequence.stored:
+            raise DataError("was not encoded", str(self.folder), name, frame)
+        row = sequence.first + sequence.stored.index(frame)
         mean, log_variance = self._floats("mean", row), self._floats("log_variance", row)
         if self.holds_pictures:
             # The same division as of pictures that are read, bit by bit.
@@ -138,30 +209,16 @@ class LatentCache:
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
-        """Refuse a store that was made from other pictures than `source` gives with these settings.
-
-        Raises:
-            DataError: another fingerprint, other settings, or other sequences.
-        """
+        """`must_be_of`, and refuse a store that was made with other settings too."""
         differing = differences(self.origin.settings, settings)
         if differing:
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
         self.must_be_of(source)
 
     def must_be_of(self, source: SequenceSource) -> None:
-        """Refuse a store that was made from another data set.
-
-        Raises:
-            DataError: another fingerprint, or other sequences.
-        """
+        """Refuse a store that was made from another data set, with `DataError`."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
-
-    def _row(self, sequence: CachedSequence, frame: int) -> int:
-        place = int(np.searchsorted(sequence.stored, frame))
-        if place == len(sequence.stored) or sequence.stored[place] != frame:
-            raise DataError("was not encoded", str(self.folder), sequence.name, frame)
-        return sequence.first + place
 
     def _floats(self, array: str, row: int) -> Float[Tensor, "_ _ _"]:
         return torch.from_numpy(np.array(self.arrays[array][row], dtype=np.float32))
@@ -175,14 +232,8 @@ class CachedTrainingScenes(TrainingScenes):
     """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
 
     Where only some frames of a sequence were encoded, the nearest of those that are there takes the reference's place
-    (the earlier one of two).
-
-    Args:
-        cache: where the items come from.
-        store: the training set, whose names and groups tell the order; it is not read.
-        choose: (number of a sequence's frames, random generator) -> views.
-        box_masks: hide parts of the pictures, as `augment` does; None for none.
-        references: items of a sequence in one epoch.
+    (the earlier one of two). The store's names and groups tell the order; it is not read. Box masks hide parts of the
+    pictures as `augment` does.
 
     Raises:
         CompleteSplatError: box masks, but the store holds features instead of pictures.

@@ -1,1 +1,0 @@
-"""Training pictures encoded once by the frozen autoreconstructor: a folder of memory-mapped arrays."""
