@@ -13,7 +13,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from completesplat import cli
-from completesplat.commands import conf_folder
+from completesplat.commands import conf_folder, refusal
+from completesplat.commands.jobs import start
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
@@ -58,6 +59,13 @@ def _composed_once(verb: str, *overrides: str) -> DictConfig:
 def compose_config(verb: str, *overrides: str) -> DictConfig:
     """The configuration of a verb, as the command line would compose it; a copy that a test may change."""
     return copy.deepcopy(_composed_once(verb, *overrides))
+
+
+def refused(verb: str, *overrides: object) -> str:
+    """The line with which a verb refuses its settings, without starting the command; empty for another exception."""
+    with pytest.raises(Exception) as caught:  # noqa: PT011
+        start(verb, compose_config(verb, *map(str, overrides)), Path("/nowhere"))
+    return refusal(caught.value) or ""
 
 
 def tiny_generator() -> CompleteSplat:

@@ -99,11 +99,8 @@ def run(command: str, folder) -> subprocess.CompletedProcess[str]:
 
 def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
     """A page is served until it is stopped: until its address is printed."""
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        program, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    )
-    assert process.stdout is not None
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(program, cwd=folder, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **streams)
     said = ""
     for line in process.stdout:
         said += line
