@@ -29,17 +29,18 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
             got, or scores at a smaller size, or at another one than that of prepared pictures.
         DataError: the protocol's files cannot be used.
     """
+    chosen = f"evaluation={evaluation['name']}"
     if "scoring" not in evaluation:
-        raise CompleteSplatError(f"evaluation={evaluation['name']}: fit scores pictures only; set test=false")
+        raise CompleteSplatError(f"{chosen}: fit scores pictures only; set test=false")
     for key, value in evaluation["data"].items():
         if key not in run_config.data:
-            raise CompleteSplatError(f"evaluation={evaluation['name']}: the data of this run have no setting {key}")
+            raise CompleteSplatError(f"{chosen}: the data of this run have no setting {key}")
         run_config.data[key] = value
     data = instantiate(run_config.data, _convert_="all")
     found = data.describe()["data_set"]
     if evaluation["data_set"] is not None and found.partition("/")[0] != evaluation["data_set"]:
-        said = f"evaluation={evaluation['name']} is of {evaluation['data_set']}, this run's data are {found}"
-        raise CompleteSplatError(f"{said}: use evaluation=images")
+        said = f"is of {evaluation['data_set']}, this run's data are {found}: use evaluation=images"
+        raise CompleteSplatError(f"{chosen} {said}")
     resolution, size = evaluation["resolution"], data.image_size
     if resolution is None or resolution == size:
         return data
@@ -80,9 +81,7 @@ def run(
 
     Args:
         trained: the arguments of `Trained`.
-        evaluation: configuration of the protocol (`conf/evaluation/`).
-        trainer: configuration of the trainer, without precision.
-        logger: configurations of loggers by name.
+        evaluation, trainer, logger: configurations of the protocol, the trainer (without precision), loggers by name.
 
     Raises:
         CompleteSplatError: model, data and protocol do not go together, or some of them are missing.

@@ -1,13 +1,11 @@
 """`completesplat data toy`, `stats`, `show`, `prepare` and `import`: what they write, say and refuse."""
 
-import json
 import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
-import numpy as np
 import pytest
-from support import refused, strict_json
+from support import refused, strict_json, write_capture
 
 from completesplat.data.toy import write_rooms
 
@@ -86,18 +84,8 @@ def test_a_flipped_bit_in_a_shard_is_found(command, packed_toys, tmp_path):
 
 
 def test_an_imported_capture_can_be_shown(command, tmp_path):
-    capture = tmp_path / "capture"
-    (capture / "images").mkdir(parents=True)
-    frames = []
-    for number in range(8):
-        angle = 2 * np.pi * number / 8
-        pose = np.eye(4)  # OpenGL's axes: the camera looks along -z, at the origin from a circle
-        pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        pose[:3, 3] = 3 * pose[:3, 2]
-        imageio.imwrite(capture / f"images/{number}.png", np.full((12, 16, 3), 30 * number, np.uint8))
-        frames.append({"file_path": f"images/{number}.png", "transform_matrix": pose.tolist()})
-    (capture / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
-    given = [f"transforms={capture / 'transforms.json'}", f"out={tmp_path / 'out'}", "category=thing"]
+    write_capture(tmp_path / "capture", frames=8)
+    given = [f"transforms={tmp_path / 'capture/transforms.json'}", f"out={tmp_path / 'out'}", "category=thing"]
     assert command("data", "import", *given).status == 0
     assert (tmp_path / "out/thing/frame_annotations.jgz").is_file()
     settings = ["data=co3d_category", f"data.root={tmp_path / 'out'}", "data.category=thing", "data.subset=imported"]
