@@ -15,8 +15,13 @@ from typing import Any, Literal
 
 from omegaconf import OmegaConf
 from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from completesplat import __version__
+from completesplat.commands import conf_folder
+from completesplat.commands.protocol import write_json
 
 ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {
@@ -209,10 +214,6 @@ def _node(program: str) -> Finding:
 
 def run(config: Any, out: Path) -> None:
     """Print the table and write `doctor.json`; exit status 1 if something is broken that a prediction needs."""
-    from rich.console import Console
-
-    from completesplat.commands.protocol import write_json
-
     findings: dict[str, Sequence[Finding]] = {}
     with Console(stderr=True).status("looking") as status:
         for part, check in checks(Path.cwd()).items():
@@ -231,8 +232,6 @@ def run(config: Any, out: Path) -> None:
 
 def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
     """The parts of the machine with their checks, in the order of the table."""
-    from completesplat.commands import conf_folder
-
     return {
         "packages": check_packages,
         "extras": check_extras,
@@ -260,10 +259,6 @@ def _check_with_parts(name: str) -> Iterator[Finding]:
 
 def show(findings: Mapping[str, Sequence[Finding]]) -> None:
     """The table, with a rule between the parts."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     table = Table(title="completesplat doctor", title_justify="left")
     for heading in ("part", "what", "here", "which, or why not"):
         table.add_column(heading, overflow="fold")

@@ -9,6 +9,7 @@ from typing import Any
 
 from completesplat import __version__
 from completesplat.atomic import write_text
+from completesplat.results.machine import machine
 from completesplat.weights import WEIGHTS_FILE, sha256_of, weights_folder
 
 
@@ -19,10 +20,10 @@ def write_json(path: Path, content: Mapping[str, Any], allow_nan: bool = False) 
 
 def git_commit() -> str | None:
     """The commit of the source, marked when there are changes on top; None where there is no repository."""
-    folder = Path(__file__).parent
 
     def git(*arguments: str) -> str:
-        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
         if not git("ls-files", "."):  # an installed package inside somebody else's repository
@@ -66,8 +67,6 @@ def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dic
 
 def provenance(data: Any) -> dict[str, Any]:
     """The test data, and which program measured with it where."""
-    from completesplat.results.machine import machine
-
     program = {"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)}
     return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 

@@ -9,6 +9,7 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from completesplat.commands.protocol import checkpoint_facts, weights_facts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.weights import CONFIG_FILE, in_the_box, weights_folder
 
@@ -52,11 +53,9 @@ class Trained:
         """
         if (self.ckpt is None) == (self.weights is None):
             raise CompleteSplatError("give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR")
+        if self.ckpt is not None and self.data is not None:
+            raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
-            if self.data is not None:
-                raise CompleteSplatError(
-                    "a checkpoint's data are its run's: change them by overrides=['data.root=DIR']"
-                )
             return config_of_run(Path(self.ckpt), list(self.overrides))
         if self.data is None:
             raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
@@ -85,8 +84,6 @@ class Trained:
 
     def facts(self) -> dict[str, Any]:
         """Path and checksum of the weights, for the protocol of a measurement."""
-        from completesplat.commands.protocol import checkpoint_facts, weights_facts
-
         return checkpoint_facts(Path(self.ckpt)) if self.ckpt is not None else weights_facts(str(self.weights))
 
     def _config_of_weights(self, weights: str) -> Any:
