@@ -42,14 +42,18 @@ def built_once(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     return build
 
 
+def made(out: Path, *arguments: str) -> None:
+    """Run the command, which must succeed, from the folder of its output."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(out.parent)
+        assert call(monkeypatch, *arguments, f"out={out}") == 0
+
+
 @pytest.fixture(scope="session")
 def toy_root(built_once: Folders) -> Path:
     """Root of a CO3D tree with the category `toy_objects`: 4 sequences (2 train, 1 val, 1 test), 4 frames, 32 px."""
-
-    def fill(root: Path) -> None:
-        write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
-
-    return built_once("toy", fill)
+    size = {"scenes": 4, "frames": 4, "size": 32, "seed": 0}
+    return built_once("toy", lambda root: write_objects(root, **size, workers=1, progress=False))
 
 
 @dataclass(frozen=True)
@@ -74,10 +78,8 @@ def pipeline(toy_root: Path, built_once: Folders) -> Pipeline:
         fit = ["fit", f"data.root={toy_root}", *SMALL]
         stage1 = runs / "var/checkpoints/last.ckpt"
         stage2 = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={stage1}", "sampler.steps=2"]
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.chdir(runs)
-            assert call(monkeypatch, *fit, "experiment=toy_var", f"out={runs / 'var'}") == 0
-            assert call(monkeypatch, *fit, *stage2, f"out={runs / 'diffusion'}") == 0
+        made(runs / "var", *fit, "experiment=toy_var")
+        made(runs / "diffusion", *fit, *stage2)
 
     runs = built_once("runs", train)
     return Pipeline(toy_root, runs / "var", runs / "diffusion")
@@ -87,26 +89,16 @@ def pipeline(toy_root: Path, built_once: Folders) -> Pipeline:
 def packed_toys(pipeline: Pipeline, built_once: Folders) -> Path:
     """The pipeline's scenes, packed."""
 
-    def pack(folder: Path) -> None:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.chdir(folder)
-            given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
-            assert call(monkeypatch, "data", "prepare", *given, f"out={folder / 'store'}") == 0
-
-    return built_once("packed", pack) / "store"
+    given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
+    return built_once("packed", lambda folder: made(folder / "store", "data", "prepare", *given)) / "store"
 
 
 @pytest.fixture(scope="session")
 def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> Path:
     """The training set, encoded by the pipeline's stage 1."""
 
-    def encode(folder: Path) -> None:
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.chdir(folder)
-            given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
-            assert call(monkeypatch, "data", "latents", *given, f"out={folder / 'cache'}") == 0
-
-    return built_once("latents", encode) / "cache"
+    given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
+    return built_once("latents", lambda folder: made(folder / "cache", "data", "latents", *given)) / "cache"
 
 
 @dataclass(frozen=True)

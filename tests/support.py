@@ -3,17 +3,21 @@
 import copy
 import functools
 import json
+import math
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from PIL import Image
 
 from completesplat import cli
-from completesplat.commands import conf_folder
+from completesplat.commands import conf_folder, refusal
+from completesplat.commands.jobs import start
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
@@ -58,6 +62,27 @@ def _composed_once(verb: str, *overrides: str) -> DictConfig:
 def compose_config(verb: str, *overrides: str) -> DictConfig:
     """The configuration of a verb, as the command line would compose it; a copy that a test may change."""
     return copy.deepcopy(_composed_once(verb, *overrides))
+
+
+def refused(verb: str, *overrides: object) -> str:
+    """The line with which a verb refuses its settings, without starting the command; empty for another exception."""
+    with pytest.raises(Exception) as caught:  # noqa: PT011
+        start(verb, compose_config(verb, *map(str, overrides)), Path("/nowhere"))
+    return refusal(caught.value) or ""
+
+
+def write_capture(folder: Path, frames: int) -> None:
+    """`transforms.json` with pictures from a circle around the origin, looking at it."""
+    folder.mkdir(exist_ok=True)
+    listed = []
+    for number in range(frames):
+        angle = 2 * math.pi * number / frames
+        back, right = np.array([math.sin(angle), 0, math.cos(angle)]), np.array([math.cos(angle), 0, -math.sin(angle)])
+        pose = np.eye(4)  # OpenGL's axes: the camera looks along -z
+        pose[:3] = np.stack([right, [0, 1, 0], back, 3 * back], axis=1)
+        Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / f"frame{number}.png")
+        listed.append({"file_path": f"frame{number}.png", "transform_matrix": pose.tolist()})
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": listed}))
 
 
 def tiny_generator() -> CompleteSplat:

@@ -35,16 +35,12 @@ def links(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_links_and_pictures_lead_somewhere(document):
+def test_links_lead_somewhere_and_paths_and_targets_of_make_exist(document):
     for link in links(document):
         file, _, anchor = link.partition("#")
         target = (document.parent / file).resolve() if file else document
         assert target.is_file(), link
         assert not anchor or anchor in anchors(target), link
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_paths_and_targets_of_make_exist(document):
     text = document.read_text()
     for path in PATH.findall(text):
         assert (ROOT / path).exists() or path == YOURS, path
@@ -69,7 +65,7 @@ def test_the_groups_of_settings_are_all_described():
     assert described == {path.name for path in (ROOT / "conf").iterdir() if path.is_dir()}
 
 
-def test_the_citation_is_the_readmes():
+def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
     citation = OmegaConf.load(ROOT / "CITATION.cff")
     paper, text = citation["preferred-citation"], README.read_text()
     authors = " and ".join(f"{one['family-names']}, {one['given-names']}" for one in paper.authors)
@@ -77,9 +73,6 @@ def test_the_citation_is_the_readmes():
         assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
     assert citation.version == PROJECT["version"]
     assert citation.license == PROJECT["license"]
-
-
-def test_the_changelog_knows_this_version():
     assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
 
 

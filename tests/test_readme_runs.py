@@ -1,6 +1,5 @@
 """The documents' commands, run as printed (and briefly), in one folder, each with what those before it left."""
 
-import json
 import os
 import re
 import shutil
@@ -12,7 +11,7 @@ import co3d_trees
 import numpy as np
 import pytest
 from PIL import Image
-from support import SMALL
+from support import SMALL, write_capture
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
 # Appended to make them short; everything else is as printed.
@@ -70,22 +69,8 @@ def folder(tmp_path_factory):
         names = [f"{index}_2_3" for index in range(4)]
         splits = {"train": names[:2], "val": names[2:3], "test": names[3:]}
         co3d_trees.write_tree(place / "ROOT", dict.fromkeys(names, 6), splits)
-    (place / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": _capture(place)}))
+    write_capture(place, frames=6)
     return place
-
-
-def _capture(place):
-    """Frames around the origin, +y up, looking inwards, each with its picture."""
-    frames = []
-    for index, angle in enumerate(np.linspace(0.3, 4.0, 6)):
-        back = np.array([np.sin(angle), 0.2, np.cos(angle)]) / np.hypot(1, 0.2)
-        right = np.cross([0.0, 1.0, 0.0], back)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, 4 * back], axis=1)
-        shutil.copy(place / "photo.jpg", place / f"frame{index}.jpg")
-        frames.append({"file_path": f"frame{index}.jpg", "transform_matrix": pose.tolist()})
-    return frames
 
 
 def run(command: str, folder) -> subprocess.CompletedProcess[str]:
@@ -99,11 +84,8 @@ def run(command: str, folder) -> subprocess.CompletedProcess[str]:
 
 def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
     """A page is served until it is stopped: until its address is printed."""
-    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        program, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-    )
-    assert process.stdout is not None
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    process = subprocess.Popen(program, cwd=folder, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **streams)
     said = ""
     for line in process.stdout:
         said += line

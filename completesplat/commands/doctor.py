@@ -1,14 +1,13 @@
 """`completesplat doctor`: what this machine has, what it lacks, and whether completing a photograph can work."""
 
-import json
 import os
 import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -16,41 +15,14 @@ from typing import Any, Literal
 
 from omegaconf import OmegaConf
 from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from completesplat import __version__
+from completesplat.commands import conf_folder
+from completesplat.commands.protocol import write_json
 
-State = Literal["yes", "no", "broken"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was found, is missing or is broken.
-
-    Args:
-        part: of the machine, the same for lines that belong together.
-        name: of the thing.
-        state: `broken` is what completing a photograph needs and does not have; `no` is no error.
-        said: a version, a place, or the reason and what to do.
-    """
-
-    part: str
-    name: str
-    state: State
-    said: str
-
-
-def one_line(error: BaseException) -> str:
-    """An exception's kind and message, without line breaks and not too long."""
-    message = " ".join(str(error).split())
-    return f"{type(error).__name__}: {message[:200]}" if message else type(error).__name__
-
-
-def size(count: float) -> str:
-    """Bytes as `3.2 GB`, `14.1 MB`, `0.3 MB`."""
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
-
-
-PACKAGES_PART, EXTRAS_PART = "packages", "extras"
 ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {
     "cuda": "draws on an NVIDIA GPU",
@@ -58,32 +30,62 @@ EXTRAS = {
     "colmap": "imports captures of your own",
     "slurm": "spreads sweeps over a cluster",
 }
+STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
+LEAST_SPACE = 100e6
+"""Bytes: the files of a few predictions."""
 
 
-def check_packages() -> list[Finding]:
-    """Versions of what is needed, and what each extra would give."""
-    found = [
-        Finding(PACKAGES_PART, "completesplat", "yes", __version__),
-        Finding(PACKAGES_PART, "python", "yes", f"{platform.python_version()} on {platform.system()}"),
-    ]
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found, is missing or is broken.
+
+    Args:
+        name: of the thing.
+        state: `broken` is what completing a photograph needs and does not have; `no` is no error.
+        said: a version, a place, or the reason and what to do.
+    """
+
+    name: str
+    state: Literal["yes", "no", "broken"]
+    said: str
+
+
+def one_line(error: BaseException) -> str:
+    """An exception's kind and message, without line breaks and not too long."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".removesuffix(": ")
+
+
+def size(count: float) -> str:
+    """Bytes as `3.2 GB`, `14.1 MB`, `0.3 MB`."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def check_packages() -> Iterator[Finding]:
+    """Versions of what is needed."""
+    yield Finding("completesplat", "yes", __version__)
+    yield Finding("python", "yes", f"{platform.python_version()} on {platform.system()}")
     try:
-        requirements = [Requirement(line) for line in requires("completesplat") or ()]
+        needed = [Requirement(line) for line in requires("completesplat") or ()]
     except PackageNotFoundError:
         said = "runs from its source without being installed; `pip install -e .` there also fetches what it needs"
-        return [*found, Finding(PACKAGES_PART, "installation", "no", said)]
-    extras = [line for name, gives in EXTRAS.items() for line in extra_packages(name, gives, requirements)]
-    return [*found, *needed_packages(one for one in requirements if applies(one, "")), *extras]
+        yield Finding("installation", "no", said)
+        return
+    yield from needed_packages(one for one in needed if applies(one, ""))
 
 
-def check_imports() -> list[Finding]:
-    """Whether what draws and writes a prediction can be imported, which needs more than that packages are there.
+def check_extras() -> Iterator[Finding]:
+    """What each extra would give; nothing where this package is not installed."""
+    with suppress(PackageNotFoundError):
+        lines = [Requirement(line) for line in requires("completesplat") or ()]
+        for name, gives in EXTRAS.items():
+            yield from extra_packages(name, gives, lines)
 
-    Raises:
-        Exception: of any kind, whatever stands in the way.
-    """
+
+def check_imports() -> Iterator[Finding]:
+    """Whether what draws and writes a prediction can be imported; raises whatever stands in the way."""
     for module in ("completesplat.generation", "completesplat.export.prediction"):
         import_module(module)
-    return [Finding("imports", "networks, files", "yes", "all that completing a photograph imports")]
+    yield Finding("networks, files", "yes", "all that completing a photograph imports")
 
 
 def applies(requirement: Requirement, extra: str) -> bool:
@@ -91,35 +93,32 @@ def applies(requirement: Requirement, extra: str) -> bool:
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
-def needed_packages(needed: Iterable[Requirement]) -> list[Finding]:
+def needed_packages(needed: Iterable[Requirement]) -> Iterator[Finding]:
     """A line for each of the best known and for each that is missing or of another version; one for all others."""
     lines, others = [], 0
     for requirement in needed:
         found = _version(requirement)
         if found is None:
             said = f'missing; `pip install "{requirement.name}{requirement.specifier}"`'
-            lines.append(Finding(PACKAGES_PART, requirement.name, "broken", said))
+            lines.append(Finding(requirement.name, "broken", said))
         elif not requirement.specifier.contains(found, prereleases=True):
             said = f"{found}, which is not {requirement.specifier}: it may or may not work"
-            lines.append(Finding(PACKAGES_PART, requirement.name, "no", said))
+            lines.append(Finding(requirement.name, "no", said))
         elif requirement.name in ALWAYS_SHOWN:
-            lines.append(Finding(PACKAGES_PART, requirement.name, "yes", found))
+            lines.append(Finding(requirement.name, "yes", found))
         else:
             others += 1
-    lines.sort(key=lambda line: line.name not in ALWAYS_SHOWN)
-    return [*lines, Finding(PACKAGES_PART, "others", "yes", f"{others} more, in versions that fit")]
+    yield from sorted(lines, key=lambda line: line.name not in ALWAYS_SHOWN)
+    yield Finding("others", "yes", f"{others} more, in versions that fit")
 
 
-def extra_packages(name: str, gives: str, requirements: Iterable[Requirement]) -> list[Finding]:
+def extra_packages(name: str, gives: str, requirements: Iterable[Requirement]) -> Iterator[Finding]:
     """A line for each package of an extra; one that is not installed is no error."""
-    lines = []
     for requirement in requirements:
-        if applies(requirement, "") or not applies(requirement, name):
-            continue
-        found = _version(requirement)
-        said = f"{found}: {gives}" if found else f'{gives}: pip install "completesplat[{name}]"'
-        lines.append(Finding(EXTRAS_PART, requirement.name, "yes" if found else "no", said))
-    return lines
+        if applies(requirement, name) and not applies(requirement, ""):
+            found = _version(requirement)
+            said = f"{found}: {gives}" if found else f'{gives}: pip install "completesplat[{name}]"'
+            yield Finding(requirement.name, "yes" if found else "no", said)
 
 
 def _version(requirement: Requirement) -> str | None:
@@ -129,27 +128,22 @@ def _version(requirement: Requirement) -> str | None:
         return None
 
 
-DEVICE_PART = "device"
-
-
-def check_device() -> list[Finding]:
+def check_device() -> Iterator[Finding]:
     """A GPU that is not there is no error: small models draw in seconds without."""
     import torch
 
     from completesplat.results.machine import machine
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    found = [Finding(DEVICE_PART, "processor", "yes", f"{machine()['processor']}, {cores} cores to use")]
+    yield Finding("processor", "yes", f"{machine()['processor']}, {cores} cores to use")
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        found.append(Finding(DEVICE_PART, "memory", "yes", size(memory)))
+        yield Finding("memory", "yes", size(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
     if not torch.cuda.is_available():
-        return [*found, Finding(DEVICE_PART, "GPU", "no", no_gpu())]
+        yield Finding("GPU", "no", no_gpu())
+        return
     for index in range(torch.cuda.device_count()):
         free, total = torch.cuda.mem_get_info(index)
-        said = f"{torch.cuda.get_device_name(index)}, {size(free)} of {size(total)} free"
-        found.append(Finding(DEVICE_PART, f"GPU {index}", "yes", said))
-    return found
+        yield Finding(f"GPU {index}", "yes", f"{torch.cuda.get_device_name(index)}, {size(free)} of {size(total)} free")
 
 
 def no_gpu() -> str:
@@ -163,47 +157,37 @@ def no_gpu() -> str:
     return f"torch for CUDA {torch.version.cuda} finds none; `nvidia-smi` says what the driver sees"
 
 
-DATA_PART = "data"
-
-
-def check_data(conf: Path, place: Path) -> list[Finding]:
-    """Data are needed to train, not to complete a photograph.
-
-    Args:
-        conf: the folder of the data sets' configurations.
-        place: the folder that relative roots start from.
-    """
-    found = []
+def check_data(conf: Path, place: Path) -> Iterator[Finding]:
+    """The data sets of the configurations in `conf`, with roots from `place`: needed to train, not to predict."""
     for path in sorted(conf.glob("*.yaml")):
         config = OmegaConf.to_container(OmegaConf.load(path))
         # One without a root of its own has another one's, or cannot be chosen.
         if isinstance(config, dict) and "root" in config:
-            found.append(_data_set(path.stem, str(config["root"]), "data_seed" in config, place))
-    return found
+            yield _data_set(path.stem, str(config["root"]), "data_seed" in config, place)
 
 
 def _data_set(name: str, root: str, procedural: bool, place: Path) -> Finding:
     if root == "???":
-        return Finding(DATA_PART, name, "no", f"has no place of its own: data={name} data.root=FOLDER")
-    folder = place / root
-    if folder.is_dir():
-        return Finding(DATA_PART, name, "yes", f"{root}: {sum(1 for _ in folder.iterdir())} entries")
+        return Finding(name, "no", f"has no place of its own: data={name} data.root=FOLDER")
+    if (place / root).is_dir():
+        return Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
     said = "made there when it is first used" if procedural else f"data={name} data.root=FOLDER names another place"
-    return Finding(DATA_PART, name, "no", f"not in {root}; {said}")
+    return Finding(name, "no", f"not in {root}; {said}")
 
 
-TOOLS_PART = "tools"
-LEAST_SPACE = 100e6
-"""Bytes: the files of a few predictions."""
+def check_tools(place: Path) -> Iterator[Finding]:
+    """Videos need ffmpeg, which comes as a package; node is for exports only. Space is that of `place`'s disk."""
+    from completesplat.export.splat_transform import PACKAGE, PROGRAM
 
-
-def check_tools(place: Path) -> list[Finding]:
-    """Videos need ffmpeg, which comes as a package; node is for exports only.
-
-    Args:
-        place: the folder whose disk is looked at.
-    """
-    return [_ffmpeg(), _node(), _splat_transform(), _space(place)]
+    yield _ffmpeg()
+    yield _node(PROGRAM)
+    path = shutil.which(PROGRAM)
+    how = "npx fetches it when they are asked for" if shutil.which("npx") else "first Node.js with npm"
+    said = f"for formats spz, sog and html: `npm install -g {PACKAGE}`, or {how}"
+    yield Finding(PROGRAM, "yes" if path else "no", path or said)
+    free = shutil.disk_usage(place).free
+    short = ": too little for a prediction's files" if free < LEAST_SPACE else ""
+    yield Finding("free disk", "broken" if short else "yes", f"{size(free)} in {place}{short}")
 
 
 def _ffmpeg() -> Finding:
@@ -213,105 +197,74 @@ def _ffmpeg() -> Finding:
         said = f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}"
     except Exception as error:  # a program that is missing, cannot be run, or says nothing
         said = f"{one_line(error)}; for videos, `pip install --force-reinstall imageio-ffmpeg`"
-        return Finding(TOOLS_PART, "ffmpeg", "broken", said)
-    return Finding(TOOLS_PART, "ffmpeg", "yes", said)
+        return Finding("ffmpeg", "broken", said)
+    return Finding("ffmpeg", "yes", said)
 
 
-def _node() -> Finding:
-    from completesplat.export.splat_transform import PROGRAM
-
+def _node(program: str) -> Finding:
     path = shutil.which("node")
     if path is None:
-        return Finding(TOOLS_PART, "node", "no", f"version 20 or newer runs {PROGRAM}: https://nodejs.org")
+        return Finding("node", "no", f"version 20 or newer runs {program}: https://nodejs.org")
     try:
         found = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True).stdout
     except (OSError, subprocess.SubprocessError) as error:
-        return Finding(TOOLS_PART, "node", "no", f"{path} does not run: {one_line(error)}")
-    return Finding(TOOLS_PART, "node", "yes", f"{found.strip()}, {path}")
-
-
-def _splat_transform() -> Finding:
-    from completesplat.export.splat_transform import PACKAGE, PROGRAM
-
-    path = shutil.which(PROGRAM)
-    if path is not None:
-        return Finding(TOOLS_PART, PROGRAM, "yes", path)
-    how = "npx fetches it when they are asked for" if shutil.which("npx") else "first Node.js with npm"
-    return Finding(TOOLS_PART, PROGRAM, "no", f"for formats spz, sog and html: `npm install -g {PACKAGE}`, or {how}")
-
-
-def _space(place: Path) -> Finding:
-    free = shutil.disk_usage(place).free
-    if free < LEAST_SPACE:
-        return Finding(
-            TOOLS_PART, "free disk", "broken", f"{size(free)} in {place}: too little for a prediction's files"
-        )
-    return Finding(TOOLS_PART, "free disk", "yes", f"{size(free)} in {place}")
+        return Finding("node", "no", f"{path} does not run: {one_line(error)}")
+    return Finding("node", "yes", f"{found.strip()}, {path}")
 
 
 def run(config: Any, out: Path) -> None:
     """Print the table and write `doctor.json`; exit status 1 if something is broken that a prediction needs."""
-    from rich.console import Console
-
-    findings = []
+    findings: dict[str, Sequence[Finding]] = {}
     with Console(stderr=True).status("looking") as status:
-        for part, check in checks(Path.cwd()):
+        for part, check in checks(Path.cwd()).items():
             status.update(f"looking at: {part}")
-            findings += findings_of(part, check)
-    broken = [finding for finding in findings if finding.state == "broken"]
-    content = {"works": not broken, "findings": [vars(finding) for finding in findings]}
-    (out / "doctor.json").write_text(json.dumps(content, indent=2) + "\n")
+            findings[part] = findings_of(check)
+    rows = [{"part": part, **vars(finding)} for part, found in findings.items() for finding in found]
+    broken = [f"{row['part']}, {row['name']}: {row['said']}" for row in rows if row["state"] == "broken"]
+    write_json(out / "doctor.json", {"works": not broken, "findings": rows})
     show(findings)
     if broken:
-        print("broken: " + "; ".join(f"{one.part}, {one.name}: {one.said}" for one in broken))
+        print("broken: " + "; ".join(broken))
         print(out)
         sys.exit(1)
     print("Nothing that completing a photograph needs is broken.")
 
 
-def checks(place: Path) -> list[tuple[str, Callable[[], list[Finding]]]]:
+def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
     """The parts of the machine with their checks, in the order of the table."""
-    from completesplat.commands import conf_folder
+    return {
+        "packages": check_packages,
+        "extras": check_extras,
+        "imports": check_imports,
+        "device": check_device,
+        "rasterizers": lambda: _check_with_parts("check_rasterizers"),
+        "weights": lambda: _check_with_parts("check_weights"),
+        "data": lambda: check_data(conf_folder() / "data", place),
+        "tools": lambda: check_tools(place),
+    }
 
-    return [
-        ("packages", check_packages),
-        ("imports", check_imports),
-        ("device", check_device),
-        ("rasterizers", partial(_check_with_parts, "check_rasterizers")),
-        ("weights", partial(_check_with_parts, "check_weights")),
-        ("data", partial(check_data, conf_folder() / "data", place)),
-        ("tools", partial(check_tools, place)),
-    ]
 
-
-def findings_of(part: str, check: Callable[[], list[Finding]]) -> list[Finding]:
+def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
     """The findings of a check; an exception, such as a failing import, becomes a finding."""
     try:
-        return check()
+        return list(check())
     except Exception as error:  # of any library: the other parts are looked at all the same
-        return [Finding(part, "check", "broken", one_line(error))]
+        return [Finding("check", "broken", one_line(error))]
 
 
-def _check_with_parts(name: str) -> list[Finding]:
+def _check_with_parts(name: str) -> Iterator[Finding]:
     """A check that needs the package's own parts, which are imported only now."""
-    return getattr(import_module("completesplat.commands.doctor_checks"), name)()
+    yield from getattr(import_module("completesplat.commands.doctor_checks"), name)()
 
 
-def show(findings: Sequence[Any]) -> None:
+def show(findings: Mapping[str, Sequence[Finding]]) -> None:
     """The table, with a rule between the parts."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    styles = {"yes": "green", "no": "yellow", "broken": "bold red"}
     table = Table(title="completesplat doctor", title_justify="left")
     for heading in ("part", "what", "here", "which, or why not"):
         table.add_column(heading, overflow="fold")
-    last = None
-    for finding in findings:
-        if last not in (None, finding.part):
-            table.add_section()
-        state = Text(finding.state, style=styles[finding.state])
-        table.add_row("" if finding.part == last else finding.part, Text(finding.name), state, Text(finding.said))
-        last = finding.part
+    for part, found in findings.items():
+        for index, finding in enumerate(found):
+            state = Text(finding.state, style=STYLES[finding.state])
+            table.add_row("" if index else part, Text(finding.name), state, Text(finding.said))
+        table.add_section()
     Console(width=None if Console().is_terminal else 160).print(table)

@@ -1,10 +1,12 @@
 """The checks of `completesplat doctor` that need the package's own parts: rasterizers and weights."""
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlparse
 
 import torch
+from huggingface_hub import try_to_load_from_cache
 
 from completesplat.commands.doctor import Finding, size
 from completesplat.errors import WeightsError
@@ -17,20 +19,20 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, TOLERANCE, failure
 from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, weights_folder
 
-RENDERING_PART = "rasterizers"
 GOOD = "a test rendering is as it should be"
+WEIGHTS_FILES = (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)
+PUBLISHED = [("LPIPS: VGG16", VGG_URL), ("FID, KID: Inception", INCEPTION_URL)]
+VAE = "stabilityai/sd-vae-ft-mse"
 
 
-def check_rasterizers() -> list[Finding]:
+def check_rasterizers() -> Iterator[Finding]:
     """The backends, fastest first. The last one, which needs torch alone, must work; the others need not."""
-    found = []
-    for name, make in FASTER.items():
-        reason = failure(name, None) or wrong(make(None))
-        found.append(Finding(RENDERING_PART, name, "no" if reason else "yes", reason or GOOD))
+    faster = {name: failure(name, None) or wrong(make(None)) for name, make in FASTER.items()}
+    for name, reason in faster.items():
+        yield Finding(name, "no" if reason else "yes", reason or GOOD)
     reason = wrong(ReferenceRasterizer())
-    faster = any(finding.state == "yes" for finding in found)
-    said = reason or (GOOD if faster else f"{GOOD}; with nothing else, predictions are very slow")
-    return [*found, Finding(RENDERING_PART, "reference", "broken" if reason else "yes", said)]
+    said = f"{GOOD}; with nothing else, predictions are very slow" if all(faster.values()) else GOOD
+    yield Finding("reference", "broken" if reason else "yes", reason or said)
 
 
 @torch.no_grad()
@@ -58,52 +60,32 @@ def wrong(rasterizer: Rasterizer) -> str | None:
     return None
 
 
-WEIGHTS_PART = "weights"
-WEIGHTS_FILES = (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)
-PUBLISHED = [("LPIPS: VGG16", VGG_URL), ("FID, KID: Inception", INCEPTION_URL)]
-VAE = "stabilityai/sd-vae-ft-mse"
-
-
-def check_weights(box: Path = BOX) -> list[Finding]:
-    """Published weights that are not here are no error: they are fetched when they are needed.
-
-    Args:
-        box: holds the package's own, one folder for each model.
-    """
-    found = [
-        _own(folder) for folder in sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
-    ]
-    if not found:
+def check_weights(box: Path = BOX) -> Iterator[Finding]:
+    """The package's own, in folders of `box`, and published ones, which are no error if missing: they are fetched."""
+    own = sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
+    yield from map(_own, own)
+    if not own:
         said = "none come with this version: give predict weights=FOLDER, the `weights` that a run of stage 2 leaves"
-        found = [Finding(WEIGHTS_PART, "in the package", "no", said)]
-    return [*found, *(_published(name, url) for name, url in PUBLISHED), _vae()]
+        yield Finding("in the package", "no", said)
+    for name, url in PUBLISHED:
+        path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
+        yield _published(name, path if path.is_file() else None, f"from {url} when it is asked for")
+    vae = try_to_load_from_cache(VAE, "diffusion_pytorch_model.safetensors")
+    when = f"from huggingface.co when autoreconstructor.pretrained={VAE} is given"
+    yield _published("Stable Diffusion's VAE", vae if isinstance(vae, str) else None, when)
 
 
 def _own(folder: Path) -> Finding:
     try:
         weights_folder(folder)
     except (OSError, WeightsError) as error:
-        return Finding(WEIGHTS_PART, folder.name, "broken", f"{error}; install completesplat again")
+        return Finding(folder.name, "broken", f"{error}; install completesplat again")
     count = (folder / WEIGHTS_FILE).stat().st_size
     checked = "as it was written" if (folder / SUMS_FILE).is_file() else f"not checked, for there is no {SUMS_FILE}"
-    return Finding(
-        WEIGHTS_PART, folder.name, "yes", f"with the package, {size(count)}, {checked}: predict weights={folder.name}"
-    )
+    return Finding(folder.name, "yes", f"with the package, {size(count)}, {checked}: predict weights={folder.name}")
 
 
-def _published(name: str, url: str) -> Finding:
-    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
-    if path.is_file():
-        return Finding(WEIGHTS_PART, name, "yes", f"{path}, {size(path.stat().st_size)}")
-    return Finding(WEIGHTS_PART, name, "no", f"not here; will be downloaded from {url} when it is asked for")
-
-
-def _vae() -> Finding:
-    from huggingface_hub import try_to_load_from_cache
-
-    name = "Stable Diffusion's VAE"
-    path = try_to_load_from_cache(VAE, "diffusion_pytorch_model.safetensors")
-    if isinstance(path, str):
-        return Finding(WEIGHTS_PART, name, "yes", path)
-    said = f"not here; will be downloaded from huggingface.co when autoreconstructor.pretrained={VAE} is given"
-    return Finding(WEIGHTS_PART, name, "no", said)
+def _published(name: str, path: Path | str | None, where: str) -> Finding:
+    if path is None:
+        return Finding(name, "no", f"not here; will be downloaded {where}")
+    return Finding(name, "yes", f"{path}, {size(Path(path).stat().st_size)}")

@@ -1,6 +1,5 @@
 """`completesplat test`: images of a trained model against true ones; `fit` scores in the same way."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,8 @@ from lightning import seed_everything
 from omegaconf import OmegaConf
 
 from completesplat.commands import quieten
-from completesplat.commands.jobs import CONFIG
-from completesplat.commands.protocol import protocol
+from completesplat.commands.jobs import CONFIG, METRICS
+from completesplat.commands.protocol import protocol, write_json
 from completesplat.commands.trained import Trained
 from completesplat.data.packed.manifest import is_packed
 from completesplat.errors import CompleteSplatError
@@ -30,19 +29,18 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
             got, or scores at a smaller size, or at another one than that of prepared pictures.
         DataError: the protocol's files cannot be used.
     """
+    chosen = f"evaluation={evaluation['name']}"
     if "scoring" not in evaluation:
-        raise CompleteSplatError(f"evaluation={evaluation['name']}: fit scores pictures only; set test=false")
+        raise CompleteSplatError(f"{chosen}: fit scores pictures only; set test=false")
     for key, value in evaluation["data"].items():
         if key not in run_config.data:
-            raise CompleteSplatError(f"evaluation={evaluation['name']}: the data of this run have no setting {key}")
+            raise CompleteSplatError(f"{chosen}: the data of this run have no setting {key}")
         run_config.data[key] = value
     data = instantiate(run_config.data, _convert_="all")
     found = data.describe()["data_set"]
     if evaluation["data_set"] is not None and found.partition("/")[0] != evaluation["data_set"]:
-        raise CompleteSplatError(
-            f"evaluation={evaluation['name']} is of {evaluation['data_set']}, this run's data are {found}: "
-            "use evaluation=images"
-        )
+        said = f"is of {evaluation['data_set']}, this run's data are {found}: use evaluation=images"
+        raise CompleteSplatError(f"{chosen} {said}")
     resolution, size = evaluation["resolution"], data.image_size
     if resolution is None or resolution == size:
         return data
@@ -68,11 +66,7 @@ def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
 
 
 def scoring_trainer(trainer: Mapping[str, Any], evaluation: Mapping[str, Any], **settings: Any) -> Any:
-    """A trainer that tests in the protocol's precision, whatever the networks were trained in.
-
-    Args:
-        settings: of the trainer, besides those of its configuration.
-    """
+    """A trainer, with further settings, that tests in the protocol's precision, whatever the networks trained in."""
     return instantiate(trainer, precision=evaluation["precision"], **settings, _convert_="all")
 
 
@@ -87,9 +81,7 @@ def run(
 
     Args:
         trained: the arguments of `Trained`.
-        evaluation: configuration of the protocol (`conf/evaluation/`).
-        trainer: configuration of the trainer, without precision.
-        logger: configurations of loggers by name.
+        evaluation, trainer, logger: configurations of the protocol, the trainer (without precision), loggers by name.
 
     Raises:
         CompleteSplatError: model, data and protocol do not go together, or some of them are missing.
@@ -110,8 +102,7 @@ def run(
         if not testing.is_global_zero:
             return
         described = protocol(evaluation, module, data, results) | tested.facts()
-        text = json.dumps({"protocol": described} | results, indent=2, allow_nan=False)
-        (out / "metrics.json").write_text(text + "\n")
+        write_json(out / METRICS, {"protocol": described} | results)
         log_test(results, shown, testing, out)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():

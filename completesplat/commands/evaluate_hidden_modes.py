@@ -1,8 +1,6 @@
 """`completesplat test evaluation=hidden_modes`: samples of what the reference view hides, against the known truth."""
 
-import json
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -12,14 +10,12 @@ from omegaconf import OmegaConf
 from rich.console import Console
 from rich.progress import track
 
-from completesplat import __version__
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG
-from completesplat.commands.protocol import drawing, git_commit
+from completesplat.commands.protocol import drawing, provenance, write_json
 from completesplat.commands.schema import Natural, Positive, Range
 from completesplat.commands.trained import Trained
 from completesplat.data.hidden_modes import hidden_modes
-from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.results.wandb import log_modes
 from completesplat.studies.mode_benchmark import Measured, draw, measure, predictors, usable
@@ -40,15 +36,9 @@ class HiddenModesEvaluation(TypedDict):
     seed: Natural
 
 
-COLUMNS: list[Column] = [
-    ("method", "method", ""),
-    ("coverage", "coverage", ".3f"),
-    ("total variation", "total_variation", ".3f"),
-    ("sharpness", "sharpness", ".3f"),
-    ("rejected", "rejected", ".3f"),
-    ("scenes", "scenes", "d"),
-    ("samples", "samples", "d"),
-]
+FORMATS = {"method": "", **dict.fromkeys(("coverage", "total_variation", "sharpness", "rejected"), ".3f")}
+FORMATS |= {"scenes": "d", "samples": "d"}
+COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in FORMATS.items()]
 
 
 def run(
@@ -60,20 +50,15 @@ def run(
 ) -> None:
     """Write `hidden_modes.json`, `calibration.json`, `protocol.json` and `hidden_modes.png`, and print the table.
 
-    Args:
-        trained: the arguments of `Trained`.
-        trainer: configuration of a trainer, of which only the `accelerator` counts: "cpu" leaves a GPU alone.
-        logger: configurations of loggers by name.
+    Args: as those of `evaluate.run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
 
     Raises:
         WeightsError: the checkpoint or its run's configuration is missing or does not fit.
         CompleteSplatError: data whose hidden parts are not known, or no scene that can be used.
     """
     tested = Trained(**trained)
-    configuration = tested.configuration()
     quieten()
-    data = instantiate(configuration.data, _convert_="all")
-    module = tested.open_module(configuration)
+    module, data = tested.open()
     data.prepare_data()
     data.setup("test")
     device = torch.device("cuda" if trainer["accelerator"] != "cpu" and torch.cuda.is_available() else "cpu")
@@ -86,14 +71,17 @@ def run(
     limits = evaluation["shown_scenes"], evaluation["shown_samples"]
     measured = measure(predictors(module, samples, evaluation["batch"]), found, samples, evaluation["seed"], *limits)
     results, calibration = measured.results(samples), measured.calibration()
-    _write(out / "hidden_modes.json", results)
-    _write(out / "calibration.json", calibration)
-    _write(out / "protocol.json", protocol(tested, evaluation, module, data, measured))
+    write_json(out / "hidden_modes.json", results)
+    write_json(out / "calibration.json", calibration)
+    write_json(out / "protocol.json", protocol(tested, evaluation, module, data, measured))
     draw(measured.shown["model"], results, calibration, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
         log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
-    _print(results, measured.skipped)
+    title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
+    Console(width=120).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
+    if measured.skipped:
+        print(f"{len(measured.skipped)} scenes skipped; the first: {measured.skipped[0]}")
 
 
 def protocol(
@@ -112,20 +100,6 @@ def protocol(
         "spread_views": evaluation["spread_views"],
         "seed": evaluation["seed"],
         **drawing(module),
-        "data_fingerprint": data.source("test").fingerprint(),
-        **{"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)},
-        "machine": machine(),
+        **provenance(data),
         **tested.facts(),
     }
-
-
-def _print(results: dict[str, Any], skipped: Sequence[str]) -> None:
-    rows = [{"method": method, **found} for method, found in results.items()]
-    title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    Console(width=120).print(table(title, COLUMNS, rows))
-    if skipped:
-        print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
-
-
-def _write(path: Path, results: dict[str, Any]) -> None:
-    path.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")

@@ -1,36 +1,25 @@
 """`completesplat fit`: train one stage, then score it."""
 
 import copy
-import json
 import logging
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
+from lightning import seed_everything
+from lightning.pytorch.callbacks import WeightAveraging
+from omegaconf import OmegaConf
 from torch import nn
 
+from completesplat.commands import quieten
+from completesplat.commands.evaluate import scored_data, scoring_trainer, set_scoring
+from completesplat.commands.jobs import LAST, METRICS
+from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.results.tables import Table, table
-
-COLUMNS = [("part", "part", ""), ("parameters, millions", "millions", ".2f"), ("of these trained", "trained", ".2f")]
-
-
-def parameter_table(module: nn.Module) -> Table:
-    """One line for each network of a module, and one for each part of a network that has several."""
-    return table("Model", COLUMNS, parameter_rows(module))
-
-
-def parameter_rows(module: nn.Module) -> list[dict[str, Any]]:
-    """Names, and numbers of parameters in millions, of parts down to two levels; parts without any are left out."""
-    rows = []
-    for name, child in module.named_children():
-        parts = [(f"  {part}", grandchild) for part, grandchild in child.named_children()]
-        for label, network in [(name, child), *(parts if len(parts) > 1 else [])]:
-            sizes = [(parameter.numel(), parameter.requires_grad) for parameter in network.parameters()]
-            if sizes:
-                millions, trained = sum(n for n, _ in sizes) / 1e6, sum(n for n, learns in sizes if learns) / 1e6
-                rows.append({"part": label, "millions": millions, "trained": trained})
-    return rows
-
+from completesplat.results.tables import Table, evaluation_table, show, table
+from completesplat.results.wandb import begin, log_test
+from completesplat.training.loggers import finished
 
 logger = logging.getLogger(__name__)
 
@@ -43,21 +32,24 @@ EXAMPLES = {
     "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
 }
 """Examples of settings that may be missing."""
+COLUMNS = [("part", "part", ""), ("parameters, millions", "millions", ".2f"), ("of these trained", "trained", ".2f")]
+
+
+def parameter_table(module: nn.Module) -> Table:
+    """A line for each network of a module, and for each part of a network with several, if it has parameters."""
+    rows = []
+    for name, child in module.named_children():
+        parts = [(f"  {part}", grandchild) for part, grandchild in child.named_children()]
+        for label, network in [(name, child), *(parts if len(parts) > 1 else [])]:
+            sizes = [(parameter.numel(), parameter.requires_grad) for parameter in network.parameters()]
+            if sizes:
+                millions, trained = sum(n for n, _ in sizes) / 1e6, sum(n for n, learns in sizes if learns) / 1e6
+                rows.append({"part": label, "millions": millions, "trained": trained})
+    return table("Model", COLUMNS, rows)
 
 
 def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
-    from hydra.utils import instantiate
-    from lightning import seed_everything
-
-    from completesplat.commands import quieten
-    from completesplat.commands.evaluate import scored_data, set_scoring
-    from completesplat.commands.protocol import protocol
-    from completesplat.data.loading.distributed import batch_per_process
-    from completesplat.results.tables import evaluation_table, show
-    from completesplat.results.wandb import begin, log_test
-    from completesplat.training.loggers import finished
-
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     refuse_missing(config)
@@ -91,24 +83,14 @@ def run(config: Any, out: Path) -> None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-        _write(results, out / "metrics.json")
+        write_json(out / METRICS, results, allow_nan=True)  # the last file, because it means that the job is done
         if scores is not None:
             log_test(scores, shown, trainer, out)
 
 
 def _parts(config: Any) -> list[Any]:
     """Callbacks or loggers: those that are not null."""
-    from hydra.utils import instantiate
-
     return [part for part in instantiate(config, _convert_="all").values() if part is not None]
-
-
-def _write(results: dict[str, Any], path: Path) -> None:
-    """Write the results in one step, because the file also means that the job is done."""
-    from completesplat.atomic import atomic_path
-
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(results, indent=2) + "\n")
 
 
 def checkpoint_to_continue(config: Any, out: Path) -> str | None:
@@ -117,10 +99,10 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
     Raises:
         WeightsError: it does not exist.
     """
-    path = str(out / "checkpoints" / "last.ckpt") if config.ckpt_path == "last" else config.ckpt_path
-    if path is None or (config.ckpt_path == "last" and not Path(path).is_file()):
-        return None
-    if not Path(path).is_file():
+    path: str | None = str(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
+    if path is None or not Path(path).is_file():
+        if config.ckpt_path in (None, "last"):
+            return None
         raise WeightsError(f"{path}: no such checkpoint")
     for part in (config.autoreconstructor, config.conditioning, config.model):
         for key in OTHER_WEIGHTS & part.keys():
@@ -134,8 +116,6 @@ def refuse_missing(config: Any) -> None:
     Raises:
         CompleteSplatError: there is one.
     """
-    from omegaconf import OmegaConf
-
     for part in (config.data, config.model):
         for key in sorted(OmegaConf.missing_keys(part)):
             example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
@@ -155,27 +135,16 @@ def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict
 
 def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
     """Score as `completesplat test` does; everything that was logged."""
-    from hydra.utils import instantiate
-
-    from completesplat.commands.evaluate import scoring_trainer
-
     progress = instantiate(config.callbacks.progress, _convert_="all")
-    callbacks = [] if progress is None else [progress]
-    trainer = scoring_trainer(
-        config.trainer, config.evaluation, callbacks=callbacks, logger=False, enable_checkpointing=False
-    )
+    settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
+    trainer = scoring_trainer(config.trainer, config.evaluation, **settings)
     trainer.test(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 
 def _facts(trainer: Any, out: Path) -> dict[str, Any]:
     """Facts of the weights that were scored: those of the last checkpoint, if any was written."""
-    from lightning.pytorch.callbacks import WeightAveraging
-
-    from completesplat.commands.protocol import checkpoint_facts
-
-    last = out / "checkpoints" / "last.ckpt"
-    facts = checkpoint_facts(last) if last.is_file() else {}
+    facts = checkpoint_facts(out / LAST) if (out / LAST).is_file() else {}
     if facts.get("checkpoint", {}).get("step") == trainer.global_step:
         return facts
     return {"checkpoint": None, "ema": any(isinstance(callback, WeightAveraging) for callback in trainer.callbacks)}

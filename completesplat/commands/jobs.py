@@ -12,17 +12,22 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import get_method, instantiate
+from omegaconf import OmegaConf
+
 from completesplat import __version__
-from completesplat.commands.protocol import git_commit
+from completesplat.atomic import atomic_path
+from completesplat.commands.protocol import git_commit, write_json
 from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
 
 LONGEST_NAME = 120
-
-
-def is_sweep(arguments: list[str]) -> bool:
-    """Whether Hydra will start several jobs."""
-    return "-m" in arguments or "--multirun" in arguments
+CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
+LAST = "checkpoints/last.ckpt"
+PROCESS_OF_JOB = "--process-of"
+VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
 def one_of_several() -> bool:
@@ -37,9 +42,8 @@ def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]
         CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
     """
     if one_of_several():
-        raise CompleteSplatError(
-            "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
-        )
+        said = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
+        raise CompleteSplatError(said)
     keys = [override.split("=")[0] for override in arguments]
     added = [] if "out" in keys else [f"out=outputs/{verb}/{run_name}"]
     if verb == "fit" and "ckpt_path" not in keys:
@@ -52,8 +56,6 @@ def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]
 
 def swept_keys(arguments: list[str]) -> list[str]:
     """Keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
     overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
     return [override.key_or_group for override in parsed if override.is_sweep_override()]
@@ -72,29 +74,15 @@ def job_name(*keys: str, _root_: Any) -> str:
     return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
 
 
-CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
-LAST = "checkpoints/last.ckpt"
-PROCESS_OF_JOB = "--process-of"
-VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
-
-
 def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     """Run one job in its own directory, leaving there what is needed to know what was run.
 
-    A job with `ckpt_path=last` whose directory holds its results is not repeated.
-
-    Args:
-        program: path by which this program was started.
-        given: its arguments, behind the verb.
+    A job with `ckpt_path=last` whose directory holds its results is not repeated. `program` was started with the
+    arguments `given` behind the verb.
 
     Raises:
         CompleteSplatError: the directory holds other work.
     """
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf
-
-    from completesplat.atomic import atomic_path
-
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
@@ -103,7 +91,8 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
-    if is_first_process():
+    # The first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone.
+    if int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0:
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
             OmegaConf.save(resolved, temporary)
         _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
@@ -116,22 +105,12 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     print(out)
 
 
-def run_process_of_job(verb: str, out: Path) -> None:
-    """Work on a job whose first process is another one: Lightning starts one process for each device."""
-    from omegaconf import OmegaConf
-
-    start(verb, OmegaConf.load(out / CONFIG), out)
-
-
 def start(verb: str, config: Any, out: Path) -> None:
     """Call the function that the configuration names as its task, else the one of a verb that has a single task.
 
     Raises:
         CompleteSplatError: a setting does not fit the function's signature.
     """
-    from hydra.utils import get_method, instantiate
-    from omegaconf import OmegaConf
-
     if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
         return
@@ -140,19 +119,12 @@ def start(verb: str, config: Any, out: Path) -> None:
     instantiate(config.task, out=out, _convert_="all")
 
 
-def is_first_process() -> bool:
-    """Whether this is the first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone."""
-    return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
-
-
 def is_finished(out: Path, config: Any) -> bool:
     """Whether a job's directory holds its results, for jobs that have something to continue (`ckpt_path`).
 
     Raises:
         CompleteSplatError: there is training in it that would be lost, or that had other settings.
     """
-    from omegaconf import OmegaConf
-
     begun = (out / LAST).is_file() or (out / METRICS).is_file()
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():
         return False
@@ -180,17 +152,12 @@ def _differences(one: Any, other: Any, key: str = "") -> set[str]:
 def _record(path: Path, command: list[str], overrides: list[str]) -> None:
     """Write `run.json`: what was started and when, and when it was continued."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record: dict[str, Any] = {
-        "version": __version__,
-        "commit": git_commit(),
-        "command": command,
-        "overrides": overrides,
-        "started": now,
-    }
+    record: dict[str, Any] = {"version": __version__, "commit": git_commit()}
+    record |= {"command": command, "overrides": overrides, "started": now}
     if path.is_file() and (path.parent / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}
-    path.write_text(json.dumps(record, indent=2) + "\n")
+    write_json(path, record)
 
 
 @contextmanager
@@ -201,8 +168,6 @@ def _for_other_processes(arguments: list[str]) -> Iterator[None]:
     settings of Hydra's. The next job of a sweep is to start its own processes: what Lightning leaves behind would make
     it wait for those of this one.
     """
-    from hydra.core.hydra_config import HydraConfig
-
     given, hydra_config = sys.argv, HydraConfig.instance().cfg
     variables = {name: os.environ.get(name) for name in VARIABLES_OF_PROCESSES}
     sys.argv, HydraConfig.instance().cfg = arguments, None
@@ -210,17 +175,9 @@ def _for_other_processes(arguments: list[str]) -> Iterator[None]:
         yield
     finally:
         sys.argv, HydraConfig.instance().cfg = given, hydra_config
-        _leave_process_group()
-        for name, value in variables.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _leave_process_group() -> None:
-    if "torch" in sys.modules:
-        from torch import distributed
-
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.destroy_process_group()
+        torch = sys.modules.get("torch")
+        if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+        for name in VARIABLES_OF_PROCESSES:
+            os.environ.pop(name, None)
+        os.environ.update({name: value for name, value in variables.items() if value is not None})

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
 from hydra.utils import instantiate
 from jaxtyping import Float
@@ -15,7 +15,8 @@ from rich.progress import Progress
 from torch import Tensor
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.commands.generator import check_settings, open_generator
+from completesplat.commands.schema import Positive, Range, Share, check_settings
+from completesplat.commands.trained import open_generator
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS
@@ -25,16 +26,23 @@ from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 
-RANGES = {"background": (0, 1), "samples": (1, None), "frames": (1, None), "batch": (1, None), "steps": (1, 1000)}
-"""Smallest and largest value of the settings that are numbers."""
-SUFFIXES = (
-    *(".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif"),
-    *(".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm"),
-)
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
 
 log = logging.getLogger(__name__)
+
+
+class PredictNumbers(TypedDict):
+    """The settings that are numbers."""
+
+    samples: Positive
+    skip_weight: Share | None
+    guidance_weight: Share
+    steps: Annotated[int, Range(1, 1000)] | None
+    batch: Positive | None
+    frames: Positive
+    background: Share
 
 
 def run(config: Any, out: Path) -> None:
@@ -43,7 +51,7 @@ def run(config: Any, out: Path) -> None:
     Raises:
         CompleteSplatError: settings without a meaning, or at least one picture that failed.
     """
-    check_settings(config, RANGES)
+    check_settings(PredictNumbers, config)
     pictures = find_pictures(config.image)
     if config.mask is not None and len(pictures) > 1:
         raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
@@ -52,20 +60,18 @@ def run(config: Any, out: Path) -> None:
 
 
 def find_pictures(image: Any) -> list[Path]:
-    """The files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its pictures, sorted by name.
+    """The files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its pictures, by suffix, sorted.
 
-    A folder's pictures are known by their suffix, and its folders are left alone. Files that are named themselves are
-    taken as they are, missing ones too: reading them says what is wrong.
+    Files that are named themselves are taken as they are, missing ones too: reading them says what is wrong.
 
     Raises:
         CompleteSplatError: a folder without a picture, or an empty list.
     """
     found: list[Path] = []
-    for path in [Path(image)] if isinstance(image, str) else [Path(str(one)) for one in image]:
-        if not path.is_dir():
-            found.append(path)
-            continue
-        pictures = sorted(one for one in path.iterdir() if one.is_file() and one.suffix.lower() in SUFFIXES)
+    for path in map(Path, [image] if isinstance(image, str) else map(str, image)):
+        pictures = [path]
+        if path.is_dir():
+            pictures = sorted(one for one in path.iterdir() if one.is_file() and one.suffix.lower() in SUFFIXES)
         if not pictures:
             raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
         found += pictures
@@ -104,9 +110,7 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
 
 
 def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
-    """Write each picture's files into a folder of its own below `out`.
-
-    A bar shows how many samples are done; where nobody watches (no terminal), a line is printed for every picture.
+    """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
     Raises:
         CompleteSplatError: the only picture failed, or some of several, which it names.
@@ -119,16 +123,18 @@ def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path]
             bar.update(task, description=picture.name, completed=index * config.samples)
             start = time.perf_counter()
             try:
-                _predict(config, model, picture, rasterizer, wanted, out / name, lambda: bar.advance(task))
+                _predict(config, model, rasterizer, wanted, picture, out / name, lambda: bar.advance(task))
             except (CompleteSplatError, OSError) as error:
+                message = " ".join(str(error).split())
+                message = message if picture.name in message else f"{picture}: {message}"
                 if len(pictures) == 1:
-                    raise CompleteSplatError(_one_line(picture, error)) from error
+                    raise CompleteSplatError(message) from error
                 failed.append(picture.name)
-                print(f"error: {_one_line(picture, error)}", file=sys.stderr, flush=True)
+                print(f"error: {message}", file=sys.stderr, flush=True)
                 continue
             if not console.is_terminal:
-                seconds = time.perf_counter() - start
-                print(f"{index + 1}/{len(pictures)} {picture.name}: {out / name} ({seconds:.0f} s)", flush=True)
+                took = f"{time.perf_counter() - start:.0f} s"
+                print(f"{index + 1}/{len(pictures)} {picture.name}: {out / name} ({took})", flush=True)
     if failed:
         share = f"{len(failed)} of {len(pictures)} pictures failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
@@ -150,23 +156,17 @@ def folder_names(pictures: Sequence[Path]) -> list[str]:
     return names
 
 
-def _one_line(picture: Path, error: Exception) -> str:
-    message = " ".join(str(error).split())
-    return message if picture.name in message else f"{picture}: {message}"
-
-
 def _predict(
     config: Any,
     model: CompleteSplat,
-    image: Path,
     rasterizer: Rasterizer,
     wanted: Wanted,
+    image: Path,
     folder: Path,
     on_sample: Callable[[], None],
 ) -> None:
     photograph = model.read(image, config.fov)
-    warning = unusual_field_of_view(photograph, model.fov_degrees.item())
-    if warning is not None:
+    if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
         log.warning("%s: %s", image.name, warning)
     visible = visible_part(config, image, model.image_size)
     settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}

@@ -1,5 +1,6 @@
 """The statement of what was measured and how, which stands beside all figures of a test."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -7,15 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from completesplat import __version__
-from completesplat.weights import sha256_of
+from completesplat.atomic import write_text
+from completesplat.results.machine import machine
+from completesplat.weights import WEIGHTS_FILE, sha256_of, weights_folder
+
+
+def write_json(path: Path, content: Mapping[str, Any], allow_nan: bool = False) -> None:
+    """Write results in one step, so that a file that is there is whole."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=allow_nan) + "\n")
 
 
 def git_commit() -> str | None:
     """The commit of the source, marked when there are changes on top; None where there is no repository."""
-    folder = Path(__file__).parent
 
     def git(*arguments: str) -> str:
-        return subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, check=True).stdout
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
         if not git("ls-files", "."):  # an installed package inside somebody else's repository
@@ -25,23 +33,15 @@ def git_commit() -> str | None:
         return None
 
 
-LPIPS = {"net": "vgg", "version": "0.1", "range": [-1, 1]}
 METRICS: dict[str, dict[str, Any]] = {
     "psnr": {"range": [0, 1], "limit_db": 100},
     "ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
-    "lpips": LPIPS,
+    "lpips": {"net": "vgg", "version": "0.1", "range": [-1, 1]},
 }
 
 
 def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
-    """The statement that stands beside the results of a test.
-
-    Args:
-        evaluation: the configuration of the protocol (`conf/evaluation/`).
-        results: of the module's test.
-    """
-    from completesplat.results.machine import machine
-
+    """The statement beside a test's results, which followed the configuration `evaluation` (`conf/evaluation/`)."""
     scored, model = module.evaluation, results["model"]
     described = {
         "name": evaluation["name"],
@@ -58,13 +58,17 @@ def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dic
         "average": "over the views of a scene, then over scenes",
         "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},
         "missing": scored.missing,
-        "data_fingerprint": data.source("test").fingerprint(),
-        **{"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)},
-        "machine": machine(),
+        **provenance(data),
     }
     for metric in scored.set_metrics:
         described["metrics"] |= metric.settings()
     return described
+
+
+def provenance(data: Any) -> dict[str, Any]:
+    """The test data, and which program measured with it where."""
+    program = {"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)}
+    return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 
 
 def drawing(module: Any) -> dict[str, Any]:
@@ -91,7 +95,5 @@ def checkpoint_facts(path: Path) -> dict[str, Any]:
 
 def weights_facts(weights: str) -> dict[str, Any]:
     """The same for a folder of weights (`completesplat.weights`), which does not say how training ended."""
-    from completesplat.weights import WEIGHTS_FILE, weights_folder
-
     digest = sha256_of(weights_folder(weights) / WEIGHTS_FILE)
     return {"checkpoint": {"path": weights, "sha256": digest, "step": None}, "ema": None}

@@ -1,14 +1,15 @@
 """Settings are checked against the signature of the function that they start, before anything is done."""
 
 import math
+import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
 
 from completesplat.errors import CompleteSplatError
 
-KINDS = {int: "a whole number", float: "a number", bool: "true or false"}
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,8 @@ class Range:
         """Why the value is refused; None if it is not."""
         if self.least <= value <= self.most:
             return None
-        if math.isinf(self.most):
-            return f"must be at least {self.least:g}"
-        return f"must lie between {self.least:g} and {self.most:g}"
+        limited = f"lie between {self.least:g} and {self.most:g}"
+        return f"must be at least {self.least:g}" if math.isinf(self.most) else f"must {limited}"
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ class Filled:
 
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+Share = Annotated[float, Range(0, 1)]
 
 
 class Refused(NamedTuple):
@@ -60,7 +61,7 @@ class Refused(NamedTuple):
 
 
 def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
-    """Hold settings against the annotations of the function's arguments of the same names.
+    """Hold settings against the annotations of the same names: of a function's arguments, or in a `TypedDict`.
 
     Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Filled`; any other
     annotation accepts everything.
@@ -69,58 +70,45 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
         CompleteSplatError: names the first setting that does not fit, and what it may be.
     """
     hints = get_type_hints(function, include_extras=True)
-    for name, value in settings.items():
-        found = refused(hints.get(name, Any), value)
-        if found is not None:
-            key = name + found.place
-            example = f", such as {key}=[{found.value}]" if found.reason == "must be a list" else ""
-            raise CompleteSplatError(f"{key}={found.value}: {found.reason}{example}")
+    for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
+        hints |= get_type_hints(shared, include_extras=True)
+    for name in [name for name in settings if name in hints]:
+        for place, value, reason in refused(hints[name], settings[name]):
+            key = name + place
+            example = f", such as {key}=[{value}]" if reason == "must be a list" else ""
+            raise CompleteSplatError(f"{key}={value}: {reason}{example}")
 
 
-def refused(annotation: Any, value: Any) -> Refused | None:
-    """The part of a value that does not fit an annotation, with the reason; None if all fits."""
+def refused(annotation: Any, value: Any) -> list[Refused]:
+    """The parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        reasons = [rule.refusal(value) for rule in rules] if refused(kind, value) is None else []
-        return refused(kind, value) or next((Refused("", value, reason) for reason in reasons if reason), None)
+        reasons = [rule.refusal(value) for rule in rules] if not refused(kind, value) else []
+        return refused(kind, value) + [Refused("", value, reason) for reason in reasons if reason]
     if origin in (Union, UnionType):
         found = [refused(member, value) for member in arguments]
-        return None if None in found else found[0]
+        return [] if [] in found else found[0]
     if origin is Literal:
-        reason = OneOf(arguments).refusal(value)
-        return Refused("", value, reason) if reason else None
-    if origin is Sequence:
-        return _refused_list(arguments[0], value)
-    if origin is Mapping or is_typeddict(annotation):
-        return _refused_mapping(annotation, value)
-    if annotation is NoneType:
-        return None if value is None else Refused("", value, "must be null")
+        return refused(Annotated[Any, OneOf(arguments)], value)
+    if origin is Sequence:  # the whole list, where one of its entries does not fit
+        if isinstance(value, str) or not isinstance(value, Sequence):
+            return [Refused("", value, "must be a list")]
+        return [Refused("", value, one.reason) for entry in value for one in refused(arguments[0], entry)]
+    if origin is Mapping or typing.is_typeddict(annotation):
+        if not isinstance(value, Mapping):
+            return [Refused("", value, "must be a mapping")]
+        typed = get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else {}
+        kinds = {key: typed.get(key, Any) if typed else arguments[1] for key in value}
+        return [
+            one._replace(place=f".{key}{one.place}") for key, kind in kinds.items() for one in refused(kind, value[key])
+        ]
     if annotation in KINDS and not _is_a(annotation, value):
-        return Refused("", value, f"must be {KINDS[annotation]}")
-    return None
+        return [Refused("", value, f"must be {KINDS[annotation]}")]
+    return []
 
 
 def _is_a(kind: type, value: Any) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)
-
-
-def _refused_list(annotation: Any, value: Any) -> Refused | None:
-    """The whole list, where one of its entries does not fit."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        return Refused("", value, "must be a list")
-    found = [refused(annotation, entry) for entry in value]
-    return next((Refused("", value, one.reason) for one in found if one is not None), None)
-
-
-def _refused_mapping(annotation: Any, value: Any) -> Refused | None:
-    if not isinstance(value, Mapping):
-        return Refused("", value, "must be a mapping")
-    typed = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else {}
-    for key, entry in value.items():
-        found = refused(typed.get(key, Any) if typed else get_args(annotation)[1], entry)
-        if found is not None:
-            return found._replace(place=f".{key}{found.place}")
-    return None

@@ -1,4 +1,4 @@
-"""Trained models that are measured: a run's checkpoint with its configuration, or a folder of weights and data."""
+"""Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from completesplat.commands.protocol import checkpoint_facts, weights_facts
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.weights import CONFIG_FILE, in_the_box, weights_folder
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -48,15 +53,18 @@ class Trained:
         """
         if (self.ckpt is None) == (self.weights is None):
             raise CompleteSplatError("give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR data=NAME data.root=DIR")
+        if self.ckpt is not None and self.data is not None:
+            raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
-            if self.data is not None:
-                raise CompleteSplatError(
-                    "a checkpoint's data are its run's: change them by overrides=['data.root=DIR']"
-                )
             return config_of_run(Path(self.ckpt), list(self.overrides))
         if self.data is None:
             raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
         return self._config_of_weights(str(self.weights))
+
+    def open(self) -> tuple[Any, Any]:
+        """The model and the data module, as `open_module` and with the errors of `configuration`."""
+        configuration = self.configuration()
+        return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
     def open_module(self, configuration: Any) -> Any:
         """The model of the configuration, with its weights and the sampler that is to draw.
@@ -65,8 +73,6 @@ class Trained:
             WeightsError: the weights do not fit.
             CompleteSplatError: a sampler for a model that draws nothing.
         """
-        from hydra.utils import instantiate
-
         from completesplat.training.checkpoints import load_part
 
         module = instantiate(configuration.model, _convert_="all")
@@ -78,16 +84,10 @@ class Trained:
 
     def facts(self) -> dict[str, Any]:
         """Path and checksum of the weights, for the protocol of a measurement."""
-        from completesplat.commands.protocol import checkpoint_facts, weights_facts
-
         return checkpoint_facts(Path(self.ckpt)) if self.ckpt is not None else weights_facts(str(self.weights))
 
     def _config_of_weights(self, weights: str) -> Any:
         """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
-        from omegaconf import OmegaConf
-
-        from completesplat.weights import CONFIG_FILE, weights_folder
-
         folder = weights_folder(weights)
         model = {
             "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
@@ -104,24 +104,21 @@ class Trained:
         return found
 
 
-def open_run(ckpt: str, overrides: Sequence[str]) -> tuple[Any, Any]:
-    """The module of a run with its trained weights, and the run's data module.
-
-    Args:
-        ckpt: a checkpoint, whose run's directory holds the configuration of model and data.
-        overrides: changes to that configuration, as on the command line.
+def open_generator(config: Any) -> Any:
+    """The `CompleteSplat` of `config.weights`, saying if these are the package's own, with `config.sampler` if given.
 
     Raises:
-        WeightsError: the checkpoint or its run's configuration is missing or does not fit.
+        WeightsError: no weights, or not readable.
     """
-    from hydra.utils import instantiate
+    from completesplat.generation import CompleteSplat
 
-    from completesplat.commands import quieten
-
-    trained = Trained(ckpt, overrides)
-    configuration = trained.configuration()
-    quieten()
-    return trained.open_module(configuration), instantiate(configuration.data, _convert_="all")
+    if config.weights in in_the_box():
+        print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
+    model = CompleteSplat.from_pretrained(config.weights)
+    if config.get("sampler") is not None:
+        sampler: Any = OmegaConf.to_container(config.sampler)
+        model.replace_sampler(sampler)
+    return model
 
 
 def diffusion_of(module: Any) -> Any:
@@ -143,8 +140,6 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
     Raises:
         WeightsError: the checkpoint or its run's configuration is missing.
     """
-    from omegaconf import OmegaConf
-
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")

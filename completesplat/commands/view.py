@@ -4,51 +4,45 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
+from completesplat.commands.schema import Range, Share, check_settings
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
 EXPORT = "--export"
 WEIGHTS = (CONFIG_FILE, WEIGHTS_FILE)
 MOST_CAMERAS = 24
-RANGES = {
-    "samples": (1, 8),
-    "steps": (1, 1000),
-    "seed": (0, 2**31),
-    "port": (1, 65535),
-    "frames": (1, 1000),
-    "background": (0, 1),
-}
-"""Smallest and largest value of the settings that are numbers."""
+
+
+class ViewNumbers(TypedDict):
+    """The settings that are numbers."""
+
+    samples: Annotated[int, Range(1, 8)]
+    skip_weight: Share | None
+    guidance_weight: Share
+    steps: Annotated[int, Range(1, 1000)] | None
+    seed: Annotated[int, Range(0, 2**31)]
+    port: Annotated[int, Range(1, 65535)]
+    frames: Annotated[int, Range(1, 1000)]
+    background: Share
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
     """Hydra's form of what people type: `PATH` is `path=PATH`, `--export FILE` is `export=FILE`."""
-    given = [part for argument in arguments for part in _parted(argument)]
-    found = []
-    while given:
-        argument = given.pop(0)
-        if argument == EXPORT:
-            if not given:
+    found, given = [], iter(arguments)
+    for argument in given:
+        name, value = "path", argument
+        if argument.partition("=")[0] == EXPORT:
+            name, value = "export", argument.partition("=")[2] or next(given, "")
+            if not value:
                 raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
-            found.append(_setting("export", given.pop(0)))
         elif argument.startswith("-") or "=" in argument:
             found.append(argument)
-        else:
-            found.append(_setting("path", argument))
+            continue
+        escaped = value.replace("'", "\\'")  # quoted, so that hydra takes every character as it is
+        found.append(f"{name}='{escaped}'")
     return found
-
-
-def _parted(argument: str) -> list[str]:
-    """`--export=FILE` as two arguments."""
-    return argument.split("=", 1) if argument.startswith(f"{EXPORT}=") else [argument]
-
-
-def _setting(name: str, value: str) -> str:
-    """Quoted, so that hydra takes every character as it is."""
-    escaped = value.replace("'", "\\'")
-    return f"{name}='{escaped}'"
 
 
 def run(config: Any, out: Path) -> None:
@@ -57,9 +51,8 @@ def run(config: Any, out: Path) -> None:
         import viser  # noqa: F401
     except ImportError as error:
         raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
-    from completesplat.commands.generator import check_settings
 
-    check_settings(config, RANGES)
+    check_settings(ViewNumbers, config)
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
     page = make_page(config, out)
     try:
@@ -102,7 +95,7 @@ def make_page(config: Any, out: Path) -> Any:
     import torch
     from hydra.utils import instantiate
 
-    from completesplat.commands.generator import open_generator
+    from completesplat.commands.trained import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page, Saver, start_server, stop_server
     from completesplat.viewer.sample import read_scene
@@ -122,19 +115,15 @@ def make_page(config: Any, out: Path) -> Any:
         if model is None:
             return Page(server, stage, saver, stage.layers)
         page = Page(server, stage, saver, model.autoreconstructor.reconstructor.parameterization.layers)
-        completion = Completion(page, model, start_settings(config, model))
+        names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
+        steps = model.sampler.steps if config.steps is None else config.steps
+        completion = Completion(page, model, {name: config[name] for name in names} | {"steps": steps})
         if photograph is not None:
             completion.load(Path(config.image).name, photograph)
         return page
     except BaseException:
         stop_server(server)
         raise
-
-
-def start_settings(config: Any, model: Any) -> dict[str, Any]:
-    """Where the sliders stand at first."""
-    settings = {name: config[name] for name in ("samples", "skip_weight", "guidance_weight", "steps", "seed")}
-    return settings | ({"steps": model.sampler.steps} if settings["steps"] is None else {})
 
 
 def data_cameras(config: Any) -> Any:

@@ -1,32 +1,31 @@
 import os
 import subprocess
 import sys
-import time
 
 import pytest
-from support import compose_config
 
 from completesplat import __version__
 from completesplat.cli import VERBS
-from completesplat.commands.generator import check_settings
-from completesplat.commands.predict import RANGES
-from completesplat.errors import CompleteSplatError
 
 
-def test_help_lists_the_verbs(command):
-    finished = command("--help")
-    assert finished.status == 0
-    assert all(f"  {verb} " in finished.out for verb in VERBS)
+def test_help_and_version(command):
+    helped = command("--help")
+    assert helped.status == 0
+    assert all(f"  {verb} " in helped.out for verb in VERBS)
+    assert command("--version").out == f"completesplat {__version__}\n"
+
+
+def python(program: str, **settings) -> str:
+    """What a program prints in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, **settings
+    ).stdout
 
 
 def test_help_needs_no_heavy_import():
-    """In a process of its own, by what is imported rather than by the clock."""
     program = "import sys; sys.argv = ['completesplat', '--help']; from completesplat.cli import main; main(); "
     program += "print([m for m in ('torch', 'lightning', 'hydra', 'diffusers', 'numpy') if m in sys.modules])"
-    start = time.perf_counter()
-    output = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert output.splitlines()[-1] == "[]"
-    assert time.perf_counter() - start < 10  # a hang, not a benchmark
+    assert python(program, timeout=60).splitlines()[-1] == "[]"
 
 
 def test_a_reader_that_goes_away_is_no_fault_of_the_program():
@@ -46,13 +45,7 @@ def test_torch_is_loaded_with_short_waits_of_its_threads(given):
     program += "sys.meta_path.insert(0, Watch())\ntry:\n    main()\nexcept SystemExit:\n    pass\nimport torch"
     environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
     environment |= {} if given is None else {"GOMP_SPINCOUNT": given}
-    command = [sys.executable, "-c", program]
-    output = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
-    assert f"torch with {given or 3000}" in output.splitlines()
-
-
-def test_version(command):
-    assert command("--version").out == f"completesplat {__version__}\n"
+    assert f"torch with {given or 3000}" in python(program, env=environment).splitlines()
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -61,12 +54,7 @@ def test_every_verbs_help_shows_its_settings(command, verb):
     assert finished.status == 0
     assert f"completesplat {verb}: " in finished.out
     assert "out: " in finished.out
-
-
-def test_fits_help_shows_the_groups(command):
-    finished = command("fit", "--help")
-    for group in ("autoreconstructor", "data", "denoiser", "experiment", "loss", "model", "rasterizer", "sampler"):
-        assert f"{group}: " in finished.out
+    assert verb != "fit" or all(f"{group}: " in finished.out for group in ("experiment", "model", "rasterizer"))
 
 
 @pytest.mark.parametrize(
@@ -91,21 +79,5 @@ def test_refusals_are_one_line_and_status_two(command, arguments, said):
     assert said in finished.err
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("skip_weight=1.5", "skip_weight=1.5"),
-        ("guidance_weight=1.5", "guidance_weight=1.5: must lie between 0 and 1"),
-        ("samples=0", "samples=0: must be at least 1"),
-    ],
-)
-def test_settings_of_predict_outside_of_their_range_are_refused(setting, said):
-    with pytest.raises(CompleteSplatError, match=said):
-        check_settings(compose_config("predict", setting), RANGES)
-
-
 def test_two_launches_in_one_second_do_not_share_a_directory():
-    program = "from completesplat.commands import RUN_NAME; print(RUN_NAME)"
-    processes = [subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    names = [process.communicate()[0].strip() for process in processes]
-    assert len(set(names)) == 2
+    assert len({python("from completesplat.commands import RUN_NAME; print(RUN_NAME)") for _ in range(2)}) == 2

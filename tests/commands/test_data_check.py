@@ -16,11 +16,8 @@ from support import strict_json
 
 from completesplat.data.toy import write_objects
 
-FRAMES, SEQUENCES, SET_LIST = (
-    "frame_annotations.jgz",
-    "sequence_annotations.jgz",
-    "set_lists/set_lists_fewview_train.json",
-)
+FRAMES, SEQUENCES = "frame_annotations.jgz", "sequence_annotations.jgz"
+SET_LIST = "set_lists/set_lists_fewview_train.json"
 SCENES = 26
 
 
@@ -136,14 +133,8 @@ def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def checked(command, root: Path, out: Path) -> tuple[Any, Any]:
-    settings = [
-        "data=co3d_category",
-        f"data.root={root}",
-        "data.category=toy_objects",
-        "data.subset=fewview_train",
-        "data.image_size=16",
-        "workers=1",
-    ]
+    settings = ["data=co3d_category", f"data.root={root}", "data.category=toy_objects", "data.subset=fewview_train"]
+    settings += ["data.image_size=16", "workers=1"]
     finished = command("data", "check", *settings, f"out={out}")
     return finished, strict_json(out / "check.json")
 
@@ -181,35 +172,32 @@ def test_every_planted_fault_is_found_and_nothing_else(command, intact, tmp_path
         assert count > 0
 
 
-def test_where_nothing_is_usable_the_status_is_1(command, intact, tmp_path):
-    root = tmp_path / "set"
-    shutil.copytree(intact, root)
-    for picture in root.glob("toy_objects/*/images/*.jpg"):
+def empty_pictures(copy: Copy) -> None:
+    for picture in copy.folder.glob("*/images/*.jpg"):
         picture.write_bytes(b"")
+
+
+def share_sequences(copy: Copy) -> None:
+    copy.edit(SET_LIST, lambda lists: lists["test"].extend(lists["train"][:6]))
+
+
+@pytest.mark.parametrize(
+    ("damage", "count", "file", "reason"),
+    [
+        (empty_pictures, 3 * SCENES, "frame000003.jpg", "is empty"),
+        (lambda copy: cut_short(copy.folder / SEQUENCES), 1, SEQUENCES, ""),
+        (share_sequences, 1, SET_LIST, "2 sequences"),
+    ],
+    ids=["no picture is usable", "the set cannot be opened", "sequences are trained on and tested"],
+)
+def test_where_nothing_is_usable_the_status_is_1(command, intact, tmp_path, damage, count, file, reason):
+    root = tmp_path / "data/set"
+    shutil.copytree(intact, root)
+    damage(Copy(root / "toy_objects"))
     finished, found = checked(command, root, tmp_path / "out")
     assert finished.status == 1
     assert found["usable"] == {"sequences": 0, "frames": 0}
-    assert len(found["refused"]) == 3 * SCENES
-
-
-def test_a_set_that_cannot_be_opened_is_reported_as_well(command, intact, tmp_path):
-    root = tmp_path / "set"
-    shutil.copytree(intact, root)
-    cut_short(root / "toy_objects" / SEQUENCES)
-    finished, found = checked(command, root, tmp_path / "out")
-    assert finished.status == 1
-    (entry,) = found["refused"]
-    assert entry["file"].endswith(SEQUENCES)
-
-
-def test_sequences_that_are_trained_on_and_tested_are_reported(command, intact, tmp_path):
-    root = tmp_path / "data" / "set"
-    shutil.copytree(intact, root)
-    Copy(root / "toy_objects").edit(SET_LIST, lambda lists: lists["test"].extend(lists["train"][:6]))
-    finished, found = checked(command, root, tmp_path / "out")
-    assert finished.status == 1
-    (refused,) = found["refused"]
-    assert refused["file"] == str(root / "toy_objects" / SET_LIST)
-    assert "2 sequences" in refused["reason"]
-    assert found["counts"] == {"shared sequence": 1}
-    assert "shared sequence" in finished.out
+    assert len(found["refused"]) == count
+    assert found["refused"][-1]["file"].endswith(file)
+    assert reason in found["refused"][-1]["reason"]
+    assert all(kind in finished.out for kind in found["counts"])

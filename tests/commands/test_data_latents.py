@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-from support import SMALL, strict_json
+from support import SMALL, compose_config, refused, strict_json
 
+from completesplat.commands.jobs import start
 from completesplat.data.latent_cache import LatentCache
 from completesplat.generation import CompleteSplat
 
@@ -44,24 +45,17 @@ def test_a_run_is_encoded_once_and_trained_from(command, pipeline, packed_toys, 
         ("var", "overrides=[]", "run `completesplat data prepare` first"),
     ],
 )
-def test_what_cannot_be_encoded_is_refused_in_one_line(
-    command, pipeline, packed_toys, tmp_path, stage, setting, message
-):
+def test_what_cannot_be_encoded_is_refused(pipeline, packed_toys, stage, setting, message):
     checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-    given = [f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", f"out={tmp_path / 'cache'}"]
-    refused = command("data", "latents", *given, setting)
-    assert refused.status == 2
-    assert len(refused.err.splitlines()) == 1
-    assert message in refused.err
-    assert not list((tmp_path / "cache").glob("*.npy"))
+    given = ["data_task=latents", f"ckpt={checkpoint}", f"overrides=['data.root={packed_toys}']", setting]
+    assert message in refused("data", *given)
 
 
-def test_few_frames_and_half_precision_can_be_asked_for(command, pipeline, packed_toys, tmp_path):
-    checkpoint, cache = pipeline.var / "checkpoints/last.ckpt", tmp_path / "cache"
-    change = f"overrides=['data.root={packed_toys}']"
-    settings = [f"ckpt={checkpoint}", change, "frames=2", "precision=float16", "batch_size=1", f"out={cache}"]
-    assert command("data", "latents", *settings).status == 0
-    store = LatentCache(cache)
+def test_few_frames_and_half_precision_can_be_asked_for(pipeline, packed_toys, tmp_path):
+    given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
+    few = ["data_task=latents", "frames=2", "precision=float16", "batch_size=1"]
+    start("data", compose_config("data", *few, *given), tmp_path / "cache")
+    store = LatentCache(tmp_path / "cache")
     assert [sequence.stored for sequence in store.sequences.values()] == [(1, 3)] * 2
     assert store.arrays["mean"].dtype == "float16"
     assert store.arrays["condition"].dtype == "uint8"

@@ -1,5 +1,6 @@
 """A sweep that is killed, twice, ends in the table that it would have had: minutes, so run by `make test-slow`."""
 
+import csv
 import os
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
-from support import SMALL
+from support import SMALL, strict_json
 
 pytestmark = pytest.mark.slow
 JOBS = ["ablation-full+seed-0", "ablation-full+seed-1", "ablation-m1+seed-0", "ablation-m1+seed-1"]
@@ -34,6 +35,11 @@ def kill_in_the_middle_of(job: Path, process: subprocess.Popen) -> None:
     assert not (job / "metrics.json").exists()
 
 
+def logged_steps(job: Path) -> list[int]:
+    with open(job / "metrics.csv") as file:
+        return [int(row["step"]) for row in csv.DictReader(file) if row["train/mse"]]
+
+
 def test_a_sweep_that_is_killed_twice_ends_in_the_same_table(toy_root, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert start(tmp_path, toy_root, whole).wait() == 0
@@ -47,3 +53,6 @@ def test_a_sweep_that_is_killed_twice_ends_in_the_same_table(toy_root, tmp_path)
     assert sorted(path.name for path in killed.iterdir() if path.is_dir()) == JOBS
     assert (killed / JOBS[0] / "metrics.json").stat().st_mtime_ns == first
     assert (killed / "summary.csv").read_bytes() == (whole / "summary.csv").read_bytes()
+    for job, times in zip(JOBS, (0, 1, 1, 0), strict=True):
+        assert len(strict_json(killed / job / "run.json").get("continued", [])) == times
+        assert logged_steps(killed / job) == logged_steps(whole / job) == sorted(logged_steps(whole / job))

@@ -3,12 +3,14 @@
 import io
 import re
 from base64 import b64decode
+from pathlib import Path
 
 import pytest
 from PIL import Image
 from report_pages import FRAMES, HOSTILE, SAMPLES, Page, grey, picture, write_results
-from support import call
+from support import compose_config, refused
 
+from completesplat.commands.jobs import start
 from completesplat.results.html_page import strip
 
 
@@ -19,21 +21,21 @@ def results(tmp_path_factory):
     return root
 
 
+def written(runs: Path, out: Path, *settings: str) -> str:
+    out.mkdir(exist_ok=True)
+    config = compose_config("report", "report_task=html", f"runs={runs}", *settings)
+    start("report", config, out)
+    return (out / "report.html").read_text(encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def raw(results, tmp_path_factory):
-    out = tmp_path_factory.mktemp("page")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        assert call(monkeypatch, "report", "html", f"runs={results}", f"out={out}", "most.frames=6") == 0
-    return (out / "report.html").read_text(encoding="utf-8")
+    return written(results, tmp_path_factory.mktemp("page"), "most.frames=6")
 
 
 @pytest.fixture(scope="module")
 def page(raw):
     return Page(raw)
-
-
-def read(tmp_path) -> Page:
-    return Page((tmp_path / "out/report.html").read_text(encoding="utf-8"))
 
 
 def decoded(uri: str) -> Image.Image:
@@ -102,10 +104,8 @@ def test_wide_pictures_are_made_smaller(page):
     assert decoded(figure["src"]).size == (1600, 40)
 
 
-def test_what_does_not_fit_is_left_out_and_counted(command, results, tmp_path):
-    most = ["most.pictures=2", "most.samples=1", "most.runs=2"]
-    assert command("report", "html", f"runs={results}", f"out={tmp_path / 'out'}", *most).status == 0
-    page = read(tmp_path)
+def test_what_does_not_fit_is_left_out_and_counted(results, tmp_path):
+    page = Page(written(results, tmp_path, "most.pictures=2", "most.samples=1", "most.runs=2"))
     assert "3 more in" in page.text
     assert "2 more samples left out" in page.text
     assert "1 more runs left out" in page.text
@@ -113,15 +113,13 @@ def test_what_does_not_fit_is_left_out_and_counted(command, results, tmp_path):
     assert [re.findall(r"step_\d+", alt or "") for alt in steps] == [["step_000003"], ["step_000004"]]
 
 
-def test_a_full_page_says_so(command, tmp_path):
+def test_a_full_page_says_so(tmp_path):
     for name in ("one", "two"):
         Image.effect_noise((1200, 800), 100).save(tmp_path / f"{name}.png")  # about a megabyte of noise
         picture(tmp_path / f"runs/{name}/controls.png", 0)
         (tmp_path / f"{name}.png").replace(tmp_path / f"runs/{name}/controls.png")
         (tmp_path / f"runs/{name}/run.json").write_text("{}")
-    finished = command("report", "html", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}", "most.megabytes=1")
-    page = read(tmp_path)
-    assert finished.status == 0
+    page = Page(written(tmp_path / "runs", tmp_path / "out", "most.megabytes=1"))
     assert (tmp_path / "out/report.html").stat().st_size < 1.1e6
     assert len(page.all("img")) == 1
     assert "the page is full" in page.text
@@ -134,20 +132,18 @@ def test_what_cannot_be_read_is_named(command, tmp_path):
     (tmp_path / "runs/x/sheet.png").write_bytes(b"no picture")
     (tmp_path / "runs/metrics.json").write_text("{")
     finished = command("report", "html", f"runs={tmp_path / 'runs'}", f"out={tmp_path / 'out'}")
-    page = read(tmp_path)
     assert finished.status == 0
+    page = Page((tmp_path / "out/report.html").read_text(encoding="utf-8"))
     assert page.text.count("cannot be shown") == 2
     assert "metrics.json: left out" in page.text
 
 
 @pytest.mark.parametrize(("folder", "said"), [("nowhere", "no such folder"), ("", "nothing to show")])
-def test_a_folder_without_anything_is_refused_in_one_line(command, tmp_path, folder, said):
-    finished = command("report", "html", f"runs={tmp_path / folder}", f"out={tmp_path / 'out'}")
-    assert finished.status == 2
-    (line,) = finished.err.splitlines()
-    assert line.startswith("error: runs=")
+def test_a_folder_without_anything_is_refused(tmp_path, folder, said):
+    line = refused("report", "report_task=html", f"runs={tmp_path / folder}")
+    assert line.startswith("runs=")
     assert said in line
 
 
-def test_a_limit_of_nothing_is_refused(command, results):
-    assert "most.frames=0: must be at least 1" in command("report", "html", f"runs={results}", "most.frames=0").err
+def test_a_limit_of_nothing_is_refused():
+    assert refused("report", "report_task=html", "runs=x", "most.frames=0") == "most.frames=0: must be at least 1"

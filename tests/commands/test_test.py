@@ -16,13 +16,23 @@ from completesplat.results.tables import SSIM_NOTE
 from completesplat.training.scene_module import SceneModule
 
 
+@pytest.fixture
+def scored(command, pipeline, tmp_path):
+    """Run the command on a stage of the pipeline: what it printed, and its metrics."""
+
+    def run(stage, *settings, out="out"):
+        checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
+        given = [f"ckpt={checkpoint}", "trainer.accelerator=cpu", *settings, f"out={tmp_path / out}"]
+        finished = command("test", *given)
+        assert (finished.status, finished.out.splitlines()[-1]) == (0, str(tmp_path / out)), finished.err
+        return finished.out, strict_json(tmp_path / out / "metrics.json")
+
+    return run
+
+
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
-def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, stage):
-    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-    finished = command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}", "trainer.accelerator=cpu")
-    assert finished.status == 0
-    assert finished.out.splitlines()[-1] == str(tmp_path / "scores")
-    metrics = strict_json(tmp_path / "scores" / "metrics.json")
+def test_scores_stand_beside_the_naive_predictors(scored, stage):
+    said, metrics = scored(stage)
     described = metrics.pop("protocol")
     assert list(metrics) == ["model", "mean_image", "copy_reference"]
     assert described["data_set"] == "toy_objects"
@@ -35,15 +45,7 @@ def test_scores_stand_beside_the_naive_predictors(command, pipeline, tmp_path, s
         assert scores["scenes"] > 0
         assert scores["views"] == scores["scenes"] * 2
     assert metrics["copy_reference"]["full"]["reference"]["psnr"] == 100
-    assert "copy_reference" in finished.out
-
-
-def test_the_runs_configuration_can_be_changed(command, pipeline, tmp_path):
-    checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    change = "overrides=['data.evaluation_targets=1']"
-    assert command("test", f"ckpt={checkpoint}", change, f"out={tmp_path / 'one'}").status == 0
-    model = strict_json(tmp_path / "one" / "metrics.json")["model"]
-    assert model["views"] == model["scenes"]
+    assert "copy_reference" in said
 
 
 def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path):
@@ -58,7 +60,7 @@ def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_pa
     assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}").status == 0
 
 
-def test_samples_can_be_drawn_by_another_sampler(command, pipeline, tmp_path, monkeypatch):
+def test_the_protocol_says_what_was_measured_and_how(scored, pipeline, monkeypatch):
     used = []
     draw = Sampler.__call__
 
@@ -67,27 +69,12 @@ def test_samples_can_be_drawn_by_another_sampler(command, pipeline, tmp_path, mo
         return draw(self, *arguments)
 
     monkeypatch.setattr(Sampler, "__call__", watched)
-    checkpoint = f"ckpt={pipeline.diffusion / 'checkpoints/last.ckpt'}"
-    assert (
-        command("test", checkpoint, "sampler=dpm10", "trainer.accelerator=cpu", f"out={tmp_path / 'out'}").status == 0
-    )
-    assert set(used) == {("DPMSolverMultistepScheduler", 10)}
-
-
-def test_a_sampler_for_a_model_without_samples_is_refused(command, pipeline, tmp_path):
-    checkpoint = f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}"
-    finished = command("test", checkpoint, "sampler=dpm10", f"out={tmp_path / 'out'}")
-    assert finished.status == 2
-    assert "a diffusion model is needed" in finished.err.splitlines()[-1]
-
-
-def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path):
-    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
-    change = "overrides=['model.guidance_weight=0.5']"
-    finished = command("test", f"ckpt={checkpoint}", change, "sampler=dpm10", "seed=3", f"out={tmp_path}")
-    assert finished.status == 0, finished.err
-    metrics = strict_json(tmp_path / "metrics.json")
+    change = "overrides=['model.guidance_weight=0.5','data.evaluation_targets=1']"
+    said, metrics = scored("diffusion", change, "sampler=dpm10", "seed=3")
     described, model = metrics["protocol"], metrics["model"]
+    assert set(used) == {("DPMSolverMultistepScheduler", 10)}
+    assert model["views"] == model["scenes"]
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
     assert (described["method"], described["name"], described["samples"]) == ("LatentDiffusion", "images", 1)
     assert (described["sampler"], described["steps"]) == ("DPMSolverMultistepScheduler", 10)
     assert (described["skip_weight"], described["guidance_weight"], described["seed"]) == (1.0, 0.5, 3)
@@ -99,22 +86,19 @@ def test_the_protocol_says_what_was_measured_and_how(command, pipeline, tmp_path
     assert described["ema"] is True  # stage 2 averages its weights
     ssim = described["metrics"]["ssim"]
     assert (ssim["window"], ssim["border"]) == (11, "mirrored, counted")
-    assert SSIM_NOTE in " ".join(finished.out.split())
+    assert SSIM_NOTE in " ".join(said.split())
     assert model["seconds"].keys() == {"inference", "rendering"}
     assert model["full"]["novel"]["swd"] > 0
     # Toy objects have true depth; predictors that are pictures alone have none to compare.
     assert 0 < model["object"]["novel"]["depth_abs_rel"] < 10
     assert "depth_abs_rel" not in metrics["mean_image"]["full"]["novel"]
     for name, reason in described["missing"].items():
-        assert f"{name}: missing: give " in finished.out
+        assert f"{name}: missing: give " in said
         assert reason.startswith("missing: ")
 
 
-def test_the_best_of_several_samples_stands_beside_one_and_the_mean(command, pipeline, tmp_path):
-    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
-    several = command("test", f"ckpt={checkpoint}", "evaluation.scoring.samples=3", "sampler=dpm10", f"out={tmp_path}")
-    assert several.status == 0, several.err
-    metrics = strict_json(tmp_path / "metrics.json")
+def test_the_best_of_several_samples_stands_beside_one_and_the_mean(scored):
+    _, metrics = scored("diffusion", "evaluation.scoring.samples=3", "sampler=dpm10")
     one, best, mean = (metrics[row]["full"]["novel"]["psnr"] for row in ("model", "best_of_k", "mean_of_k"))
     assert best >= max(one, mean)
     curve = metrics["best_of_k"]["curve"]
@@ -125,7 +109,7 @@ def test_the_best_of_several_samples_stands_beside_one_and_the_mean(command, pip
 
 
 def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pictures_it_was_trained_on(
-    command, pipeline, tmp_path, monkeypatch
+    scored, pipeline, tmp_path, monkeypatch
 ):
     shown = []
     draw = SceneModule.draw
@@ -137,9 +121,7 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
     monkeypatch.setattr(SceneModule, "draw", watched)
     root = tmp_path / "larger"  # its pictures are larger than both sizes
     write_objects(root, scenes=4, frames=3, size=96, seed=0, workers=1, progress=False)
-    checkpoint, change = pipeline.var / "checkpoints/last.ckpt", f"overrides=['data.root={root}']"
-    assert command("test", f"ckpt={checkpoint}", "evaluation.resolution=48", change, f"out={tmp_path}").status == 0
-    described = strict_json(tmp_path / "metrics.json")["protocol"]
+    described = scored("var", "evaluation.resolution=48", f"overrides=['data.root={root}']")[1]["protocol"]
     assert (described["image_size"], described["resolution"]) == (32, 48)
     config = OmegaConf.load(pipeline.var / "config.yaml")
     config.data.root = str(root)
@@ -151,12 +133,15 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
         assert torch.equal(ours.cameras.intrinsics, theirs.cameras.intrinsics)
 
 
-def test_prepared_pictures_have_one_size(command, pipeline, tmp_path):
-    settings = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32"]
-    assert command("data", "prepare", *settings, f"out={tmp_path / 'prepared'}").status == 0
-    run = compose_config("fit", "experiment=toy_var", f"data.root={tmp_path / 'prepared'}", "data.image_size=32")
+def test_prepared_pictures_have_one_size(packed_toys):
+    run = compose_config("fit", "experiment=toy_var", f"data.root={packed_toys}", "data.image_size=32")
     with pytest.raises(CompleteSplatError, match=r"evaluation\.resolution=48: prepared pictures have one size"):
         scored_data(run, compose_config("fit", "evaluation.resolution=48").evaluation)
+
+
+def test_a_sampler_for_a_model_without_samples_is_refused(pipeline):
+    with pytest.raises(CompleteSplatError, match="a diffusion model is needed"):
+        Trained(str(pipeline.var / "checkpoints/last.ckpt"), sampler={"steps": 2}).open()
 
 
 @pytest.mark.parametrize(
@@ -175,19 +160,10 @@ def test_protocols_that_do_not_fit_the_data_are_refused(toy_root, arguments, sai
         scored_data(run, compose_config("fit", *arguments).evaluation)
 
 
-def test_several_samples_of_a_model_that_draws_none_are_refused(command, pipeline, tmp_path):
-    given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"out={tmp_path / 'out'}"]
-    finished = command("test", *given, "evaluation.scoring.samples=2")
-    assert finished.status == 2
-    assert "draws no samples" in finished.err.splitlines()[-1]
-
-
-def test_weights_score_as_the_checkpoint_they_were_saved_with(command, pipeline, tmp_path):
+def test_weights_score_as_the_checkpoint_they_were_saved_with(scored, pipeline):
     data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.evaluation_targets=2"]
-    assert command("test", f"weights={pipeline.weights}", *data, f"out={tmp_path / 'a'}").status == 0
-    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
-    assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'b'}").status == 0
-    first, second = (strict_json(tmp_path / name / "metrics.json") for name in "ab")
+    _, first = scored("diffusion", "ckpt=null", f"weights={pipeline.weights}", *data)
+    _, second = scored("diffusion", out="other")
     for predictor in ("model", "copy_reference"):
         for views in ("novel", "reference"):
             assert first[predictor]["full"][views] == pytest.approx(second[predictor]["full"][views], rel=1e-6)
