@@ -6,13 +6,10 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """Something of a data set that is missing, broken or not in the expected layout; its kinds: `data/checks.py`.
+    """Something of a data set that is missing, broken or not in the expected layout.
 
     Args:
-        reason: what is wrong, without the place.
-        file: the file (or folder) it was found in.
-        sequence: the name of the sequence (RealEstate10K: clip).
-        frame: the number of the frame in its data set.
+        reason: what is wrong, without the place: file or folder, name of the sequence, number of the frame in it.
     """
 
     kind = "not as expected"
@@ -21,10 +18,7 @@ class DataError(CompleteSplatError):
         self, reason: str, file: str | None = None, sequence: str | None = None, frame: int | None = None
     ) -> None:
         super().__init__(reason, file, sequence, frame)
-        self.reason = reason
-        self.file = file
-        self.sequence = sequence
-        self.frame = frame
+        self.reason, self.file, self.sequence, self.frame = reason, file, sequence, frame
 
     def __str__(self) -> str:
         frame = None if self.frame is None else f"frame {self.frame}"

@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from completesplat.viewer.worker import Worker
+from completesplat.viewer.page import Worker
 
 
 @pytest.fixture
@@ -34,14 +34,6 @@ def test_of_waiting_jobs_of_a_kind_the_newest_is_done(worker):
     release.set()
     assert worker.wait(5)
     assert sorted(done) == ["saved", "third"]
-
-
-def test_submitting_does_not_wait_for_the_work(worker):
-    release = blocked(worker)
-    worker.submit("draw", lambda: None)
-    assert not worker.wait(0.01)
-    release.set()
-    assert worker.wait(5)
 
 
 def test_jobs_run_one_at_a_time_in_another_thread(worker):
