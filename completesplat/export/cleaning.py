@@ -29,8 +29,7 @@ def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
 def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     """One unbatched set without the Gaussians that cannot be stored; their number is logged as a warning.
 
-    Raises:
-        CompleteSplatError: nothing is left of a set that was not empty; `name` is that of the file or sample.
+    `CompleteSplatError`: nothing is left of a set that was not empty; `name` is that of the file or sample.
     """
     kept = storable(gaussians)
     broken = gaussians.count - int(kept.sum())

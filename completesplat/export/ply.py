@@ -43,10 +43,7 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
         comments: metadata for the header, a line each; characters outside ASCII are escaped.
 
     Returns:
-        How many Gaussians the file holds: those that can be stored (`completesplat.export.cleaning`).
-
-    Raises:
-        CompleteSplatError: none of the Gaussians can be stored.
+        How many Gaussians the file holds: those that can be stored; `CompleteSplatError` if there are none.
     """
     table = _table(cleaned(gaussians, path))
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -92,10 +89,8 @@ def read_ply(path: str | Path) -> Gaussians:
     """Read a binary little-endian 3DGS `.ply`, of this project or another.
 
     Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
-    become 0, as in the renderers of such files.
-
-    Raises:
-        PlyError: no such file, another format or size than the header declares, or values that are not finite.
+    become 0, as in the renderers of such files. `PlyError`: no such file, another format or size than the header
+    declares, or values that are not finite.
     """
     try:
         if not Path(path).is_file():

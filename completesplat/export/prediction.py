@@ -85,8 +85,7 @@ def write_prediction(
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_sample: called when a sample's files are written.
 
-    Raises:
-        CompleteSplatError: a sample without anything to draw, or a converter that fails.
+    `CompleteSplatError`: a sample without anything to draw, or a converter that fails.
     """
     # Before anything is written: a sample of which nothing is left is refused.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]

@@ -35,10 +35,9 @@ class SplatTransform:
     program: str
 
     def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target` in the format that its suffix names; the file appears whole or not at all.
+        """Write `target`, in the format that its suffix names, whole or not at all.
 
-        Raises:
-            CompleteSplatError: the program fails, writes nothing, or takes more than ten minutes.
+        `CompleteSplatError`: the program fails, writes nothing, or takes more than ten minutes.
         """
         with atomic_path(target) as temporary:
             _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
@@ -49,8 +48,7 @@ class SplatTransform:
 def find_splat_transform() -> SplatTransform:
     """The program on PATH; without one npm's package, which `npx` downloads on first use and keeps (some 200 MB).
 
-    Raises:
-        CompleteSplatError: neither is there, or the program does not start.
+    `CompleteSplatError`: neither is there, or the program does not start.
     """
     program = shutil.which(PROGRAM)
     if program is None:

@@ -40,11 +40,8 @@ class Checkpoints(Checkpoint):
     it. A run that is killed at any moment leaves a whole `last.ckpt`.
 
     Args:
-        every_n_train_steps, every_minutes: optimizer steps or minutes between them; None: these do not matter.
-        keep_every: optimizer steps between milestones; None: none are kept.
-
-    Raises:
-        CompleteSplatError: an interval of steps below 1.
+        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
+        keep_every: optimizer steps between milestones (at least 1); None: none are kept.
     """
 
     def __init__(

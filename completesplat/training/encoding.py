@@ -66,9 +66,8 @@ def check_cache(
     Args:
         conditioning: a frozen one needs its own features, one that is trained needs pictures; None is not looked at.
 
-    Raises:
-        WeightsError: it was made with another autoreconstructor, or with another conditioning.
-        DataError: it was made of other data, or its latents have another shape than this autoreconstructor's.
+    `WeightsError`: made with another autoreconstructor or conditioning; `DataError`: of other data, or its latents
+    have another shape than this autoreconstructor's.
     """
     if store.origin.encoder != fingerprint(autoreconstructor.encoder):
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
@@ -147,9 +146,7 @@ def encode_training_set(
             first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
         conditioning: frozen, images -> features, which are stored; None: the pictures are.
 
-    Raises:
-        DataError: data that are not packed or are damaged, no space, another store in the folder, or encodings that
-            are not finite.
+    `DataError`: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
     """
     if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
         raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
@@ -165,13 +162,9 @@ def encode_training_set(
         logger.info("%s already holds these encodings", out)
         return store
     out.mkdir(parents=True, exist_ok=True)
-    encode = partial(
-        encoded,
-        encoder=autoreconstructor.to(device).eval().encoder,
-        conditioning=None if conditioning is None else conditioning.to(device).eval(),
-        precision=PRECISIONS[precision],
-        device=device,
-    )
+    features = None if conditioning is None else conditioning.to(device).eval()
+    encoder = autoreconstructor.to(device).eval().encoder
+    encode = partial(encoded, encoder=encoder, conditioning=features, precision=PRECISIONS[precision], device=device)
     blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []

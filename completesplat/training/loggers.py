@@ -99,9 +99,6 @@ class WandbRun(WandbLogger):
         mode: online, offline or disabled.
         group, name: by default the sweep's folder, in a sweep, and the name of the directory.
         scenes: shown of a test.
-
-    Raises:
-        CompleteSplatError: another mode, or wandb is not installed.
     """
 
     def __init__(

@@ -51,11 +51,7 @@ class FittedScenes:
         self.settings = settings
 
     def complete(self, names: Sequence[str], progress: bool) -> None:
-        """Fit those of these sequences that are not there yet; a bar shows it, or ten lines where there is no terminal.
-
-        Raises:
-            DataError: a sequence or one of its pictures cannot be read.
-        """
+        """Fit those that are not there yet (`DataError` if a sequence cannot be read); a bar, or ten lines, show it."""
         missing = [name for name in names if not self._path(name).is_file()]
         bar = progress and get_console().is_terminal
         for done, name in enumerate(track(missing, "fitting Gaussians to scenes", disable=not bar), start=1):
@@ -122,18 +118,11 @@ class PreoptimizedVAE(Preoptimized):
         self._kept: FittedScenes | None = None
 
     def on_fit_start(self) -> None:
-        """Fit the training set, each process its share of it, and measure the normalisation.
-
-        Raises:
-            CompleteSplatError: encoded pictures.
-            DataError: a training sequence or one of its pictures cannot be read.
-        """
+        """Fit the training set, each process its share of it, and measure the normalisation."""
         trainer: Any = self.trainer
         data = trainer.datamodule
         if data.latent_cache is not None:
-            raise CompleteSplatError(
-                "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
-            )
+            raise CompleteSplatError("data.latent_cache is for model=latent_diffusion: set it to null")
         terms = {name: term.weight for name, term in self.loss.terms.items()}
         settings = f"{self.fitting} {terms} {self.background} {data.image_size}"
         stores = [data.store("val"), data.store("train")]

@@ -97,7 +97,6 @@ class SceneModule(LightningModule):
     """A model that turns reference images into Gaussians.
 
     Args:
-        optimizer: parameters -> optimizer.
         schedule: optimizer and steps of the run -> learning-rate schedule, stepped every optimizer step.
         background: grey value (0 to 1) seen where the Gaussians leave a pixel open.
     """

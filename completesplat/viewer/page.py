@@ -109,11 +109,7 @@ class Saver:
         return self._make_rasterizer()
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write these samples as `ply` or `video`, or the page as it stands as `html`.
-
-        Raises:
-            CompleteSplatError: nothing is shown yet.
-        """
+        """Write these samples as `ply` or `video`, or the page as it stands as `html`."""
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         if kind == "html":

@@ -27,9 +27,7 @@ def weights_folder(weights: Path | str) -> Path:
     """The folder that is meant: a name of `in_the_box`, else a folder, else an id of the Hugging Face hub.
 
     Of the hub, files are downloaded once (a token, a mirror, work without a network: by its environment variables).
-
-    Raises:
-        WeightsError: there are none, files are missing, or one has another checksum.
+    `WeightsError`: there are none, files are missing, or one has another checksum.
     """
     folder = _locate(str(weights))
     for name in (CONFIG_FILE, WEIGHTS_FILE):
@@ -87,8 +85,7 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
         advice: how to get the right file and where to give it, the end of every refusal.
         hash_setting: the setting that `sha256` came from.
 
-    Raises:
-        WeightsError: the file is missing, cannot be downloaded, or is another one.
+    `WeightsError`: the file is missing, cannot be downloaded, or is another one.
     """
     expected = None if sha256 is None else sha256.lower()
     url = weights.startswith(("http://", "https://"))

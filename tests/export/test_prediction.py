@@ -121,3 +121,12 @@ def test_numbers_that_are_not_finite_leave_the_old_file(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         write_scene_json(tmp_path / "s.json", OBLONG, {"weight": torch.inf}, 0, {})
     assert [path.read_text() for path in tmp_path.iterdir()] == ["{}"]
+
+
+def test_the_title_is_drawn_above_all_pictures(tmp_path, rows):
+    for name in ("a title", ""):
+        contact_sheet(tmp_path / f"{name}.png", name, torch.ones(3, 36, 48), rows[:1], [0.0] * 8)
+    first, second = (read(tmp_path, name).astype(int) for name in ("a title", ""))
+    changed = np.argwhere(np.abs(first - second).sum(-1) > 0)
+    assert len(changed) > 0
+    assert changed[:, 0].max() < 40

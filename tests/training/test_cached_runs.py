@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pandas
 import pytest
+import torch
 from support import SMALL, call
 
 from completesplat.data.latent_cache.store import LatentCache
@@ -74,3 +75,16 @@ def test_the_scale_is_the_caches_and_near_the_one_that_is_measured(fit, pipeline
     (measured,) = logged(pipeline.diffusion, "^latent_scale")["latent_scale"]
     assert exact == pytest.approx(LatentCache(latent_cache).scale)
     assert exact == pytest.approx(measured, rel=0.1)
+
+
+def test_the_cache_of_another_autoreconstructor_is_refused_in_one_line(command, pipeline, latent_cache, tmp_path):
+    checkpoint = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)
+    name = next(name for name in checkpoint["state_dict"] if name.startswith("model.encoder."))
+    checkpoint["state_dict"][name].view(-1)[0] += 1
+    torch.save(checkpoint, tmp_path / "other.ckpt")
+    given = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, f"data.latent_cache={latent_cache}"]
+    start = f"model.autoreconstructor_checkpoint={tmp_path / 'other.ckpt'}"
+    finished = command("fit", *given, start, f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    assert "made with another autoreconstructor; encode the training set again" in finished.err.splitlines()[-1]
+    assert not (tmp_path / "run/checkpoints").exists()

@@ -83,3 +83,10 @@ def test_processes_of_a_launcher_need_one_directory(command, monkeypatch, variab
     assert refused.status == 2
     assert "give them one out=DIR" in refused.err.splitlines()[-1]
     assert not os.path.exists("outputs")
+
+
+def test_a_batch_that_the_devices_do_not_share_is_refused_before_they_start(command, toy_root, tmp_path):
+    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=3", "rasterizer=reference"]
+    finished = command("fit", *settings, "trainer.devices=2", "trainer.strategy=ddp", f"out={tmp_path / 'run'}")
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith("error: data.batch_size=3 is the batch of an optimizer step")

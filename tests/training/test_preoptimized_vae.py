@@ -1,10 +1,13 @@
 """Gaussians fitted once to whole sequences, and the VAE that is trained on their Splatter Images."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.scene import SceneBatch
@@ -115,3 +118,10 @@ def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tm
         FittedScenes(tmp_path, [store], fit, settings).complete(store.names, progress=False)
     assert calls == [*store.names, *store.names]
     assert len(list(tmp_path.iterdir())) == len(calls)
+
+
+def test_encoded_pictures_are_refused():
+    module = instantiate(compose_config("fit", *SETTINGS).model, _convert_="all")
+    module._trainer = SimpleNamespace(datamodule=SimpleNamespace(latent_cache="folder"))
+    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is for model=latent_diffusion"):
+        module.on_fit_start()
