@@ -8,15 +8,17 @@ from pathlib import Path
 
 
 @contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that takes its place when the block ends without an exception.
+def atomic_path(path: str | Path, name: str | None = None) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends without an exception.
 
-    The folder of `path` is made if it is missing. After an exception the old file is as it was and nothing is left
-    beside it. The temporary file lies in the same folder, so that the last step is a rename, never a copy.
+    The folder is made if it is missing. After an exception the old file is as it was and nothing is left beside it.
+
+    Args:
+        name: of the temporary file; by default one of its own each time, with the suffix of `path`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb+") as file:

@@ -10,9 +10,7 @@ class DataError(CompleteSplatError):
 
     Args:
         reason: what is wrong, without the place.
-        file: the file (or folder) it was found in.
-        sequence: the name of the sequence (RealEstate10K: clip).
-        frame: the number of the frame in its data set.
+        file, sequence, frame: the place: file or folder, name of the sequence, number of the frame in its data set.
     """
 
     kind = "not as expected"
@@ -24,10 +22,7 @@ class DataError(CompleteSplatError):
         self, reason: str, file: str | None = None, sequence: str | None = None, frame: int | None = None
     ) -> None:
         super().__init__(reason, file, sequence, frame)
-        self.reason = reason
-        self.file = file
-        self.sequence = sequence
-        self.frame = frame
+        self.reason, self.file, self.sequence, self.frame = reason, file, sequence, frame
 
     def __str__(self) -> str:
         frame = None if self.frame is None else f"frame {self.frame}"

@@ -96,18 +96,15 @@ class SplatterImage(TensorDataclass):
 
     def split(self) -> dict[str, Float[Tensor, "*batch layer channel height width"]]:
         """The raw values by group, in the order of `GROUPS`."""
-        parts = self.raw.split([group.channels for group in GROUPS.values()], dim=-3)
+        parts = torch.split(self.raw, [group.channels for group in GROUPS.values()], dim=-3)
         return dict(zip(GROUPS, parts, strict=True))
 
     def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> Gaussians:
         """Activate the raw values and place each Gaussian on its pixel's ray (supplement A.1).
 
         Args:
-            cameras: the reference cameras [*batch], of which only the intrinsics matter.
+            cameras: the reference cameras [*batch], of which only the intrinsics matter; the result is in their frames.
             depth_range: near and far along the optical axis, in scene units.
-
-        Returns:
-            layers * height * width Gaussians in the reference cameras' frames.
         """
         parts, settings = self.split(), self.parameterization
         near, far = (x[..., None, None, None] for x in depth_range.unbind(-1))
@@ -131,7 +128,8 @@ def from_channels(
     output: Float[Tensor, "batch channel height width"], parameterization: Parameterization
 ) -> SplatterImage:
     """Read a network's output, whose channels are ordered by layer, then by group."""
-    return SplatterImage(output.unflatten(1, (parameterization.layers, CHANNELS)), parameterization)
+    raw = rearrange(output, "batch (layer channel) height width -> batch layer channel height width", channel=CHANNELS)
+    return SplatterImage(raw, parameterization)
 
 
 @torch.no_grad()
@@ -140,19 +138,16 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
 
     Upstream's output passes a 3x3 convolution of 128 channels to N (xavier, weights times 0.2) and then a 1x1
     convolution with a gain for each group (`gaussian_predictor.py`, SongUNet and SingleImageSongUNetPredictor). Here
-    there is one convolution, whose weights have the variance that lets its raw values deviate as theirs do. With
-    upstream's gains alone they would be spread four times as far, most colours outside [0, 1].
+    there is one convolution, with the variance that lets its raw values deviate as theirs do.
     """
     assert head.bias is not None
     inputs = head.weight[0].numel()
     row = 0
-    for _ in range(parameterization.layers):
-        for group in GROUPS.values():
-            rows = slice(row, row + group.channels)
-            bound = math.sqrt(3 * _upstream_variance(group) / inputs)
-            nn.init.uniform_(head.weight[rows], -bound, bound)
-            nn.init.constant_(head.bias[rows], group.bias)
-            row += group.channels
+    for group in [*GROUPS.values()] * parameterization.layers:
+        rows, row = slice(row, row + group.channels), row + group.channels
+        bound = math.sqrt(3 * _upstream_variance(group) / inputs)
+        nn.init.uniform_(head.weight[rows], -bound, bound)
+        nn.init.constant_(head.bias[rows], group.bias)
 
 
 def _upstream_variance(group: Group) -> float:

@@ -15,8 +15,8 @@ T = TypeVar("T", bound="TensorDataclass")
 class TensorDataclass:
     """Base of the frozen dataclasses whose fields are tensors, nested tensor dataclasses, or static values.
 
-    Static values (image sizes, names, None) are carried along unchanged. A TypeVar stands where `typing.Self`
-    would be expected because beartype's import hook does not accept `Self` here.
+    Static values (image sizes, names, None) are carried along unchanged. A TypeVar stands for `typing.Self`, which
+    beartype's import hook does not accept here.
     """
 
     def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
@@ -57,10 +57,7 @@ class TensorDataclass:
 def stack(items: Sequence[T]) -> T:
     """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
 
-    Strings are collected into a tuple, one for each item; any other static value must be the same in all items.
-
-    Raises:
-        ValueError: no items, or static values that differ.
+    Strings are collected into a tuple; another static value must be the same in all items (`ValueError` otherwise).
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")

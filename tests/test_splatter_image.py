@@ -7,7 +7,7 @@ from torch import nn
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.baselines.splatter_image import SplatterImageUNet
+from completesplat.baselines.regressor import SplatterImageUNet
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.splatter_image import CHANNELS, GROUPS, SH_C0, Parameterization, SplatterImage
 
@@ -25,14 +25,9 @@ def image_of(layers: int = 2, depths: str = "independent", **raw: torch.Tensor |
     return SplatterImage(torch.cat(parts, dim=2), Parameterization(layers, depths))
 
 
-def test_fifteen_channels_in_the_papers_order():
-    assert CHANNELS == 15
-    assert [(name, group.channels) for name, group in GROUPS.items()] == [
-        ("depth", 1), ("offset", 3), ("opacity", 1), ("scale", 3), ("rotation", 4), ("color", 3),
-    ]  # fmt: skip
-
-
 def test_closed_forms_at_the_heads_bias():
+    assert list(GROUPS) == ["depth", "offset", "opacity", "scale", "rotation", "color"]  # the paper's order
+    assert ([group.channels for group in GROUPS.values()], CHANNELS) == ([1, 3, 1, 3, 4, 3], 15)
     gaussians = image_of().gaussians(CAMERA, RANGE)
     assert gaussians.count == 2 * SIZE * SIZE
     torch.testing.assert_close(gaussians.means[..., 2], torch.full((1, 72), 3.0))
@@ -62,32 +57,25 @@ def test_color_is_the_zeroth_harmonic_cut_at_black():
     torch.testing.assert_close(color, torch.tensor([0.5 + 1 / (2 * math.sqrt(math.pi)), 0.0, 0.5]))
 
 
-@pytest.mark.parametrize(("raw", "expected"), [(-100.0, 1e-4), (100.0, 2.0), (0.0, 1.0)])
-def test_scale_is_exponential_within_its_range(raw, expected):
-    torch.testing.assert_close(
-        image_of(scale=raw).gaussians(CAMERA, RANGE).scales[0, 0], torch.full((3,), expected), rtol=1e-5, atol=0
-    )
-
-
-def test_scale_keeps_its_gradient_inside_the_range():
+def test_scale_is_exponential_within_its_range_and_keeps_its_gradient_there():
+    for raw, expected in ((-100.0, 1e-4), (100.0, 2.0), (0.0, 1.0)):
+        scales = image_of(scale=raw).gaussians(CAMERA, RANGE).scales
+        torch.testing.assert_close(scales[0, 0], torch.full((3,), expected), rtol=1e-5, atol=0)
     image = image_of(scale=-3.0)
     raw = image.raw.clone().requires_grad_()
     SplatterImage(raw, image.parameterization).gaussians(CAMERA, RANGE).scales.log().sum().backward()
     torch.testing.assert_close(raw.grad[:, :, 5:8], torch.ones(1, 2, 3, SIZE, SIZE))
 
 
-def test_incremental_layers_lie_behind_each_other():
+def test_incremental_layers_lie_behind_each_other_and_independent_ones_anywhere():
     raw = torch.linspace(-3, 2, 3).view(1, 3, 1, 1, 1)
     depth = image_of(3, "incremental", depth=raw).gaussians(CAMERA, RANGE).means[..., 2].reshape(3, -1)
-    torch.testing.assert_close(depth[0], torch.full((36,), 1 + 4 / (1 + math.exp(3))))
-    torch.testing.assert_close(depth[1] - depth[0], torch.full((36,), math.exp(-0.5)))
-    torch.testing.assert_close(depth[2] - depth[1], torch.full((36,), math.exp(2.0)))
-
-
-def test_independent_layers_share_no_depth():
-    raw = torch.tensor([1.0, -1.0]).view(1, 2, 1, 1, 1)
-    depth = image_of(depth=raw).gaussians(CAMERA, RANGE).means[..., 2].reshape(2, -1)
-    assert (depth[1] < depth[0]).all()
+    expected = torch.tensor([1 + 4 / (1 + math.exp(3)), math.exp(-0.5), math.exp(2.0)])
+    torch.testing.assert_close(depth, expected.cumsum(0)[:, None].expand(3, 36))
+    first, second = (
+        image_of(depth=torch.tensor([1.0, -1.0]).view(1, 2, 1, 1, 1)).gaussians(CAMERA, RANGE).means.split(36, 1)
+    )
+    assert (second[..., 2] < first[..., 2]).all()
 
 
 def test_zero_rotation_is_the_identity_with_a_finite_gradient():
@@ -105,17 +93,15 @@ def test_zero_rotation_is_the_identity_with_a_finite_gradient():
 UPSTREAM = {"depth": 0.206, "offset": 0.0209, "opacity": 0.200, "scale": 0.000596, "rotation": 0.196, "color": 0.968}
 
 
-def autoreconstructor(channels: tuple[int, ...], layers_per_block: int, groups: int, layers: int) -> nn.Module:
-    settings = Parameterization(layers)
-    encoder = Encoder(channels, layers_per_block, 4, groups)
-    return VariationalAutoReconstructor(encoder, Reconstructor(settings, channels, layers_per_block, 4, groups))
+def autoreconstructor(channels: tuple[int, ...], groups: int, layers: int = 2) -> nn.Module:
+    encoder = Encoder(channels, 1, 4, groups)
+    return VariationalAutoReconstructor(encoder, Reconstructor(Parameterization(layers), channels, 1, 4, groups))
 
 
 NETWORKS = {
-    "tiny": lambda: autoreconstructor((16, 16, 64, 128), 1, 8, layers=2),
-    "small": lambda: autoreconstructor((24, 48, 96), 1, 8, layers=2),
-    "small, 3 layers": lambda: autoreconstructor((24, 48, 96), 1, 8, layers=3),
-    "Stable Diffusion's blocks": lambda: autoreconstructor((128, 256, 512, 512), 1, 32, layers=2),
+    "tiny": lambda: autoreconstructor((16, 16, 64, 128), 8),
+    "small, 3 layers": lambda: autoreconstructor((24, 48, 96), 8, layers=3),
+    "Stable Diffusion's blocks": lambda: autoreconstructor((128, 256, 512, 512), 32),
     "Splatter Image, tiny": lambda: SplatterImageUNet(Parameterization(1), (32, 48, 64, 112), (2,), 1, norm_groups=8),
     "Splatter Image": lambda: SplatterImageUNet(Parameterization(1), layers_per_block=1),
 }

@@ -38,11 +38,8 @@ def make(index: int = 0) -> Outer:
     )
 
 
-def dtypes(item: Outer) -> list[torch.dtype]:
-    return [item.floats.dtype, item.integers.dtype, item.flags.dtype, item.inner.values.dtype]
-
-
-DOUBLE = [torch.float64, torch.int64, torch.bool, torch.float64]
+def tensors(item: Outer) -> list[Tensor]:
+    return [item.floats, item.integers, item.flags, item.inner.values]
 
 
 @pytest.mark.parametrize(
@@ -59,36 +56,22 @@ DOUBLE = [torch.float64, torch.int64, torch.bool, torch.float64]
 def test_to_casts_only_floats_in_every_form_of_the_call(args: tuple, kwargs: dict) -> None:
     item = make(3)
     moved = item.to(*args, **kwargs)
-    assert dtypes(moved) == DOUBLE
+    assert [tensor.dtype for tensor in tensors(moved)] == [torch.float64, torch.int64, torch.bool, torch.float64]
+    assert (moved.integers is item.integers) == ("copy" not in kwargs)
     assert torch.equal(moved.integers, item.integers)
     assert torch.equal(moved.flags, item.flags)
     assert (moved.name, moved.note, moved.inner.size) == (item.name, None, (4, 6))
 
 
-def test_to_moves_nested_tensors_to_the_device() -> None:
-    moved = make().to("meta")
-    assert {t.device.type for t in (moved.floats, moved.integers, moved.flags, moved.inner.values)} == {"meta"}
-
-
-def test_to_copies_when_asked_and_only_then() -> None:
+def test_map_detach_and_to_reach_every_tensor_and_leave_the_original() -> None:
     item = make()
-    assert item.to("cpu").integers is item.integers
-    assert item.to("cpu", copy=True).integers is not item.integers
-
-
-def test_map_reaches_every_tensor_and_leaves_the_original() -> None:
-    item = make()
+    assert {tensor.device.type for tensor in tensors(item.to("meta"))} == {"meta"}
+    tracked = replace(item, inner=Inner(item.inner.values.clone().requires_grad_() * 2))
+    assert not tracked.detach().inner.values.requires_grad
     doubled = item.map(lambda tensor: tensor * 2)
     assert torch.equal(doubled.inner.values, item.inner.values * 2)
     assert torch.equal(doubled.integers, item.integers * 2)
     assert torch.equal(item.floats, make().floats)
-
-
-def test_detach_cuts_the_graph_of_nested_tensors() -> None:
-    item = make()
-    item = replace(item, inner=Inner(item.inner.values.requires_grad_() * 2))
-    assert item.inner.values.requires_grad
-    assert not item.detach().inner.values.requires_grad
 
 
 def test_indexing_acts_on_the_leading_axes_of_all_tensors() -> None:
@@ -118,9 +101,6 @@ def test_stack_refuses_static_values_that_differ_even_when_nested() -> None:
         stack([make(), other])
     with pytest.raises(ValueError, match="static values differ"):
         stack([make(), replace(make(), note="text")])
-
-
-def test_stack_refuses_an_empty_sequence() -> None:
     with pytest.raises(ValueError, match="empty"):
         stack([])
 
@@ -150,7 +130,7 @@ def test_the_data_loaders_pinning_pins_every_tensor(monkeypatch: pytest.MonkeyPa
     item = make()
     pinned = pin_memory([item])[0]
     assert isinstance(pinned, Outer)
-    assert {id(t) for t in asked} == {id(t) for t in (item.floats, item.integers, item.flags, item.inner.values)}
+    assert {id(tensor) for tensor in asked} == {id(tensor) for tensor in tensors(item)}
     assert pinned.inner.values is not item.inner.values
 
 

@@ -1,6 +1,5 @@
 """Folders of weights: which one is meant, and whether it is whole."""
 
-import json
 import shutil
 import subprocess
 
@@ -31,18 +30,19 @@ def test_the_sums_are_those_of_sha256sum(written):
     assert checked.stdout.splitlines() == [f"{CONFIG_FILE}: OK", f"{WEIGHTS_FILE}: OK"]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.999])
-def test_one_flipped_bit_is_refused(folder, share):
+def test_one_flipped_bit_is_refused(folder):
     content = bytearray((folder / WEIGHTS_FILE).read_bytes())
-    content[int(share * len(content))] ^= 1
-    (folder / WEIGHTS_FILE).write_bytes(bytes(content))
+    content[len(content) // 2] ^= 1
+    (folder / WEIGHTS_FILE).write_bytes(content)
     with pytest.raises(WeightsError, match=rf"{WEIGHTS_FILE}: damaged or changed"):
         CompleteSplat.from_pretrained(folder)
+    write_sums(folder)
+    assert weights_folder(folder) == folder
 
 
 def test_a_changed_configuration_is_refused_until_the_sums_are_gone(folder):
-    config = json.loads((folder / CONFIG_FILE).read_text())
-    (folder / CONFIG_FILE).write_text(json.dumps(config))
+    with (folder / CONFIG_FILE).open("a") as file:
+        file.write("\n")
     with pytest.raises(WeightsError, match=f"remove {SUMS_FILE}"):
         weights_folder(folder)
     (folder / SUMS_FILE).unlink()
@@ -82,11 +82,3 @@ def test_a_hub_repository_in_the_cache_needs_no_network(written, tmp_path, monke
     assert weights_folder("some/splats") == repository / "snapshots" / commit
     with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
         weights_folder("other/splats")
-
-
-def test_sums_follow_what_is_written(folder):
-    before = (folder / SUMS_FILE).read_text()
-    (folder / WEIGHTS_FILE).write_bytes(b"something else")
-    write_sums(folder)
-    assert (folder / SUMS_FILE).read_text() != before
-    assert weights_folder(folder) == folder

@@ -4,11 +4,11 @@ import pytest
 import torch
 from support import strict_json
 
-from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.generation import CompleteSplat
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.training.scene_module import copy_reference, repeat_image
 from completesplat.weights import BOX, SUMS_FILE, in_the_box, weights_folder
 
 NAME = "toy_objects"

@@ -25,9 +25,7 @@ class AutoDecoder(nn.Module):
     should be off. The table takes `rows * latent_channels * (image_size / 8)^2` numbers, thrice with Adam's moments.
 
     Args:
-        reconstructor: without skips, as there are no features.
-        image_size: side of the pictures.
-        rows: pictures that the table has room for; see `make_room`. Weights that are loaded bring as many as they have.
+        rows: pictures that the table has room for; weights that are loaded bring as many as they have.
 
     Raises:
         CompleteSplatError: a reconstructor with skips, or an image size that its levels do not divide.
@@ -47,7 +45,8 @@ class AutoDecoder(nn.Module):
 
     def forward(self, codes: Float[Tensor, "batch channel latent_height latent_width"]) -> SplatterImage:
         """Reconstruct from codes."""
-        return self.reconstructor(codes, ())
+        image: SplatterImage = self.reconstructor(codes, ())
+        return image
 
     def make_room(self, rows: int) -> None:
         """A new table for this number of pictures, all rows of it free."""
@@ -63,11 +62,7 @@ class AutoDecoder(nn.Module):
     def codes_of(
         self, names: Sequence[str], frames: Int64[Tensor, " batch"]
     ) -> Float[Tensor, "batch channel latent_height latent_width"]:
-        """The codes of pictures, each given by its sequence and its place therein; new ones get the next free rows.
-
-        Raises:
-            CompleteSplatError: the table is full.
-        """
+        """The codes of pictures, given by sequence and place therein; `CompleteSplatError` where the table is full."""
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
     def new_codes(self, count: int, seed: int) -> Float[Tensor, "batch channel latent_height latent_width"]:

@@ -28,11 +28,10 @@ is relative to the scene's extent and decays exponentially to its hundredth."""
 
 @dataclass(frozen=True)
 class FittingSettings:
-    """How Gaussians are fitted.
+    """How many Gaussians are fitted to a scene, and how.
 
     Attributes:
-        count: Gaussians of a scene.
-        steps: steps of Adam; the positions' rate decays over as many.
+        steps: of Adam; the positions' rate decays over as many.
         views: random views of a step, the same for all scenes of a batch.
         opacity: of all Gaussians at the start (0.1 in 3DGS).
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
@@ -65,12 +64,9 @@ class RawGaussians:
 def initial_gaussians(
     views: Views, depth_range: Float[Tensor, "batch 2"], count: int, opacity: float, generator: torch.Generator
 ) -> RawGaussians:
-    """Round Gaussians on the rays of random pixels, with the pixels' colours and the size of one pixel there.
+    """Round Gaussians on the rays of random pixels of all views, with the pixels' colours and the size of one there.
 
-    Args:
-        views: [batch view], of which all pixels are equally likely.
-        depth_range: near and far, between which depths along each view's optical axis are uniform, in scene units.
-        generator: on the CPU, whatever the device of the views.
+    Depths along each view's optical axis are uniform in the depth range, in scene units; the generator is on the CPU.
     """
     batch, number = views.images.shape[:2]
     height, width = views.cameras.image_size
@@ -93,11 +89,7 @@ def initial_gaussians(
 
 
 def scene_extent(depth_range: Float[Tensor, "batch 2"]) -> float:
-    """Half of the mean depth range, in scene units: the spread of the initial Gaussians.
-
-    3DGS takes the spread of the cameras instead, around which its points lie; here they lie in the depth range, however
-    little the cameras move.
-    """
+    """Half of the mean depth range, in scene units: the spread of the initial Gaussians (3DGS: that of the cameras)."""
     return (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
 
 
@@ -111,14 +103,8 @@ def fit_gaussians(
 ) -> Gaussians:
     """Optimise a set of Gaussians for each scene of a batch, all at once, until its renderings look like the views.
 
-    Works also where autograd is off, as in `torch.inference_mode()`.
-
-    Args:
-        views: [batch view], in the world of the Gaussians that are returned.
-        depth_range: see `initial_gaussians`.
-        render: differentiable in the Gaussians.
-        loss: compares some rendered views with the true ones; its step is that of the fit.
-        generator: on the CPU; decides the start and the views of each step.
+    Works also where autograd is off, as in `torch.inference_mode()`. The Gaussians are in the world of the views; the
+    generator, on the CPU, decides the start and the views of each step.
     """
     with torch.inference_mode(False), torch.enable_grad():
         raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
@@ -131,7 +117,7 @@ def fit_gaussians(
             truth, gaussians = views[:, chosen.to(views.images.device)], raw.gaussians()
             total, _ = loss(Prediction(render(gaussians, truth.cameras), gaussians, None), truth, step)
             optimizer.zero_grad()
-            total.backward()
+            torch.autograd.backward(total)
             optimizer.step()
             positions["lr"] *= decay
         return raw.gaussians().detach()

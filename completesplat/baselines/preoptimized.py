@@ -35,10 +35,9 @@ def project_to_splatter_image(
 ) -> Projection:
     """The Splatter Image whose Gaussians are those of a set, as far as its pixels have place for them.
 
-    In every pixel the most opaque Gaussians stay, the most opaque in the first layer. The others are dropped, and so is
-    what lies behind the camera or outside its image, or is never drawn because its opacity is below 1/255: that does
-    not fill a pixel either. The offset takes up what ray and depth range cannot. Scales are clamped to the
-    parameterisation's range, opacities to 1e-6 below 1.
+    In every pixel the most opaque Gaussians stay, the most opaque in the first layer. What lies behind the camera or
+    outside its image, or is never drawn because its opacity is below 1/255, fills no pixel. The offset takes up what
+    ray and depth range cannot. Scales are clamped to the parameterisation's range, opacities to 1e-6 below 1.
 
     Args:
         gaussians: [batch], in the reference cameras' frames.
@@ -53,7 +52,7 @@ def project_to_splatter_image(
         """[batch layer channel height width]"""
         flat = values.new_full((math.prod(grid), values.shape[-1]), elsewhere)
         flat[place] = values.flatten(0, 1)[source]
-        return rearrange(flat.unflatten(0, grid), "b layer h w channel -> b layer channel h w")
+        return flat.view(*grid, -1).movedim(-1, 2)
 
     smallest, largest = math.log(parameterization.smallest_scale), math.log(parameterization.largest_scale)
     means = placed(gaussians.means, 0.0)

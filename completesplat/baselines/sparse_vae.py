@@ -22,16 +22,13 @@ class SparseVAE(nn.Module):
     """Splatter Image -> latent -> Splatter Image, in the autoreconstructor's blocks without skips.
 
     A place is one layer of one pixel. The encoder sees the 15 raw values of every place, normalised, or zeros where the
-    place is empty, and whether it is occupied. The decoder's outputs are normalised raw values; that a place is empty
-    is said by a low opacity. In training a latent is drawn from the posterior, in evaluation its mode is used.
+    place is empty, and whether it is occupied. The decoder's outputs are normalised raw values; a low opacity says that
+    a place is empty. In training a latent is drawn from the posterior, in evaluation its mode is used.
 
     Args:
-        encoder: makes an `Encoder` of so many `in_channels`.
-        reconstructor: without skips, which would carry the Splatter Image past the latent. Its last convolution starts
-            as PyTorch's do, since its outputs are normalised.
-
-    Raises:
-        CompleteSplatError: a reconstructor with skips.
+        encoder: makes an `Encoder` of a number of `in_channels`.
+        reconstructor: its last convolution starts as PyTorch's do, since its outputs are normalised. One with skips,
+            which would carry the Splatter Image past the latent, is refused (`CompleteSplatError`).
     """
 
     mean: Tensor
@@ -91,9 +88,8 @@ class SparseVAE(nn.Module):
     def errors(self, found: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
         """How well each group of raw values is reconstructed.
 
-        Returns:
-            "depth", "offset", "scale", "rotation", "color": mean squared error of the normalised values over occupied
-            places. "opacity": binary cross entropy of the opacities over all places, in nats; an empty one's is 0.
+        The mean squared error of the normalised values over occupied places; for "opacity" the binary cross entropy
+        over all places, in nats, where an empty one's opacity is 0.
         """
         there = occupied(truth)[:, :, None]
         squared = torch.where(there, self.normalize(found.raw) - self.normalize(truth.raw), 0.0).square()

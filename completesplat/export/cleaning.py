@@ -29,11 +29,7 @@ def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
 def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     """One unbatched set without the Gaussians that cannot be stored; their number is logged as a warning.
 
-    Args:
-        name: of the file or sample, for the message.
-
-    Raises:
-        CompleteSplatError: nothing is left of a set that was not empty.
+    `CompleteSplatError`: nothing is left of a set that was not empty; `name` is that of the file or sample.
     """
     kept = storable(gaussians)
     broken = gaussians.count - int(kept.sum())
@@ -52,11 +48,8 @@ def with_screen_space_dilation(
 
     A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
     makes Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian
-    at depth z gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes.
-
-    Args:
-        gaussians: [gaussian], in the world of the camera.
-        reference: the photograph's camera, unbatched, at the size that the model was trained at.
+    at depth z gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes. The
+    camera is the photograph's, unbatched, at the size that the model was trained at.
     """
     depth = transform_points(reference.world_to_camera, gaussians.means)[:, 2]
     variance = blur * (depth / reference.intrinsics[0, 0]).square()

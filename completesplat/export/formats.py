@@ -37,16 +37,11 @@ def write_formats(
     `.sog` keep our axes (+y down); `.spz` has +y up and +z towards the viewer, as its format prescribes, which its
     readers undo.
 
-    Args:
-        view: how the page begins.
-        converter: needed for `CONVERTED` formats.
-        comments: for the header of the `.ply`.
-
     Returns:
         The files' names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
 
     Raises:
-        CompleteSplatError: nothing to write, or the converter is missing or fails.
+        CompleteSplatError: nothing to write, or the converter (of `CONVERTED` formats) is missing or fails.
     """
     if converter is None and set(formats) & set(CONVERTED):
         raise CompleteSplatError(f"a converter is needed for {', '.join(set(formats) & set(CONVERTED))}")
@@ -65,16 +60,7 @@ def write_formats(
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> int:
-    """Write one unbatched set of Gaussians, in its order; the file appears whole or not at all.
-
-    Colours beyond 0 to 1 are clamped.
-
-    Returns:
-        How many Gaussians the file holds; see `completesplat.export.cleaning` for what is left out.
-
-    Raises:
-        CompleteSplatError: none of the Gaussians can be stored.
-    """
+    """Write one unbatched set of Gaussians, in its order, as `write_ply` does; colours beyond 0 to 1 are clamped."""
     kept = cleaned(gaussians, path).detach()
     records = np.zeros(kept.count, RECORD)
     records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()

@@ -15,8 +15,7 @@ from completesplat.rasterizers import Rendering
 READABLE_SIDE = 144
 GAP, LINE, MARGIN = 6, 20, 12
 INK, PAPER = "black", "white"
-NOTHING = 0.5
-OPAQUE = 0.5
+NOTHING, OPAQUE = 0.5, 0.5
 # Far to near; lightness rises steadily, so that the picture is also right in grey.
 STOPS = [
     [0.05, 0.03, 0.20],
@@ -29,11 +28,7 @@ STOPS = [
 
 
 def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Images (sRGB, 0 to 1, clamped) to bytes with the channels last.
-
-    Raises:
-        ValueError: values that are not finite.
-    """
+    """Images (sRGB, 0 to 1, clamped) to bytes with the channels last; `ValueError` for what is not finite."""
     if not images.isfinite().all():
         raise ValueError("images hold values that are not finite")
     scaled = images.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
@@ -48,15 +43,7 @@ def enlarge(
 
 
 def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Image.Image:
-    """Images (sRGB, 0 to 1), each row from the left, white where a row is shorter than the longest.
-
-    Args:
-        rows: of images of one size.
-        factor: the width and height in pixels that one pixel becomes.
-
-    Raises:
-        ValueError: values that are not finite.
-    """
+    """Rows of images (sRGB, 0 to 1) of one size, enlarged; white where a row is shorter than the longest."""
     columns = max(len(row) for row in rows)
     filled = [torch.cat([row, torch.ones(columns - len(row), *row.shape[1:]).to(row)]) for row in rows]
     whole = rearrange(torch.stack(filled), "row column rgb height width -> rgb (row height) (column width)")
@@ -77,12 +64,8 @@ def picture_sheet(
     """Pictures in rows and columns, each enlarged by a whole factor to about 144 px, with room for its label above it.
 
     Args:
-        headings: of the columns.
         rows: at least one, none longer than the headings; None leaves a place empty. All pictures have one size.
         title: the first line; None leaves no room for one.
-
-    Raises:
-        ValueError: pictures that are not finite.
     """
     first = next(cell.image for row in rows for cell in row if cell is not None)
     factor = max(1, round(READABLE_SIDE / max(first.shape[-2:])))

@@ -16,15 +16,14 @@ from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.splatter_image import SH_C0
 
-LONGEST_HEADER = 1 << 16
-LONGEST_COUNT = 15  # digits
+LONGEST_HEADER, LONGEST_COUNT = 1 << 16, 15  # bytes, digits
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
-SH_C0 = 0.28209479177387814  # the constant of the DC harmonic, 1 / (2 sqrt(pi))
 SMALLEST_ALPHA = 1e-6
 AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
 MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -36,20 +35,15 @@ REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
     """Write one unbatched set of Gaussians; the file appears whole or not at all.
 
-    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Gaussians that cannot be stored are left out, see
-    `completesplat.export.cleaning`. Reading the file with `read_ply` and writing it again gives the same bytes, except
-    for clamped opacities.
+    Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Reading the file with `read_ply` and writing it again
+    gives the same bytes, except for clamped opacities.
 
     Args:
-        path: the file.
         gaussians: in any one frame; quaternions of any length.
         comments: metadata for the header, a line each; characters outside ASCII are escaped.
 
     Returns:
-        How many Gaussians the file holds.
-
-    Raises:
-        CompleteSplatError: none of the Gaussians can be stored.
+        How many Gaussians the file holds: those that can be stored; `CompleteSplatError` if there are none.
     """
     table = _table(cleaned(gaussians, path))
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -60,15 +54,12 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
     """One row for each Gaussian; computed in float64, so that the stored float32 is the nearest one."""
-    means, quaternions, scales, opacities, colors = (
-        t.detach().cpu().double()
-        for t in (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-    )
-    logits = opacities.clamp(SMALLEST_ALPHA, 1 - SMALLEST_ALPHA).logit()[:, None]
+    g = gaussians.detach().to("cpu", torch.float64)
+    logits = g.opacities.logit(SMALLEST_ALPHA)[:, None]
     # A quaternion that is of unit length up to float32 rounding is kept: normalising it again would move its bits.
-    is_unit = (quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
-    rotations = torch.where(is_unit, quaternions, normalize_quaternion(quaternions))
-    rows = [means, torch.zeros_like(means), (colors - 0.5) / SH_C0, logits, scales.log(), rotations]
+    is_unit = (g.quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
+    rotations = torch.where(is_unit, g.quaternions, normalize_quaternion(g.quaternions))
+    rows = [g.means, torch.zeros_like(g.means), (g.colors - 0.5) / SH_C0, logits, g.scales.log(), rotations]
     return torch.cat(rows, dim=-1).float()
 
 
@@ -86,7 +77,7 @@ class Element:
 
     name: str
     count: int
-    dtype: np.dtype
+    dtype: np.dtype[np.void]
 
     @property
     def size(self) -> int:
@@ -98,11 +89,8 @@ def read_ply(path: str | Path) -> Gaussians:
     """Read a binary little-endian 3DGS `.ply`, of this project or another.
 
     Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
-    become 0, as in the renderers of such files.
-
-    Raises:
-        PlyError: no such file, another format, a property missing, a size that differs from what the header
-            declares (checked before anything is allocated), or values that are not finite.
+    become 0, as in the renderers of such files. `PlyError`: no such file, another format or size than the header
+    declares, or values that are not finite.
     """
     try:
         if not Path(path).is_file():
@@ -126,11 +114,7 @@ def read_ply(path: str | Path) -> Gaussians:
 
 
 def read_header(file: BinaryIO) -> tuple[list[Element], int]:
-    """Elements in the order of the file, and the position where their data begin.
-
-    Raises:
-        PlyError: not a `.ply`, another format than binary little endian, list properties, or a broken line.
-    """
+    """Elements in the order of the file, and the position where their data begin."""
     lines = _lines(file)
     if lines[0] != "ply":
         raise PlyError("not a .ply file")
@@ -147,7 +131,10 @@ def read_header(file: BinaryIO) -> tuple[list[Element], int]:
                 declared[-1][2].append((name, TYPES[kind]))
             case _:
                 raise PlyError(f"header line not understood: {line[:60]!r}")
-    return [Element(name, count, _dtype(name, fields)) for name, count, fields in declared], file.tell()
+    for name, _, fields in declared:
+        if len(dict(fields)) < len(fields):
+            raise PlyError(f"element {name[:60]!r} names a property twice")
+    return [Element(name, count, np.dtype(fields)) for name, count, fields in declared], file.tell()
 
 
 def _lines(file: BinaryIO) -> list[str]:
@@ -161,12 +148,6 @@ def _lines(file: BinaryIO) -> list[str]:
         if lines[0] != "ply":
             return lines
     raise PlyError("no end of the header found" if lines else "not a .ply file")
-
-
-def _dtype(element: str, fields: list[tuple[str, str]]) -> np.dtype:
-    if len({name for name, _ in fields}) < len(fields):
-        raise PlyError(f"element {element[:60]!r} names a property twice")
-    return np.dtype(fields)
 
 
 def _columns(data: bytes, elements: Sequence[Element]) -> dict[str, np.ndarray]:

@@ -11,17 +11,10 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, write_text
 from completesplat.export.cleaning import cleaned, with_screen_space_dilation
 from completesplat.export.formats import write_formats
-from completesplat.export.pictures import (
-    SheetCell,
-    color_depth,
-    color_normals,
-    picture_sheet,
-    surface_depth,
-    to_bytes,
-)
+from completesplat.export.pictures import SheetCell, color_depth, color_normals, picture_sheet, surface_depth, to_bytes
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
@@ -47,14 +40,11 @@ class Wanted:
     """What to write of each prediction.
 
     Args:
-        formats: of the scenes, out of `completesplat.export.formats.FORMATS`.
-        videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`.
-        frames: of each video.
+        formats: of the scenes, out of `completesplat.export.formats.FORMATS`; some need the converter.
+        videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`; each video has `frames`.
         background: grey value where a scene leaves a pixel open.
         maps: depth, normals and opacity of the reference view, see `write_maps`.
-        converter: writes the formats that need one.
-        screen_space_dilation: store Gaussians `with_screen_space_dilation` for viewers, which draw larger pictures
-            than training.
+        screen_space_dilation: store Gaussians `with_screen_space_dilation`.
     """
 
     formats: Sequence[str] = ("ply",)
@@ -89,18 +79,13 @@ def write_prediction(
     """Write `sample_00.ply`, `orbit_00.mp4`, ..., `sheet.png` and `scene.json`.
 
     Args:
-        folder: of the files; made when it is missing.
-        image: the input image.
+        image, reference: the input image and its camera.
         scenes: the samples, in the reference camera's frame; what cannot be drawn is left out, with a warning.
-        reference: the input's camera.
-        rasterizer: draws the videos and the sheet.
         up: where up is in the scene; the views turn about it.
-        wanted: which files.
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_sample: called when a sample's files are written.
 
-    Raises:
-        CompleteSplatError: a sample without anything to draw, or a converter that fails.
+    `CompleteSplatError`: a sample without anything to draw, or a converter that fails.
     """
     # Before anything is written: a sample of which nothing is left is refused.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
@@ -171,20 +156,8 @@ def contact_sheet(
 ) -> None:
     """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
 
-    Depth is coloured on one scale for all rows (near bright, far dark); places that show nothing are grey.
-
-    Args:
-        path: the file.
-        title: its first line.
-        reference: the input image, of the size of the views.
-        samples: at least one.
-        angles: of the views in degrees, the same for all samples.
-
-    Raises:
-        ValueError: images that are not finite, or numbers of views and angles that differ.
+    Depth is coloured on one scale for all rows. The angles of the views, in degrees, are the same for all samples.
     """
-    if any(len(sample.images) != len(angles) for sample in samples):
-        raise ValueError(f"{len(angles)} angles given for rows of {[len(sample.images) for sample in samples]} views")
     depths, (near, far) = color_depth(torch.stack([sample.depth for sample in samples]))
     rows = [
         [None, SheetCell(sample.images[0], sample.label), *map(SheetCell, sample.images[1:]), SheetCell(depth)]
@@ -229,18 +202,9 @@ def write_maps(
 def write_scene_json(
     path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
 ) -> None:
-    """Write the scene description as plain JSON; the file appears whole or not at all.
+    """Write the scene description as plain JSON; `ValueError` for a number that is not finite (JSON has none).
 
-    Args:
-        path: the file.
-        reference: the reference camera, unbatched.
-        settings: what the scene was made with, as plain values.
-        seed: of the random numbers.
-        files: what each file beside this one is called, by purpose.
-
-    Raises:
-        ValueError: a number that is not finite (JSON has none).
-        TypeError: a setting that JSON cannot express.
+    `settings` are what the scene was made with, as plain values, `files` the names of those beside it, by purpose.
     """
     camera = {
         "world_to_camera": reference.world_to_camera.tolist(),
@@ -255,6 +219,4 @@ def write_scene_json(
         "seed": seed,
         "files": dict(files),
     }
-    text = json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_text(path, json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False) + "\n")

@@ -25,8 +25,7 @@ from completesplat.geometry.cameras import Cameras, transform_points
 PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
-WIDEST_WINDOW = 16 / 9
-LARGEST_FOV = 120.0
+WIDEST_WINDOW, LARGEST_FOV = 16 / 9, 120.0
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,9 @@ class SplatTransform:
     program: str
 
     def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target` in the format that its suffix names; the file appears whole or not at all.
+        """Write `target`, in the format that its suffix names, whole or not at all.
 
-        Raises:
-            CompleteSplatError: the program fails, writes nothing, or takes more than ten minutes.
+        `CompleteSplatError`: the program fails, writes nothing, or takes more than ten minutes.
         """
         with atomic_path(target) as temporary:
             _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
@@ -50,8 +48,7 @@ class SplatTransform:
 def find_splat_transform() -> SplatTransform:
     """The program on PATH; without one npm's package, which `npx` downloads on first use and keeps (some 200 MB).
 
-    Raises:
-        CompleteSplatError: neither is there, or the program does not start.
+    `CompleteSplatError`: neither is there, or the program does not start.
     """
     program = shutil.which(PROGRAM)
     if program is None:
@@ -67,21 +64,13 @@ def find_splat_transform() -> SplatTransform:
 
 
 def _run(command: Sequence[str]) -> str:
-    """What a program prints.
-
-    A session of its own, because npx starts further processes, which have to end with it.
-    """
+    """What a program prints. It has a session of its own: npx starts further processes, which end with it."""
     name = Path(command[0]).name
     try:
         process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        )
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            errors="replace", start_new_session=True,
+        )  # fmt: skip
     except OSError as error:
         raise CompleteSplatError(f"{name} does not start: {error.strerror}") from error
     try:
@@ -114,11 +103,7 @@ class PageView:
 
 
 def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
-    """Write the page: the scene upright, seen from the front, turning until a person touches it.
-
-    Raises:
-        CompleteSplatError: nothing to show, or the converter fails.
-    """
+    """Write the page: the scene upright, seen from the front, turning until a person touches it."""
     turn = upright(view.up)
     with tempfile.TemporaryDirectory() as folder:
         scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"

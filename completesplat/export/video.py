@@ -22,29 +22,15 @@ def orbit_views(
     reference: Cameras,
     pivot: Float[Tensor, "3"],
     frames: int,
-    background: Float[Tensor, "3"] | float = 1.0,
+    background: float,
     up: Float[Tensor, "3"] | None = None,
-    chunk: int = 8,
 ) -> tuple[Float[Tensor, "frame 3 height width"], Float[Tensor, "frame 1 height width"]]:
-    """Render one scene on a full turn about `pivot` that starts at the reference camera.
+    """`render_views` on a full turn, that starts at the reference camera, about the pivot and the direction up.
 
-    Args:
-        rasterizer: any backend.
-        gaussians: the scene, unbatched.
-        reference: the reference camera, unbatched.
-        pivot: the point in the centre of every frame, in world coordinates.
-        frames: how many views a turn has.
-        background: colour behind the scene.
-        up: axis of the turn, in world coordinates. A photograph does not tell where gravity points, so the default
-            is the reference camera's own up direction.
-        chunk: how many views are rendered at a time.
-
-    Returns:
-        Images over the background, and expected depths (0 where nothing is seen).
+    A photograph does not tell where gravity points: by default, up is where the camera's own up is.
     """
-    if up is None:
-        up = -reference.world_to_camera[1, :3]
-    return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background, chunk)
+    up = -reference.world_to_camera[1, :3] if up is None else up
+    return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
 
 
 @torch.no_grad()
@@ -52,16 +38,10 @@ def render_views(
     rasterizer: Rasterizer,
     gaussians: Gaussians,
     cameras: Cameras,
-    background: Float[Tensor, "3"] | float = 1.0,
+    background: float,
     chunk: int = 8,
 ) -> tuple[Float[Tensor, "frame 3 height width"], Float[Tensor, "frame 1 height width"]]:
-    """Render one unbatched scene from several cameras, `chunk` at a time.
-
-    Returns:
-        Images over the background, and expected depths (0 where nothing is seen).
-    """
-    if isinstance(background, Tensor):
-        background = background[:, None, None]
+    """Images of one unbatched scene from several cameras, `chunk` at a time, and expected depths (0: nothing seen)."""
     images, depths = [], []
     for start in range(0, len(cameras.world_to_camera), chunk):
         rendering = rasterizer(gaussians[None], cameras[start : start + chunk][None])
@@ -73,11 +53,8 @@ def render_views(
 def write_video(path: str | Path, frames: Float[Tensor, "frame 3 height width"], fps: int = 24) -> None:
     """Write an H.264 `.mp4` (yuv420p) of images (sRGB, 0 to 1).
 
-    Small images are enlarged by a whole factor until their shorter side has at least 256 px. H.264 halves the
-    colour resolution, which needs even sizes: an odd side gets its last row or column once more.
-
-    Raises:
-        ValueError: no frames, frames that are not finite, or a path that does not end in `.mp4`.
+    Small images are enlarged by a whole factor until their shorter side has at least 256 px. H.264 needs even sizes: an
+    odd side gets its last row or column once more. `ValueError`: no or broken frames, or a path without `.mp4`.
     """
     import imageio.v2 as imageio
 

@@ -1,7 +1,7 @@
 """Callbacks of training: seeds of each step, averaged weights, the progress bar, and the weights that are exported."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,8 @@ logger = logging.getLogger(__name__)
 class StepSeeds(Callback):
     """Seeds torch's global generators anew before every training batch.
 
-    Posterior noise, skip dropout and the noise of the diffusion then depend on (seed, epoch, batch, process) alone, not
-    on what was drawn before: a run that is resumed, in the middle of an epoch too, draws what it would have drawn.
-    Batches are counted, not optimizer steps, which several batches share where gradients are accumulated.
+    What is drawn then depends on (seed, epoch, batch, process) alone: a run that is resumed, in the middle of an epoch
+    too, draws what it would have drawn. (Several batches share an optimizer step where gradients are accumulated.)
     """
 
     def __init__(self, seed: int) -> None:
@@ -42,14 +41,12 @@ class ExponentialMovingAverage(WeightAveraging):
     """Average of the weights over the steps; checkpoints, validation and the end of training use the average.
 
     Lightning's own `EMAWeightAveraging` computes decay * a + (1 - decay) * b, which lets frozen weights and measured
-    buffers drift by rounding; linear interpolation leaves them exactly as they are.
-
-    Args:
-        decay: weight of the past (not stated by the paper).
+    buffers drift by rounding; linear interpolation leaves them exactly as they are. The paper states no `decay`.
     """
 
     def __init__(self, decay: float) -> None:
-        super().__init__(multi_avg_fn=get_ema_multi_avg_fn(decay))
+        averages: Callable[[float], Any] = get_ema_multi_avg_fn
+        super().__init__(multi_avg_fn=averages(decay))
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:
@@ -70,7 +67,7 @@ class ExponentialMovingAverage(WeightAveraging):
 class Progress(RichProgressBar):
     """Lightning's bar, with optimizer steps; where nobody watches (no terminal), a line after every validation."""
 
-    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict:
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """The figures behind the bar."""
         metrics = super().get_metrics(trainer, pl_module)
         metrics.pop("v_num", None)
@@ -84,8 +81,7 @@ class Progress(RichProgressBar):
         logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
 
     def _get_train_description(self, current_epoch: int) -> str:
-        """Lightning's speaks of -2 epochs where there is no limit to them."""
-        return f"Epoch {current_epoch}"
+        return f"Epoch {current_epoch}"  # Lightning's speaks of -2 epochs where there is no limit to them
 
 
 def _steps(trainer: Trainer) -> str:

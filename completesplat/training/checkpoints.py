@@ -2,8 +2,9 @@
 
 import os
 import shutil
-import time
+from contextlib import AbstractContextManager
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import nn
 
+from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, WeightsError
 
 LAST = "last.ckpt"
@@ -20,40 +22,26 @@ LAST = "last.ckpt"
 class CheckpointFiles(TorchCheckpointIO):
     """Writes straight into a file beside the final place and renames it: there is a whole checkpoint or none.
 
-    Lightning's own first makes the whole file in memory, which for a model of 860 million parameters with its optimizer
-    and its average takes 15 GB more. The unfinished file always has the same name, so that a run which is killed while
-    it saves, again and again, leaves one of them and not many.
+    Lightning's own first makes the whole file in memory, for 860 million parameters with optimizer and average 15 GB.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | os.PathLike, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
+    ) -> None:
         """Replace what is at this path."""
-        final = Path(path)
-        final.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = _unfinished(final)
-        try:
+        with _replaced(Path(path)) as unfinished:
             torch.save(checkpoint, unfinished)
-            with unfinished.open("rb+") as file:
-                os.fsync(file.fileno())
-            os.replace(unfinished, final)
-        finally:
-            unfinished.unlink(missing_ok=True)
 
 
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` anew at intervals and at the end of training, and milestones that are kept.
 
     Every time one file is written: at a milestone `step=N.ckpt`, and `last.ckpt` becomes a second name (hard link) of
-    it. A run that is killed at any moment leaves a whole `last.ckpt`. (Lightning's `ModelCheckpoint` writes the whole
-    contents twice.)
+    it. A run that is killed at any moment leaves a whole `last.ckpt`.
 
     Args:
-        folder: of the files.
-        every_n_train_steps: optimizer steps between them; None: they do not matter.
-        every_minutes: minutes between them; None: time does not matter.
-        keep_every: optimizer steps between milestones; None: none are kept.
-
-    Raises:
-        CompleteSplatError: an interval of steps below 1.
+        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
+        keep_every: optimizer steps between milestones (at least 1); None: none are kept.
     """
 
     def __init__(
@@ -73,7 +61,7 @@ class Checkpoints(Checkpoint):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = self.saved_step = trainer.global_step
-        self.saved_at = now()
+        self.saved_at = monotonic()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -96,11 +84,11 @@ class Checkpoints(Checkpoint):
         if self.every_minutes is None:
             return False
         # All processes save together, and their clocks differ.
-        return trainer.strategy.broadcast(now() - self.saved_at >= 60 * self.every_minutes)
+        return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer) -> None:
         self.step = self.saved_step = trainer.global_step
-        self.saved_at = now()
+        self.saved_at = monotonic()
         last = self.folder / LAST
         if not self._is_milestone():
             return trainer.save_checkpoint(last)
@@ -113,30 +101,21 @@ class Checkpoints(Checkpoint):
 
 def link(source: Path, target: Path) -> None:
     """Give a file a second name, which may belong to another file until then; a copy where there are no hard links."""
-    unfinished = _unfinished(target)
-    unfinished.unlink(missing_ok=True)
-    try:
-        os.link(source, unfinished)
-    except OSError:
-        shutil.copyfile(source, unfinished)
-    os.replace(unfinished, target)
+    with _replaced(target) as unfinished:
+        unfinished.unlink(missing_ok=True)
+        try:
+            os.link(source, unfinished)
+        except OSError:
+            shutil.copyfile(source, unfinished)
 
 
-def now() -> float:
-    """Seconds, of a clock that is never set."""
-    return time.monotonic()
-
-
-def _unfinished(final: Path) -> Path:
-    return final.with_name(f".{final.name}.unfinished")
+def _replaced(path: Path) -> AbstractContextManager[Path]:
+    """A file that is unfinished always has the same name: a run that is killed again and again leaves one of them."""
+    return atomic_path(path, f".{path.name}.unfinished")
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents.
-
-    Raises:
-        WeightsError: the file is missing or not a checkpoint of plain tensors.
-    """
+    """A checkpoint's contents; `WeightsError` if the file is missing or not a checkpoint of plain tensors."""
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     try:
@@ -147,11 +126,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
-    """Load the weights below `prefix` of a checkpoint into a module; all must fit.
-
-    Raises:
-        WeightsError: the file is unusable, or its weights are those of another architecture.
-    """
+    """Load the weights below `prefix` of a checkpoint into a module; `WeightsError` unless all are there and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
     try:

@@ -2,9 +2,9 @@
 
 import hashlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -37,6 +37,7 @@ from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
+Rows = dict[str, Shaped[np.ndarray, "picture _ _ _"]]
 
 logger = logging.getLogger(__name__)
 
@@ -64,13 +65,10 @@ def check_cache(
     """Refuse a stale cache. (The data module compares picture sizes and all other settings of the data.)
 
     Args:
-        source: the training set.
-        conditioning: of the model: a frozen one needs its own features, one that is trained needs pictures; None: it
-            is not looked at.
+        conditioning: a frozen one needs its own features, one that is trained needs pictures; None is not looked at.
 
-    Raises:
-        WeightsError: it was made with another autoreconstructor, or with another conditioning.
-        DataError: it was made of other data, or its latents have another shape than this autoreconstructor's.
+    `WeightsError`: made with another autoreconstructor or conditioning; `DataError`: of other data, or its latents
+    have another shape than this autoreconstructor's.
     """
     if store.origin.encoder != fingerprint(autoreconstructor.encoder):
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
@@ -91,34 +89,27 @@ def features_fingerprint(conditioning: nn.Module | None) -> str | None:
     return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
 
-@dataclass(frozen=True)
-class PictureEncoder:
-    """Pictures -> rows of the store's arrays, by frozen networks."""
-
-    encoder: Encoder
-    conditioning: nn.Module | None
-    precision: torch.dtype
-    device: torch.device
-
-    @torch.no_grad()
-    def __call__(
-        self, pictures: UInt8[Tensor, "picture 3 size size"]
-    ) -> dict[str, Shaped[np.ndarray, "picture _ _ _"]]:
-        """ "mean", "log_variance" and "condition"."""
-        # Divided as everywhere: torch multiplies by 1 / 255 on a GPU.
-        images = torch.from_numpy(np.divide(pictures.numpy(), 255, dtype=np.float32)).to(self.device)
-        posterior, _ = self.encoder(images)
-        rows = {"mean": posterior.mean, "log_variance": posterior.log_variance}
-        if self.conditioning is None:
-            return self._stored(rows) | {"condition": pictures.numpy()}
-        return self._stored(rows | {"condition": self.conditioning(images)})
-
-    def _stored(self, rows: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        return {name: value.to(self.precision).cpu().numpy() for name, value in rows.items()}
+@torch.no_grad()
+def encoded(
+    pictures: UInt8[Tensor, "picture 3 size size"],
+    encoder: Encoder,
+    conditioning: nn.Module | None,
+    precision: torch.dtype,
+    device: torch.device | str,
+) -> Rows:
+    """The rows "mean", "log_variance" and "condition" of these pictures, by frozen networks."""
+    # Divided as everywhere: torch multiplies by 1 / 255 on a GPU.
+    images = torch.from_numpy(np.divide(pictures.numpy(), 255, dtype=np.float32)).to(device)
+    posterior, _ = encoder(images)
+    made = {"mean": posterior.mean, "log_variance": posterior.log_variance}
+    if conditioning is not None:
+        made["condition"] = conditioning(images)
+    stored = {name: value.to(precision).cpu().numpy() for name, value in made.items()}
+    return {"condition": pictures.numpy(), **stored} if conditioning is None else stored
 
 
 class Moments:
-    """Sums over all elements of what was encoded, in float64, for the standard deviation of a draw."""
+    """Sums over all elements of what was encoded, in float64, for the deviation of a draw."""
 
     def __init__(self) -> None:
         self.count, self.total, self.squares = 0, 0.0, 0.0
@@ -151,16 +142,12 @@ def encode_training_set(
     A finished store of the same is left as it is. Nothing that opens is left behind by a run that was interrupted.
 
     Args:
-        out: folder of the store.
         frames: the largest number of frames of a sequence, evenly spaced; None: all.
         precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
             first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
         conditioning: frozen, images -> features, which are stored; None: the pictures are.
-        batch_size: pictures that are encoded together.
 
-    Raises:
-        DataError: data that are not packed or are damaged, no space, another store in the folder, or encodings that
-            are not finite.
+    `DataError`: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
     """
     if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
         raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
@@ -170,11 +157,15 @@ def encode_training_set(
         raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
     origin = _origin(autoreconstructor, data, conditioning, frames, precision)
     if is_latent_cache(out):
-        return _kept(out, origin)
+        store = LatentCache(out)
+        if store.origin != origin:
+            raise DataError("already holds another store: choose another folder, or remove this one", str(out))
+        logger.info("%s already holds these encodings", out)
+        return store
     out.mkdir(parents=True, exist_ok=True)
     features = None if conditioning is None else conditioning.to(device).eval()
     encoder = autoreconstructor.to(device).eval().encoder
-    encode = PictureEncoder(encoder, features, PRECISIONS[precision], torch.device(device))
+    encode = partial(encoded, encoder=encoder, conditioning=features, precision=PRECISIONS[precision], device=device)
     blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
@@ -195,11 +186,7 @@ class FrameToEncode(NamedTuple):
 def _pictures(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[FrameToEncode]:
-    """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of.
-
-    Raises:
-        DataError: the store is damaged.
-    """
+    """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of."""
     rows = 0
     for name in track(source.names, "encoding sequences", disable=not progress):
         sequence = source.read(name)
@@ -211,11 +198,7 @@ def _pictures(
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
-    """Say how large the store is going to be.
-
-    Raises:
-        DataError: the disk has less space than that.
-    """
+    """Say how large the store is going to be; `DataError` if the disk has less space than that."""
     most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
     total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
     contents = f"{total:,} frames of {len(source.names):,} sequences"
@@ -223,11 +206,7 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 
 
 def _write_arrays(
-    out: Path,
-    encode: PictureEncoder,
-    blank: Mapping[str, np.ndarray],
-    pictures: Iterator[FrameToEncode],
-    batch_size: int,
+    out: Path, encode: Callable[[Tensor], Rows], blank: Rows, pictures: Iterator[FrameToEncode], batch_size: int
 ) -> tuple[dict[str, Array], float]:
     """Rows like those of `blank` for all pictures; what was written, and the scale."""
     moments = Moments()
@@ -265,20 +244,7 @@ def _origin(
     )
 
 
-def _kept(out: Path, origin: Origin) -> LatentCache:
-    """The finished store that is there already.
-
-    Raises:
-        DataError: it is damaged, or another one than is to be made.
-    """
-    store = LatentCache(out)
-    if store.origin != origin:
-        raise DataError("already holds another store: choose another folder, or remove this one", str(out))
-    logger.info("%s already holds these encodings", out)
-    return store
-
-
-def _refuse_not_finite(rows: Mapping[str, Shaped[np.ndarray, "_ _ _ _"]], pictures: list[FrameToEncode]) -> None:
+def _refuse_not_finite(rows: Rows, pictures: list[FrameToEncode]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():

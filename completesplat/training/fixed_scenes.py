@@ -35,9 +35,8 @@ class DrawsFixedScenes(Callback):
     The model is in evaluation mode, with averaged weights if training keeps them. Training is the same without.
 
     Args:
-        folder: of the pictures.
+        folder, scenes: of the pictures, and how many scenes they show.
         every_n_steps: optimizer steps between them; there is another one at the end of training.
-        scenes: how many.
         views: targets of a scene, evenly spread over those that it has; all, if these are fewer.
     """
 
@@ -80,9 +79,8 @@ class DrawsFixedScenes(Callback):
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
     """Evaluation with averaged weights if there are any; afterwards all is as it was, random numbers too."""
     modes = {part: part.training for part in module.modules()}
-    with ExitStack() as contexts:
-        contexts.enter_context(torch.no_grad())
-        contexts.enter_context(torch.random.fork_rng([module.device] if module.device.type == "cuda" else []))
+    devices = [module.device] if module.device.type == "cuda" else []
+    with torch.no_grad(), torch.random.fork_rng(devices), ExitStack() as contexts:
         for callback in trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, ExponentialMovingAverage):
                 contexts.enter_context(callback.in_place(module))
@@ -112,9 +110,8 @@ class Pictures(DrawsFixedScenes):
     """What the first target of each scene looks like, and what its Gaussians are like; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`). All loggers get `gaussians/opacity_p10`, `_p50`,
-    `_p90`, the same of `log10_scale` (all three axes) and `depth` (along the reference's optical axis, in scene
-    units). If the model has a posterior, they also get what its latent carries (`latent_bits`). Weights & Biases gets
-    the picture and histograms too.
+    `_p90`, the same of all `distributions`, and what the latent carries of a model that has a posterior
+    (`latent_bits`). Weights & Biases gets the picture and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 1000, scenes: int = 4) -> None:
@@ -143,8 +140,7 @@ def scene_panels(
 ) -> dict[str, Float[Tensor, "batch 3 height width"]]:
     """Input and first target, what the Gaussians [batch] show from the target's camera, and each layer by itself.
 
-    A layer is as many Gaussians as there are pixels (see `completesplat.splatter_image`). The error is the mean
-    absolute difference of the colours, times 4. Depth is coloured on a scale of its own for each scene.
+    The error is the mean absolute difference of the colours, times 4. Depth has a scale of its own for each scene.
     """
     target = scenes.targets[:, :1]
 
@@ -158,9 +154,9 @@ def scene_panels(
         "input": scenes.reference.images,
         "target": target.images[:, 0],
         "render": image,
-        f"error x{ERROR_GAIN}": _grey(ERROR_GAIN * error),
+        f"error x{ERROR_GAIN}": (ERROR_GAIN * error).expand(-1, 3, -1, -1),
         "depth": torch.stack([color_depth(depth)[0] for depth in whole.expected_depth()]),
-        "opacity": _grey(whole.alpha),
+        "opacity": whole.alpha.expand(-1, 3, -1, -1),
     }
     pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
     for layer in range(gaussians.count // pixels):
@@ -169,12 +165,8 @@ def scene_panels(
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
 
 
-def _grey(values: Float[Tensor, "batch 1 height width"]) -> Float[Tensor, "batch 3 height width"]:
-    return values.expand(-1, 3, -1, -1)
-
-
 def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]]:
-    """Opacities, decimal logarithms of the scales, and depths, of all Gaussians in their reference's frame."""
+    """Opacities, decimal logarithms of the scales (all axes), and depths in the reference's frame, in scene units."""
     values = {
         "opacity": gaussians.opacities,
         "log10_scale": gaussians.scales.log10(),

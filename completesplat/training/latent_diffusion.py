@@ -163,7 +163,7 @@ class LatentDiffusion(SceneModule):
             timestep,
             conditioning.contiguous(memory_format=self.memory_format),
         )
-        errors = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
+        errors: Tensor = (predicted - target(parts.sampler.scheduler, latent, noise, timestep)).square().mean((1, 2, 3))
         self.log_loss(errors.detach(), timestep)
         return errors.mean()
 

@@ -24,11 +24,7 @@ from completesplat.errors import CompleteSplatError
 MODES = ("online", "offline", "disabled")
 ANSWER_SECONDS, START_SECONDS = 4, 6
 """How long a server may take to answer at all, and to start a run: together the longest that it can delay training."""
-AXIS = "trainer/global_step"
-SWEEP = "multirun.yaml"  # hydra's, in a sweep's folder
-ID = "wandb_id"
-DATA = "WANDB_DATA_DIR"
-GATEWAY_ERRORS = 502
+AXIS, DATA = "trainer/global_step", "WANDB_DATA_DIR"
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +32,8 @@ log = logging.getLogger(__name__)
 class ContinuedCSVLogger(CSVLogger):
     """Writes `metrics.csv`, each row at once, so that a run that is killed keeps what it logged.
 
-    Of what the file holds already, the rows before the first step that is logged now stay; the others are what an
-    interrupted run did after its last checkpoint, and is done again.
+    Of what the file holds already, the rows before the first step that is logged now stay: what an interrupted run did
+    after its last checkpoint is done again.
     """
 
     def __init__(self, save_dir: str) -> None:
@@ -101,13 +97,8 @@ class WandbRun(WandbLogger):
 
     Args:
         mode: online, offline or disabled.
-        group: by default the sweep's folder, in a sweep.
-        name: by default the name of the directory.
-        job_type: fit or test.
+        group, name: by default the sweep's folder, in a sweep, and the name of the directory.
         scenes: shown of a test.
-
-    Raises:
-        CompleteSplatError: another mode, or wandb is not installed.
     """
 
     def __init__(
@@ -123,7 +114,7 @@ class WandbRun(WandbLogger):
         if mode not in MODES:
             raise CompleteSplatError(f"wandb.mode={mode}: choose one of {', '.join(MODES)}")
         folder = Path(save_dir).absolute()
-        if group is None and (folder.parent / SWEEP).is_file():
+        if group is None and (folder.parent / "multirun.yaml").is_file():  # hydra's, in a sweep's folder
             group = folder.parent.name
         about = {"mode": mode, "group": group, "job_type": job_type}
         try:
@@ -147,10 +138,8 @@ class WandbRun(WandbLogger):
     def _begin(self) -> Any:
         import wandb
 
-        settings = self._wandb_init | {
-            "id": self._id_of_folder(),
-            "settings": wandb.Settings(init_timeout=START_SECONDS),
-        }
+        limit = wandb.Settings(init_timeout=START_SECONDS)
+        settings = self._wandb_init | {"id": self._id_of_folder(), "settings": limit}
         if settings["mode"] == "online":
             server = wandb.setup().settings.base_url
             try:
@@ -164,12 +153,10 @@ class WandbRun(WandbLogger):
         return wandb.init(**settings)
 
     def _id_of_folder(self) -> str:
-        path = Path(self._save_dir) / ID  # type: ignore[arg-type]
-        known = path.read_text().strip() if path.is_file() else ""
-        if not known:
-            known = secrets.token_hex(4)
-            path.write_text(known + "\n")
-        return known
+        path = Path(self._save_dir) / "wandb_id"  # type: ignore[arg-type]
+        if not (path.is_file() and path.read_text().strip()):
+            path.write_text(secrets.token_hex(4) + "\n")
+        return path.read_text().strip()
 
     @rank_zero_only
     def log_hyperparams(self, params: Any) -> None:
@@ -220,10 +207,7 @@ class WandbRun(WandbLogger):
 
 @contextmanager
 def finished(loggers: Iterable[Logger]) -> Iterator[None]:
-    """Close W&B's runs in the end, with exit code 0, or with 1 after an error or Ctrl-C.
-
-    They outlive a job: what the next one of a sweep logs must not go there.
-    """
+    """Close W&B's runs in the end, so that what the next job logs does not go there; exit code 1 after an error."""
     exit_code = 1
     try:
         yield
@@ -252,7 +236,7 @@ def _asked(url: str, seconds: float) -> bool:
     try:
         urlopen(url, timeout=seconds).close()
     except HTTPError as error:
-        return error.code < GATEWAY_ERRORS  # which a proxy reports of a server that it does not reach
+        return error.code < 502  # a proxy reports 502 and above of a server that it does not reach
     except URLError as error:
         return isinstance(error.reason, SSLError)  # W&B may trust more certificates than Python
     except OSError:

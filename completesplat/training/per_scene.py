@@ -18,12 +18,7 @@ from completesplat.training.scene_module import SceneModule
 class PerScene(SceneModule):
     """An upper bound, not a competitor: it is fitted to all views, so it has seen those that it is scored on.
 
-    It has nothing to train; all its work is done in evaluation.
-
-    Args:
-        loss: of the fit, weighted terms by name.
-        fitting: number of Gaussians, steps and rates.
-        **rendering_and_optimization: see `SceneModule`.
+    It has nothing to train; all its work is done in evaluation. `loss` is that of the fit.
     """
 
     upper_bound = True
@@ -50,10 +45,6 @@ class Preoptimized(PerScene):
 
     Like `PerScene`, it has seen the views that it is scored on. The results of a test have the share of pixels without
     any Gaussian as `empty_pixels`, a mean over scenes; the paper reports 80 %.
-
-    Args:
-        parameterization: layers and activations of the Splatter Image.
-        **fitting_and_rendering: see `PerScene`.
     """
 
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:

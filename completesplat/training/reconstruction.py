@@ -62,7 +62,8 @@ class ReconstructionModule(SceneModule):
     def forward(self, scenes: SceneBatch) -> Reconstruction:
         """Splatter Images, and posteriors if the model has any, from the reference images alone."""
         images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
-        return self.model(images.contiguous(memory_format=self.memory_format))
+        reconstruction: Reconstruction = self.model(images.contiguous(memory_format=self.memory_format))
+        return reconstruction
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         reconstruction = self(scenes)
@@ -76,4 +77,5 @@ class ReconstructionModule(SceneModule):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Gaussians from the posterior's mode: nothing is drawn, so the seed has no effect."""
-        return self(scenes).splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
+        reconstruction: Reconstruction = self(scenes)
+        return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

@@ -13,6 +13,7 @@ from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import SceneBatch, Views
+from completesplat.splatter_image import SplatterImage
 from completesplat.training.reconstruction import ReconstructionModule
 
 
@@ -20,11 +21,8 @@ class ReconstructorOnly(ReconstructionModule):
     """Codes and reconstructor are trained together; a picture of the test gets a new code, the reconstructor stays.
 
     Args:
-        model: codes and reconstructor.
         loss: weighted terms by name, in training of all views, in the test of the reference alone.
-        code_steps: steps of the optimisation of a new code (800 in DeepSDF).
-        code_rate: its learning rate (0.005 in DeepSDF).
-        **reconstruction: see `ReconstructionModule`.
+        code_steps, code_rate: of the optimisation of a new code (800 and 0.005 in DeepSDF).
     """
 
     model: AutoDecoder
@@ -68,7 +66,8 @@ class ReconstructorOnly(ReconstructionModule):
 
     def gaussians(self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch) -> Gaussians:
         """Gaussians from codes."""
-        return self.model(codes).gaussians(scenes.reference.cameras, scenes.depth_range)
+        image: SplatterImage = self.model(codes)
+        return image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
     def reference_loss(
         self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch

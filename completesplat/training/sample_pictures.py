@@ -24,14 +24,12 @@ class Samples(DrawsFixedScenes):
     """Several samples of each scene, seen from its reference and its targets; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has for each scene a row of true pictures (the input first), one for each sample, and the
-    depth of the first sample (`color_depth`, on one scale for a scene's views). `folder/strip_000500.png` shows the
-    first sample while it is denoised: the scenes that estimates of the clean latent stand for, from the reference and
-    from the middle target. All loggers get, of the targets' views, `samples/diversity` (see `diversity`; not of one
-    sample), `samples/psnr` (mean over the samples) and `samples/psnr_of_mean` (of their mean picture); Weights & Biases
-    also both pictures.
+    depth of the first sample. `folder/strip_000500.png` shows the first sample while it is denoised: the scenes that
+    estimates of the clean latent stand for, from the reference and from the middle target. All loggers get, of the
+    targets' views, `samples/diversity` (not of one sample), `samples/psnr` (mean over the samples) and
+    `samples/psnr_of_mean` (of their mean picture); Weights & Biases also both pictures.
 
     Args:
-        folder, every_n_steps, scenes, views: see `DrawsFixedScenes`.
         samples: of a scene, always from the same noise.
         strip: the largest number of denoiser calls shown, evenly spaced from the first to the last.
     """
@@ -64,8 +62,7 @@ class Samples(DrawsFixedScenes):
 
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=keep)
-        # The reference, and the middle one of the targets.
-        pair = [0, 1 + (len(views.images[0]) - 1) // 2]
+        pair = [0, 1 + (len(views.images[0]) - 1) // 2]  # the reference, and the middle one of the targets
         with torch.autocast(module.device.type, enabled=False):
             cameras = views.cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
             seen = module.rasterizer(gaussians, cameras)
@@ -109,12 +106,8 @@ def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
     """A column for each view; views that a scene has less than others stay white."""
     rows: list[list[SheetCell | None]] = []
     for scene in drawn:
-        named = {
-            "true": scene.true,
-            **{f"sample {i + 1}": images for i, images in enumerate(scene.samples)},
-            "depth of 1": color_depth(scene.depth[0])[0],
-        }
-        rows += [labelled(name, images) for name, images in named.items()]
+        samples = [labelled(f"sample {i + 1}", images) for i, images in enumerate(scene.samples)]
+        rows += [labelled("true", scene.true), *samples, labelled("depth of 1", color_depth(scene.depth[0])[0])]
     most = max(map(len, rows))
     return picture_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
 

@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from completesplat.baselines.naive import copy_reference, repeat_image
 from completesplat.data.loading.distributed import gathered
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -28,6 +27,18 @@ from completesplat.scene import SceneBatch, Views
 Result = TypeVar("Result")
 
 
+def copy_reference(scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
+    """The reference image for every view. A model that does not beat this and `repeat_image` has learned nothing."""
+    return scenes.reference.images[:, None].expand_as(scenes.all_views().images)
+
+
+def repeat_image(
+    image: Float[Tensor, "3 height width"], scenes: SceneBatch
+) -> Float[Tensor, "batch view 3 height width"]:
+    """One image for every view: with the training set's mean image, the best constant prediction of the MSE."""
+    return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
+
+
 class Timings:
     """Seconds for each scene, by the name of the work."""
 
@@ -35,7 +46,7 @@ class Timings:
         self.seconds: dict[str, list[float]] = defaultdict(list)
 
     def of(self, name: str, work: Callable[[], Result], scenes: int = 1) -> Result:
-        """Do the work for so many scenes at once."""
+        """Do the work, for this number of scenes at once."""
         start = _now()
         result = work()
         self.seconds[name].append((_now() - start) / scenes)
@@ -60,12 +71,7 @@ def _now() -> float:
 
 
 def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> None:
-    """Settings of speed, in place; the state dict's keys stay as they are.
-
-    Args:
-        channels_last: order weights for convolutions in NHWC; its images should be too.
-        compile: `torch.compile` the network on its first call.
-    """
+    """Order the weights of convolutions in NHWC (images should be too), compile on the first call; keys stay."""
     if channels_last:
         network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if compile:
@@ -76,7 +82,7 @@ def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> N
 class ScoredScene:
     """What a test makes of one scene: Gaussians, and their images as they are scored, the reference view first.
 
-    The input is as the model sees it. The cameras are those of the renders, whose pictures may be smaller.
+    The input is as the model sees it, the cameras those of the renders, whose pictures may be smaller.
     """
 
     name: str
@@ -91,8 +97,6 @@ class SceneModule(LightningModule):
     """A model that turns reference images into Gaussians.
 
     Args:
-        rasterizer: renders the Gaussians.
-        optimizer: parameters -> optimizer.
         schedule: optimizer and steps of the run -> learning-rate schedule, stepped every optimizer step.
         background: grey value (0 to 1) seen where the Gaussians leave a pixel open.
     """
@@ -126,11 +130,7 @@ class SceneModule(LightningModule):
         """One set of Gaussians [batch] for each reference image, in its camera's frame."""
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
-        """So many sets of Gaussians for each reference image, next to each other: [batch * samples].
-
-        Args:
-            seeds: one for each image.
-        """
+        """`samples` sets of Gaussians for each reference image and its seed, next to each other: [batch * samples]."""
         return self.reconstruct(scenes, seeds[0])
 
     @property
@@ -211,4 +211,4 @@ def upsampled(
     if images.shape[-2:] == size:
         return images
     resized = torch.nn.functional.interpolate(images.flatten(0, 1), size, mode="bilinear", align_corners=False)
-    return resized.unflatten(0, images.shape[:2])
+    return resized.view(*images.shape[:2], *resized.shape[1:])

@@ -10,17 +10,15 @@ from lightning.pytorch.profilers import Profiler
 
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
 STATUS = Path("/proc/self/status")
-KIBIBYTES_OF_GIBIBYTE = 1024**2
 
 
 class Throughput(Callback):
     """Logs speed and memory with the trainer's interval.
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
-    for data, are of the steps since the last row; `memory/process_gb` is what the training process has in memory now
-    (on Linux), `memory/gpu_gb` the most that torch had allocated on the GPU (where there is one), in GiB.
-    The clock stands still during validation, and from a row to the next batch: while pictures are drawn and checkpoints
-    written, if their intervals are multiples of the trainer's, and this callback stands before those.
+    for data, are of the steps since the last row; for memory see `memory`. The clock stands still during validation
+    and from a row to the next batch: while pictures are drawn and checkpoints written, if their intervals are multiples
+    of the trainer's, and this callback stands before those.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -71,6 +69,8 @@ class DataClock(Profiler):
         self.profiler = profiler
         self.begin: float | None = None
         self.waited = 0.0
+        for name in ("setup", "describe", "teardown"):
+            setattr(self, name, getattr(profiler, name))
 
     def start(self, action_name: str) -> None:
         """Called by Lightning before an action."""
@@ -85,25 +85,13 @@ class DataClock(Profiler):
         if action_name == FETCHING:
             self.waited += time.perf_counter() - self.since
 
-    def setup(self, *args: Any, **kwargs: Any) -> None:
-        """Passed on."""
-        self.profiler.setup(*args, **kwargs)
-
-    def describe(self) -> None:
-        """Passed on."""
-        self.profiler.describe()
-
-    def teardown(self, stage: str | None) -> None:
-        """Passed on."""
-        self.profiler.teardown(stage)
-
 
 def memory(device: torch.device) -> dict[str, float]:
-    """`memory/process_gb` on Linux, `memory/gpu_gb` where the device is a GPU."""
+    """In GiB: `memory/process_gb`, what this process has now (on Linux), `memory/gpu_gb`, the most torch has had."""
     values = {}
     if STATUS.exists():
         lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
-        values["memory/process_gb"] = int(lines["VmRSS"].split()[0]) / KIBIBYTES_OF_GIBIBYTE
+        values["memory/process_gb"] = int(lines["VmRSS"].split()[0]) / 2**20  # from KiB
     if device.type == "cuda":
         values["memory/gpu_gb"] = torch.cuda.max_memory_allocated(device) / 2**30
     return values

@@ -16,7 +16,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.viewer.page import Page
-from completesplat.viewer.panel import MOST_SAMPLES, add_drawing, nearest_steps
+from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
 from completesplat.viewer.sample import Sample
 
 MOST_BYTES = 32 * 2**20
@@ -24,12 +24,7 @@ PAUSE = 0.2  # seconds between two pictures of a scene that forms
 
 
 class Completion:
-    """The controls that complete a photograph, added to a page.
-
-    Args:
-        model: completes the photographs, in the page's worker only.
-        start: where the sliders stand at first (`samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`).
-    """
+    """The controls that complete a photograph, added to a page; the model works in the page's worker only."""
 
     def __init__(self, page: Page, model: CompleteSplat, start: dict[str, Any]) -> None:
         self.page, self.model = page, model
@@ -37,8 +32,8 @@ class Completion:
         self.controls = add_drawing(page.server.gui, model, start)
         self.controls.upload.on_upload(self._upload)
         self.controls.draw.on_click(lambda event: self.request(event.client))
-        for slider in self.controls.sliders():
-            slider.on_update(self._moved)
+        for name in SLIDERS:
+            getattr(self.controls, name).on_update(self._moved)
 
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
         """Complete this picture from now on."""
@@ -55,14 +50,14 @@ class Completion:
         job = partial(self._draw, *self.photograph, self.controls.settings(), client)
         self.page.worker.submit("draw", job)
 
-    def _upload(self, event: viser.GuiEvent) -> None:
+    def _upload(self, event: viser.GuiEvent[Any]) -> None:
         file = self.controls.upload.value
         try:
             self.load(file.name, read_upload(self.model, file.name, file.content), event.client)
         except CompleteSplatError as error:
             self.page.tell(error, event.client)
 
-    def _moved(self, event: viser.GuiEvent) -> None:
+    def _moved(self, event: viser.GuiEvent[Any]) -> None:
         steps: Any = self.controls.steps
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
@@ -107,19 +102,12 @@ class Completion:
     ) -> list[Sample]:
         """The new samples behind the earlier ones, as many as there is room for."""
         layers = self.model.autoreconstructor.reconstructor.parameterization.layers
-        new = [
-            Sample(scene, layers, reference, {**settings, "sample": i}, finished, exact=True)
-            for i, scene in enumerate(scenes)
-        ]
+        new = (Sample(x, layers, reference, {**settings, "sample": i}, finished, True) for i, x in enumerate(scenes))
         return [*earlier, *new][-MOST_SAMPLES:]
 
 
 def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
-    """The picture at the model's size. Its name is used in refusals only, never as a path.
-
-    Raises:
-        ImageError: more than 32 MiB, or what `read_photograph` refuses: no image, damaged, too many pixels, ...
-    """
+    """The picture at the model's size; `ImageError` above 32 MiB. Its name is for refusals only, never a path."""
     shown = "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
     if len(content) > MOST_BYTES:
         raise ImageError(f"{shown}: {len(content) / 2**20:.0f} MiB; at most {MOST_BYTES // 2**20} MiB are taken")

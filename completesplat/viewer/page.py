@@ -3,14 +3,16 @@
 import contextlib
 import io
 import logging
+import threading
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.video import orbit_views, write_video
@@ -18,19 +20,68 @@ from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.panel import SIDE_BY_SIDE, add_looking, add_saving
 from completesplat.viewer.sample import Sample
 from completesplat.viewer.stage import Stage
-from completesplat.viewer.worker import Worker
 
 HOST = "127.0.0.1"
+
+Job = Callable[[], None]
 
 log = logging.getLogger(__name__)
 
 
-def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
-    """Listen on the port or, if it is taken, on the next free one; 0 takes any.
+class Worker:
+    """Does one job after the other, in a thread of its own, so that the page answers meanwhile.
 
-    Args:
-        background: grey value where a scene leaves a pixel open.
+    Of the waiting jobs of one kind only the newest is done: a moving slider submits more than can be computed. `failed`
+    is called with every exception that a job raises; the thread goes on.
     """
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
+        self._waiting: dict[str, Job] = {}
+        self._changed = threading.Condition()
+        self._busy = self._closed = False
+        self._thread = threading.Thread(target=self._run, name="completesplat-viewer", daemon=True)
+        self._thread.start()
+
+    def submit(self, kind: str, job: Job) -> None:
+        """Do this after what waits already, in the place of a waiting job of the same kind."""
+        with self._changed:
+            self._waiting[kind] = job
+            self._changed.notify_all()
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until no job is left, at most `timeout` seconds; returns whether none is left."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
+
+    def close(self) -> None:
+        """Forget what waits, and end with the job in progress."""
+        with self._changed:
+            self._waiting.clear()
+            self._closed = True
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: bool(self._waiting) or self._closed)
+                if self._closed:
+                    return
+                job = self._waiting.pop(next(iter(self._waiting)))
+                self._busy = True
+            try:
+                job()
+            except Exception as error:
+                try:
+                    self._failed(error)
+                except Exception:
+                    log.exception("the viewer could not say what failed")
+
+
+def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
+    """Listen on the port or, if it is taken, on the next free one (0 takes any), before a grey background."""
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(HOST, port, verbose=False)
@@ -44,10 +95,7 @@ def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
 class Saver:
     """Writes numbered files into a folder; nothing is overwritten.
 
-    Args:
-        make_rasterizer: called when the first video is wanted, as it may have to be compiled.
-        frames: of a video.
-        background: its grey value where a scene leaves a pixel open.
+    `make_rasterizer` is called when the first video is wanted; it has this number of frames, and a grey background.
     """
 
     def __init__(
@@ -61,37 +109,28 @@ class Saver:
         return self._make_rasterizer()
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write these samples as `ply` or `video`, or the page as it stands as `html`.
-
-        Raises:
-            CompleteSplatError: nothing is shown yet.
-        """
+        """Write these samples as `ply` or `video`, or the page as it stands as `html`."""
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         if kind == "html":
-            return [self.html(self._next("page", ".html"))]
-        return [self.ply(sample) if kind == "ply" else self.video(sample) for sample in samples]
+            return [write_page(self.stage.server, self._next("page", ".html"))]
+        return [self._ply(sample) if kind == "ply" else self._video(sample) for sample in samples]
 
-    def ply(self, sample: Sample) -> Path:
+    def _ply(self, sample: Sample) -> Path:
         """All layers of the sample, in its reference camera's frame."""
         path = self._next("sample", ".ply")
         write_ply(path, sample.for_viewers(), [f"{name} {value}" for name, value in sample.settings.items()])
         return path
 
-    def video(self, sample: Sample) -> Path:
+    def _video(self, sample: Sample) -> Path:
         """A turn about the sample."""
         path = self._next("orbit", ".mp4")
-        reference = sample.reference
-        up = reference.intrinsics.new_tensor(self.stage.up.tolist())
-        frames, _ = orbit_views(
-            self.rasterizer, sample.gaussians, reference, sample.pivot(), self.frames, self.background, up
-        )
+        camera = sample.reference
+        up = camera.intrinsics.new_tensor(self.stage.up.tolist())
+        scene, pivot = sample.gaussians, sample.pivot()
+        frames, _ = orbit_views(self.rasterizer, scene, camera, pivot, self.frames, self.background, up)
         write_video(path, frames)
         return path
-
-    def html(self, path: Path) -> Path:
-        """The scene as one file that needs no server, without the controls."""
-        return write_page(self.stage.server, path)
 
     def _next(self, stem: str, suffix: str) -> Path:
         taken = {path.name for path in self.folder.glob(f"{stem}_*{suffix}")}
@@ -99,12 +138,7 @@ class Saver:
 
 
 class Page:
-    """Controls and scene of one server. What takes time happens in the thread of `worker`.
-
-    Args:
-        saver: writes the files.
-        layers: how many can be switched on and off.
-    """
+    """Controls and scene of one server, where `layers` can be switched. What takes time happens in the worker."""
 
     def __init__(self, server: viser.ViserServer, stage: Stage, saver: Saver, layers: int) -> None:
         self.server, self.stage, self.saver = server, stage, saver
@@ -142,7 +176,7 @@ class Page:
     def _connect_looking(self) -> None:
         looking, stage = self.looking, self.stage
 
-        def changed(_: viser.GuiEvent) -> None:
+        def changed(_: viser.GuiEvent[Any]) -> None:
             index = looking.chosen.options.index(looking.chosen.value)
             stage.chosen = index - 1 if index else None
             stage.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
@@ -155,7 +189,7 @@ class Page:
             box.on_update(changed)
         looking.front.on_click(lambda event: stage.look_from_the_front(event.client))
 
-    def _save(self, kind: str, event: viser.GuiEvent) -> None:
+    def _save(self, kind: str, event: viser.GuiEvent[Any]) -> None:
         client = event.client
         if client is None:
             return
@@ -179,8 +213,6 @@ def stop_server(server: viser.ViserServer) -> None:
 
 
 def write_page(server: viser.ViserServer, path: Path) -> Path:
-    """What the server shows, as one offline HTML file."""
-    text = server.get_scene_serializer().as_html()
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    """What the server shows, without the controls, as one HTML file that needs no server."""
+    write_text(path, server.get_scene_serializer().as_html())
     return path

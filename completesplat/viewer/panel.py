@@ -11,6 +11,7 @@ from completesplat.diffusion.sampling import Sampler
 from completesplat.generation import CompleteSplat
 
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
+SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
 
@@ -34,22 +35,13 @@ class CompletionControls:
 
     def settings(self) -> dict[str, Any]:
         """Arguments of `CompleteSplat`."""
-        names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
-        return {name: getattr(self, name).value for name in names}
-
-    def sliders(self) -> list[Any]:
-        """The controls that start another drawing when they are moved."""
-        return [self.samples, self.skip_weight, self.guidance_weight, self.steps, self.seed]
+        return {name: getattr(self, name).value for name in SLIDERS}
 
 
 def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> CompletionControls:
-    """The folders `Photograph` and `Completion`.
-
-    Args:
-        start: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`: where the sliders stand at first.
-    """
+    """The folders `Photograph` and `Completion`; `start` says by name where the sliders stand at first."""
     blank = np.full((model.image_size, model.image_size, 3), 230, np.uint8)
-    steps = possible_steps(model.sampler)
+    steps, first_steps = possible_steps(model.sampler), nearest_steps(model.sampler, start["steps"])
     with gui.add_folder("Photograph", order=1):
         upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_image(blank, label="none yet", format="png")
@@ -60,9 +52,7 @@ def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) 
             gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
             gui.add_slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint="1: most faithful, 0: most free"),
             gui.add_slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint="more: more diverse"),
-            gui.add_slider(
-                "Steps", 1, steps[-1], 1, nearest_steps(model.sampler, start["steps"]), hint="denoising steps"
-            ),
+            gui.add_slider("Steps", 1, steps[-1], 1, first_steps, hint="denoising steps"),
             gui.add_slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
             gui.add_checkbox("Draw when a slider moves", True),
             gui.add_checkbox("Show it forming", True, hint="costs a little time at each step"),

@@ -1,6 +1,7 @@
 """What the page shows: scenes with the camera that they belong to."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +29,7 @@ class Sample:
         layers: M of the splatter image that it was, or 1.
         reference: the camera of its photograph, or one that sees all of it.
         settings: what it was drawn with, for the files that are saved.
-        finished: or an estimate on the way.
+        finished: False for an estimate on the way.
         exact: as the model gives it, for our rasterizers; files hold Gaussians with screen-space dilation already.
     """
 
@@ -61,10 +62,8 @@ class Sample:
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     """A `.ply`, or the folder of a prediction with all its samples; and where up is.
 
-    Without the prediction's `scene.json` beside it, a file is looked at along +z from where nine tenths of it are seen.
-
-    Raises:
-        CompleteSplatError: nothing there that can be shown.
+    Without the prediction's `scene.json` beside it, a file is looked at by its `framing_camera`. `CompleteSplatError`:
+    nothing there that can be shown.
     """
     files = [path] if path.is_file() else sorted(path.glob("sample_*.ply"))
     if not files:
@@ -92,8 +91,7 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:
     """Gaussians that could not be written are missing from a file: then its layers are not known."""
-    height, width = reference.image_size
-    layers, rest = divmod(gaussians.count, height * width)
+    layers, rest = divmod(gaussians.count, math.prod(reference.image_size))
     return layers if layers and not rest else 1
 
 

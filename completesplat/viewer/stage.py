@@ -20,9 +20,7 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.viewer.sample import Sample
 
 LARGEST_COVARIANCE = 3e4
-GAP = 1.25
-NARROWEST_WINDOW = 1.1
-SAME = 0.15
+GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
 ORBIT_CAMERAS = 12
 REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
 
@@ -33,10 +31,8 @@ class Arrangement:
 
     Attributes:
         pivots: the point that each sample turns about, before it is moved to its place.
-        right: the direction of the row.
-        spacing: between neighbours, in scene units: 1.25 times the width of the picture at the pivot.
-        position, look_at: of the page's camera.
-        fov: vertical, of the page's camera, in radians.
+        right, spacing: the row's direction, and between neighbours 1.25 widths of the picture at the pivot.
+        position, look_at, fov: of the page's camera, the field of view vertical and in radians.
     """
 
     pivots: list[Float[Tensor, "3"]]
@@ -80,11 +76,8 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
 class Stage:
     """Samples side by side or one of them, all layers or some, in their colours or those of their depths; cameras.
 
-    Everything is drawn anew from the attributes by `refresh`, under a lock: callbacks come from several threads.
-
-    Args:
-        up: where up is, in the reference cameras' frame.
-        data_cameras: of a data set, [view], relative to a reference camera.
+    Everything is drawn anew from the attributes by `refresh`, under a lock: callbacks come from several threads. Where
+    up is, and the cameras [view] of a data set, are in the reference camera's frame.
     """
 
     def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
@@ -141,28 +134,23 @@ class Stage:
         with self._lock:
             if self._arrangement is None:
                 return
-            clients = list(self.server.get_clients().values()) if client is None else [client]
-            start = self.server.initial_camera
-            start.position, start.look_at = self._arrangement.position, self._arrangement.look_at
-            start.fov = self._arrangement.fov
-            for one in clients:
+            view, start = self._arrangement, self.server.initial_camera
+            start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
+            for one in list(self.server.get_clients().values()) if client is None else [client]:
                 with one.atomic():
-                    one.camera.up_direction = self.up
-                    one.camera.position, one.camera.look_at = self._arrangement.position, self._arrangement.look_at
-                    one.camera.fov = self._arrangement.fov
+                    camera = one.camera
+                    camera.up_direction = self.up
+                    camera.position, camera.look_at, camera.fov = view.position, view.look_at, view.fov
 
     def _draw_splats(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
         scenes = [sample.for_viewers() for sample in shown]
         if self.depth:
             scenes = depth_colored(scenes)
-        wanted = {}
-        for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True)):
-            for layer in range(sample.layers):
-                wanted[f"/sample_{i}/layer_{layer}"] = (
-                    layer_of(scene, layer, sample.layers),
-                    arrangement.shift(i),
-                    layer,
-                )
+        wanted = {
+            f"/sample_{i}/layer_{layer}": (layer_of(scene, layer, sample.layers), arrangement.shift(i), layer)
+            for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True))
+            for layer in range(sample.layers)
+        }
         for name in self._splats.keys() - wanted.keys():
             self._splats.pop(name).remove()
         for name, (gaussians, shift, layer) in wanted.items():
@@ -216,8 +204,8 @@ class Stage:
 class ViserSplats(NamedTuple):
     """What `add_gaussian_splats` takes, in units of `scale` scene units.
 
-    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: the unit is chosen so that
-    the largest one is just below that end, and thin Gaussians keep their shape.
+    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: with this unit the largest
+    one is just below that end, and thin Gaussians keep their shape.
     """
 
     centers: Float[np.ndarray, "gaussian 3"]
@@ -256,5 +244,5 @@ def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
     """The scenes in the colours of their depths (z), near bright and far dark, on one scale for all of them."""
     depths = torch.cat([scene.means[:, 2] for scene in scenes])
     colors, _ = color_depth(depths[None, None, :])
-    parts = colors[:, 0].T.split([scene.count for scene in scenes])
+    parts = torch.split(colors[:, 0].T, [scene.count for scene in scenes])
     return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]

@@ -24,15 +24,10 @@ def in_the_box() -> list[str]:
 
 
 def weights_folder(weights: Path | str) -> Path:
-    """The folder that is meant, complete, with every file that has a checksum as it was written.
+    """The folder that is meant: a name of `in_the_box`, else a folder, else an id of the Hugging Face hub.
 
-    Args:
-        weights: a name of `in_the_box` (a folder of that name is meant by `./NAME`); else a folder; else an id of the
-            Hugging Face hub, whose files are downloaded once (a token, a mirror, work without a network: by the hub's
-            own environment variables).
-
-    Raises:
-        WeightsError: there are none, files are missing, or one has another checksum.
+    Of the hub, files are downloaded once (a token, a mirror, work without a network: by its environment variables).
+    `WeightsError`: there are none, files are missing, or one has another checksum.
     """
     folder = _locate(str(weights))
     for name in (CONFIG_FILE, WEIGHTS_FILE):
@@ -73,10 +68,9 @@ def _check_sums(folder: Path) -> None:
     sums = folder / SUMS_FILE
     if not sums.is_file():
         return
-    entries = (line.partition("  ") for line in sums.read_text(errors="replace").splitlines())
-    expected = {name: digest for digest, _, name in entries}
+    lines = sums.read_text(errors="replace").splitlines()
     for name in (CONFIG_FILE, WEIGHTS_FILE):
-        if sha256_of(folder / name) != expected.get(name):
+        if f"{sha256_of(folder / name)}  {name}" not in lines:
             raise WeightsError(
                 f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
                 f"if the change is meant, remove {SUMS_FILE}"
@@ -84,28 +78,24 @@ def _check_sums(folder: Path) -> None:
 
 
 def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: str) -> Path:
-    """The file, which exists and has the hash.
+    """The file, or that of a URL (http or https), downloaded into torch's hub cache once.
 
     Args:
-        weights: a file, or a URL (http or https) that is downloaded into torch's hub cache once.
         sha256: the file's SHA-256, or its first digits; None takes any file.
         advice: how to get the right file and where to give it, the end of every refusal.
-        hash_setting: the setting that `sha256` came from, named where the file has another.
+        hash_setting: the setting that `sha256` came from.
 
-    Raises:
-        WeightsError: the file is missing, cannot be downloaded, or is another one.
+    `WeightsError`: the file is missing, cannot be downloaded, or is another one.
     """
     expected = None if sha256 is None else sha256.lower()
     url = weights.startswith(("http://", "https://"))
     path = _download_file(weights, expected, advice) if url else Path(weights).expanduser()
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
-    if expected is not None:
-        found = sha256_of(path)
-        if not found.startswith(expected):
-            raise WeightsError(
-                f"{path}: SHA-256 {found}, not {sha256}; {advice} (if that file is meant, {hash_setting}={found})"
-            )
+    if expected is not None and not (found := sha256_of(path)).startswith(expected):
+        raise WeightsError(
+            f"{path}: SHA-256 {found}, not {sha256}; {advice} (if that file is meant, {hash_setting}={found})"
+        )
     return path
 
 

@@ -79,16 +79,6 @@ def test_what_the_camera_does_not_see_fills_no_pixel():
     assert not project_to_splatter_image(corner, ONE, RANGE, Parameterization()).empty[0, 0, 0]
 
 
-def test_the_empty_pixels_are_counted_exactly():
-    taken = [(0, 0), (3, 0), (1, 2), (1, 2)]
-    gaussians = at([(column + 0.5, row + 0.5, 2.0) for column, row in taken], [0.5] * 4)
-    empty = project_to_splatter_image(gaussians, ONE, RANGE, Parameterization()).empty
-    expected = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
-    for column, row in taken:
-        expected[0, row, column] = False
-    assert torch.equal(empty, expected)
-
-
 def test_scenes_of_a_batch_stay_apart():
     one, other = at([(0.5, 0.5, 2.0)], [0.9]), at([(2.5, 1.5, 1.5)], [0.4])
     both = Gaussians(*(torch.cat([getattr(one, f.name), getattr(other, f.name)]) for f in fields(Gaussians)))

@@ -16,21 +16,17 @@ from completesplat.export.pictures import (
 )
 
 
-def test_images_stand_where_they_were_given():
+def test_images_stand_where_they_were_given_each_pixel_a_square():
     first, second = torch.rand(3, 3, 4, 5), torch.rand(2, 3, 4, 5)
-    picture = np.asarray(image_grid(first, second, factor=1))
-    assert picture.shape == (8, 15, 3)
+    large = np.asarray(image_grid(first, second, factor=3))
+    picture = large[::3, ::3]
+    assert large.shape == (24, 45, 3)
+    assert np.array_equal(large, picture.repeat(3, axis=0).repeat(3, axis=1))
     for row, images in enumerate((first, second)):
         for column, image in enumerate(images):
             place = picture[4 * row : 4 * row + 4, 5 * column : 5 * column + 5]
             assert np.array_equal(place, to_bytes(image))
     assert np.all(picture[4:, 10:] == 255)
-
-
-def test_pixels_become_squares():
-    picture = np.asarray(image_grid(torch.rand(1, 3, 4, 5), factor=3))
-    assert picture.shape == (12, 15, 3)
-    assert np.array_equal(picture, picture[::3, ::3].repeat(3, axis=0).repeat(3, axis=1))
 
 
 def test_every_picture_of_a_sheet_lies_in_its_row_and_column():
@@ -66,10 +62,9 @@ def lightness(colors):
     return (colors * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(-3)
 
 
-def test_nearer_is_brighter():
-    depth = torch.linspace(1, 20, 100)[None, None]
-    colors, (near, far) = color_depth(depth)
-    assert (lightness(colors).squeeze().diff() <= 0).all()
+def test_nearer_is_brighter_on_one_scale_for_all_pictures():
+    colors, (near, far) = color_depth(torch.linspace(1, 20, 100).view(10, 1, 1, 10))
+    assert (lightness(colors).flatten().diff() <= 0).all()
     assert 1 <= near < 2
     assert 19 < far <= 20
 
@@ -82,11 +77,6 @@ def test_what_is_not_seen_is_grey_and_does_not_move_the_scale():
     assert same_ends == ends
     assert torch.equal(with_holes[..., :8], colors)
     assert (with_holes[..., 8:] == 0.5).all()
-
-
-def test_all_pictures_share_one_scale():
-    near, far = color_depth(torch.stack([torch.full((1, 4, 4), 1.0), torch.full((1, 4, 4), 9.0)]))[0]
-    assert lightness(near).min() > lightness(far).max()
 
 
 def test_stray_depths_do_not_flatten_the_rest():
@@ -111,12 +101,9 @@ def test_nothing_seen_and_one_depth_are_pictures_too():
         ([1.0, 0, 0], [1, 0.5, 0.5]),  # right
         ([0.0, -1, 0], [0.5, 1, 0.5]),  # up
         ([0.6, 0.0, -0.8], [0.8, 0.5, 0.9]),
+        ([0.0, 0, 0], [NOTHING] * 3),
     ],
 )
 def test_colors_are_those_of_normal_maps(normal, color):
     found = color_normals(torch.tensor(normal)[:, None, None])
     torch.testing.assert_close(found[:, 0, 0], torch.tensor(color))
-
-
-def test_no_normal_is_as_grey_as_no_depth():
-    assert (color_normals(torch.zeros(2, 3, 4, 4)) == NOTHING).all()

@@ -94,17 +94,12 @@ def test_reading_returns_what_was_written(tmp_path):
     torch.testing.assert_close(back.covariances(), gaussians.covariances(), rtol=1e-4, atol=1e-6)
 
 
-def test_opacities_of_0_and_1_are_clamped(tmp_path):
-    gaussians = dataclasses.replace(random_gaussians(2), opacities=torch.tensor([0.0, 1.0]))
-    write_ply(tmp_path / "a.ply", gaussians)
+def test_opacities_of_0_and_1_are_clamped_and_colours_below_0_read_as_0(tmp_path):
+    colors = torch.tensor([[-0.5, 0.25, 1.5]] * 2)
+    write_ply(tmp_path / "a.ply", dataclasses.replace(random_gaussians(2), opacities=torch.arange(2.0), colors=colors))
     limit = np.log(1e-6 / (1 - 1e-6))
     np.testing.assert_allclose(PlyData.read(tmp_path / "a.ply")["vertex"]["opacity"], [limit, -limit], rtol=1e-6)
-
-
-def test_colours_below_0_are_read_as_0(tmp_path):
-    gaussians = dataclasses.replace(random_gaussians(1), colors=torch.tensor([[-0.5, 0.25, 1.5]]))
-    write_ply(tmp_path / "a.ply", gaussians)
-    torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, torch.tensor([[0, 0.25, 1.5]]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, colors.clamp(min=0), rtol=0, atol=1e-6)
 
 
 def test_comments_are_kept_one_a_line(tmp_path):
@@ -115,28 +110,14 @@ def test_comments_are_kept_one_a_line(tmp_path):
     assert read_ply(tmp_path / "a.ply").count == 3
 
 
-@pytest.mark.parametrize("field", ["means", "quaternions", "scales", "opacities", "colors"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_gaussians_that_are_not_finite_are_left_out(tmp_path, caplog, field, value):
-    good = random_gaussians(6)
-    damaged = getattr(good, field).clone()
-    damaged.view(6, -1)[2, 0] = value
-    assert write_ply(tmp_path / "a.ply", dataclasses.replace(good, **{field: damaged})) == 5
-    assert torch.equal(read_ply(tmp_path / "a.ply").means, good.means[[0, 1, 3, 4, 5]])
-    assert "left out 1 of 6" in caplog.text
-
-
-def test_gaussians_without_extent_or_beyond_float32_are_left_out(tmp_path):
+def test_what_cannot_be_stored_is_left_out(tmp_path, caplog):
     good = random_gaussians(5, dtype=torch.float64)
     scales, means = good.scales.clone(), good.means.clone()
     scales[0, 1], scales[3, 2], means[4, 0] = 0, -1, 1e300
     assert write_ply(tmp_path / "a.ply", dataclasses.replace(good, scales=scales, means=means)) == 2
     assert torch.equal(read_ply(tmp_path / "a.ply").means, good.means[[1, 2]].float())
-
-
-def test_an_empty_set_is_a_file(tmp_path):
-    assert write_ply(tmp_path / "a.ply", random_gaussians(0)) == 0
-    assert read_ply(tmp_path / "a.ply").count == 0
+    assert "left out 3 of 5" in caplog.text
+    assert write_ply(tmp_path / "a.ply", good[:0]) == read_ply(tmp_path / "a.ply").count == 0
 
 
 def test_further_properties_and_elements_are_passed_over(tmp_path, written):
@@ -160,20 +141,16 @@ def test_windows_line_ends_in_the_header_are_read(tmp_path, written):
 
 BROKEN = {
     "empty": lambda data: b"",
-    "text": lambda data: b"<html>not a splat</html>\n" * 100,
     "zeros": lambda data: bytes(200_000),
     "no line breaks": lambda data: b"a" * 300_000,
     "endless header": lambda data: with_line(data, b"end_header\n", b"comment x\n" * 20_000 + b"end_header\n"),
     "huge count": lambda data: with_line(data, b"vertex 10\n", b"vertex 1000000000000\n"),
     "count of 5000 digits": lambda data: with_line(data, b"vertex 10\n", b"vertex " + b"9" * 5000 + b"\n"),
     "negative count": lambda data: with_line(data, b"vertex 10\n", b"vertex -10\n"),
-    "one too many": lambda data: with_line(data, b"vertex 10\n", b"vertex 11\n"),
     "one too few": lambda data: with_line(data, b"vertex 10\n", b"vertex 9\n"),
-    "trailing byte": lambda data: data + b"x",
     "missing property": lambda data: with_line(data, b"property float rot_3\n", b"property float rot_9\n"),
     "property named twice": lambda data: with_line(data, b"property float nx\n", b"property float x\n"),
     "no vertices": lambda data: with_line(data, b"element vertex", b"element edge"),
-    "big endian": lambda data: with_line(data, b"binary_little_endian", b"binary_big_endian"),
     "ascii": lambda data: with_line(data, b"binary_little_endian", b"ascii"),
     "list property": lambda data: with_line(data, b"float nx\n", b"list uchar int nx\n"),
     "unknown type": lambda data: with_line(data, b"property float nx\n", b"property half nx\n"),
@@ -194,33 +171,24 @@ def test_broken_files_are_refused_in_one_line_and_at_once(tmp_path, written, nam
     assert "\n" not in str(caught.value)
 
 
-def test_every_truncation_is_refused(tmp_path, written):
-    path = tmp_path / "bad.ply"
-    for length in range(0, len(written[1]), 7):
-        path.write_bytes(written[1][:length])
-        with pytest.raises(PlyError):
-            read_ply(path)
-
-
-def test_random_damage_never_raises_anything_else(tmp_path, written):
-    rng = np.random.default_rng(0)
-    path = tmp_path / "bad.ply"
-    for _ in range(500):
+def test_damage_never_raises_anything_else(tmp_path, written):
+    rng, path = np.random.default_rng(0), tmp_path / "bad.ply"
+    for _ in range(200):
         data = bytearray(written[1])
         for position in rng.integers(0, rng.choice([500, len(data)]), rng.integers(1, 6)):
             data[position] = rng.integers(256)
         path.write_bytes(data)
         try:
-            gaussians = read_ply(path)
+            assert read_ply(path).finite().all()
         except PlyError:
             continue
-        assert gaussians.finite().all()
-
-
-@pytest.mark.parametrize("name", ["missing.ply", "."])
-def test_a_path_without_a_file_is_refused(tmp_path, name):
-    with pytest.raises(PlyError, match="no such file"):
-        read_ply(tmp_path / name)
+    for length in range(0, len(written[1]), 7):
+        path.write_bytes(written[1][:length])
+        with pytest.raises(PlyError):
+            read_ply(path)
+    for nothing in (tmp_path / "missing.ply", tmp_path):
+        with pytest.raises(PlyError, match="no such file"):
+            read_ply(nothing)
 
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path, written, monkeypatch):

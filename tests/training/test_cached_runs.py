@@ -82,17 +82,9 @@ def test_the_cache_of_another_autoreconstructor_is_refused_in_one_line(command, 
     name = next(name for name in checkpoint["state_dict"] if name.startswith("model.encoder."))
     checkpoint["state_dict"][name].view(-1)[0] += 1
     torch.save(checkpoint, tmp_path / "other.ckpt")
+    given = ["experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, f"data.latent_cache={latent_cache}"]
     start = f"model.autoreconstructor_checkpoint={tmp_path / 'other.ckpt'}"
-    given = [
-        "experiment=toy_diffusion",
-        f"data.root={pipeline.toy}",
-        *QUICK,
-        f"data.latent_cache={latent_cache}",
-        start,
-    ]
-    finished = command("fit", *given, f"out={tmp_path / 'run'}")
+    finished = command("fit", *given, start, f"out={tmp_path / 'run'}")
     assert finished.status == 2
-    (line,) = [line for line in finished.err.splitlines() if line.startswith("error: ")]
-    assert line == finished.err.splitlines()[-1]
-    assert "made with another autoreconstructor; encode the training set again" in line
+    assert "made with another autoreconstructor; encode the training set again" in finished.err.splitlines()[-1]
     assert not (tmp_path / "run/checkpoints").exists()

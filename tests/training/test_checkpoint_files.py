@@ -15,36 +15,25 @@ from completesplat.errors import CompleteSplatError
 from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 
 
-def test_a_checkpoint_that_cannot_be_written_leaves_the_last_one(tmp_path, monkeypatch):
-    path, files = tmp_path / "run/last.ckpt", CheckpointFiles()
+def test_a_file_is_written_whole_or_not_at_all_and_not_into_memory_first(tmp_path, monkeypatch):
+    trainer = instantiate(compose_config("fit").trainer, accelerator="cpu", logger=False, _convert_="all")
+    path, files = tmp_path / "run/last.ckpt", trainer.strategy.checkpoint_io
+    path.parent.mkdir()
+    (path.parent / ".last.ckpt.unfinished").write_bytes(b"left by a run that was killed")
     files.save_checkpoint({"weights": torch.ones(3)}, path)
+    targets = []
 
     def half(contents, file):
-        with open(file, "wb") as stream:
-            stream.write(b"half")
+        targets.append(file)
+        Path(file).write_bytes(b"half")
         raise OSError("no space left on device")
 
     monkeypatch.setattr(torch, "save", half)
     with pytest.raises(OSError, match="no space"):
         files.save_checkpoint({"weights": torch.zeros(3)}, path)
+    assert not any(isinstance(target, io.BytesIO) for target in targets)
     assert torch.equal(torch.load(path, weights_only=True)["weights"], torch.ones(3))
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
-
-
-def test_what_a_killed_run_left_unfinished_is_replaced(tmp_path):
-    (tmp_path / ".last.ckpt.unfinished").write_bytes(b"half")
-    CheckpointFiles().save_checkpoint({"weights": torch.ones(3)}, tmp_path / "last.ckpt")
-    assert [file.name for file in tmp_path.iterdir()] == ["last.ckpt"]
-
-
-def test_training_writes_its_checkpoints_so_and_not_into_memory_first(tmp_path, monkeypatch):
-    trainer = instantiate(compose_config("fit").trainer, accelerator="cpu", logger=False, _convert_="all")
-    assert isinstance(trainer.strategy.checkpoint_io, CheckpointFiles)
-    saved = []
-    monkeypatch.setattr(torch, "save", lambda contents, file: saved.append(file) or open(file, "wb").close())
-    trainer.strategy.checkpoint_io.save_checkpoint({}, tmp_path / "last.ckpt")
-    assert not any(isinstance(file, io.BytesIO) for file in saved)
-    assert (tmp_path / "last.ckpt").is_file()
 
 
 class Line(LightningModule):
@@ -97,28 +86,20 @@ def test_an_interval_writes_one_file(tmp_path, written):
     assert max(written) < 1.1 * min(written)
 
 
-def test_milestones_are_kept_and_written_once(tmp_path, written):
-    train(tmp_path, steps=7, every_n_train_steps=2, keep_every=3)
+@pytest.mark.parametrize("links", [True, False])
+def test_milestones_are_kept_and_written_once(tmp_path, written, monkeypatch, links):
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("not permitted")))
+    train(tmp_path, steps=6, every_n_train_steps=2, keep_every=3)
     files = {path.name: path for path in (tmp_path / "checkpoints").iterdir()}
-    assert {name: step_of(path) for name, path in files.items()} == {"last.ckpt": 7, "step=3.ckpt": 3, "step=6.ckpt": 6}
-    assert len(written) == 5  # at 2, 3, 4, 6, 7
-
-
-def test_the_last_milestone_is_the_same_file_as_the_last_checkpoint(tmp_path):
-    train(tmp_path, steps=4, keep_every=2)
-    assert (tmp_path / "checkpoints/last.ckpt").samefile(tmp_path / "checkpoints/step=4.ckpt")
-
-
-def test_without_hard_links_milestones_are_copied(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("not permitted")))
-    train(tmp_path, steps=3, keep_every=2)
-    files = {path.name: step_of(path) for path in (tmp_path / "checkpoints").iterdir()}
-    assert files == {"last.ckpt": 3, "step=2.ckpt": 2}
+    assert {name: step_of(path) for name, path in files.items()} == {"last.ckpt": 6, "step=3.ckpt": 3, "step=6.ckpt": 6}
+    assert len(written) == 4  # at 2, 3, 4, 6
+    assert files["last.ckpt"].samefile(files["step=6.ckpt"]) == links
 
 
 def test_intervals_in_minutes(tmp_path, written, monkeypatch):
     minutes = itertools.count()  # each look at the clock takes one: at the start, then after every step
-    monkeypatch.setattr("completesplat.training.checkpoints.now", lambda: 60.0 * next(minutes))
+    monkeypatch.setattr("completesplat.training.checkpoints.monotonic", lambda: 60.0 * next(minutes))
     train(tmp_path, steps=7, every_minutes=3)
     assert len(written) == 3  # after 3 steps, after 6, and in the end
 

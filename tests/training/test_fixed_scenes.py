@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
@@ -16,13 +17,7 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.fixed_scenes import (
-    distributions,
-    fixed_scenes,
-    latent_bits,
-    percentiles,
-    scene_panels,
-)
+from completesplat.training.fixed_scenes import distributions, fixed_scenes, latent_bits, percentiles, scene_panels
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
@@ -45,13 +40,6 @@ def panels(gaussians: Gaussians, scenes: SceneBatch, background: float = 0.5) ->
     return scene_panels(ReferenceRasterizer(), gaussians, scenes, background)
 
 
-def test_input_and_target_are_those_of_the_scene():
-    scenes = scene_batch()
-    drawn = panels(two_layers(scenes), scenes)
-    assert torch.equal(drawn["input"], scenes.reference.images)
-    assert torch.equal(drawn["target"], scenes.targets.images[:, 0])
-
-
 def test_the_error_of_a_perfect_render_is_zero_and_of_another_the_difference():
     scenes = scene_batch()
     gaussians = two_layers(scenes)
@@ -64,95 +52,73 @@ def test_the_error_of_a_perfect_render_is_zero_and_of_another_the_difference():
     torch.testing.assert_close(error, torch.full_like(error, 0.4))
 
 
-def test_layers_are_told_apart_and_the_nearer_is_brighter_in_depth():
+def test_panels_are_input_target_and_layers():
     scenes = scene_batch()
     gaussians = two_layers(scenes)
     drawn = panels(gaussians, scenes, background=0.0)
     assert list(drawn) == ["input", "target", "render", "error x4", "depth", "opacity", "layer 1", "layer 2"]
-    first, second = drawn["layer 1"], drawn["layer 2"]
-    assert (first[:, 0] > 0.5).all()
-    assert (first[:, 1:] == 0).all()
-    assert (second[:, 2] > 0.5).all()
-    assert (second[:, :2] == 0).all()
+    assert torch.equal(drawn["input"], scenes.reference.images)
+    assert torch.equal(drawn["target"], scenes.targets.images[:, 0])
+    for layer, channel in (("layer 1", 0), ("layer 2", 2)):
+        assert ((drawn[layer] > 0.5).all((0, 2, 3)) == (torch.arange(3) == channel)).all()
+        assert ((drawn[layer] == 0).all((0, 2, 3)) == (torch.arange(3) != channel)).all()
     rendering = ReferenceRasterizer()(gaussians, scenes.targets.cameras[:, :1])[:, 0]
     assert torch.equal(drawn["opacity"], rendering.alpha.clamp(0, 1).expand(-1, 3, -1, -1))
 
 
-def test_what_is_near_is_bright_and_what_is_not_seen_is_grey():
-    scenes = scene_batch(batch=1)
+def test_what_is_near_is_bright_on_each_scenes_own_scale_and_what_is_not_seen_is_grey():
+    scenes = scene_batch(batch=2)
     gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
     rows = torch.arange(SIZE).repeat_interleave(SIZE)
-    far = torch.where(rows < 5, 3.0, 1.0)[None, :, None]
-    gaussians = replace(gaussians, means=gaussians.means * far, opacities=gaussians.opacities * (rows < 10))
+    depths = torch.where(rows < 5, 3.0, 1.0) * torch.tensor([[1.0], [7.0]])
+    gaussians = replace(
+        gaussians, means=gaussians.means * depths[..., None], opacities=gaussians.opacities * (rows < 10)
+    )
     depth = panels(gaussians, scenes)["depth"]
     assert (depth[..., 12:, :] == 0.5).all()
     lightness = depth.mean(1)
     assert (lightness[:, 6:9] > lightness[:, :4].max()).all()
-
-
-def test_each_scene_has_a_scale_of_depth_of_its_own():
-    scenes = scene_batch(batch=2)
-    gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
-    rows = torch.arange(SIZE).repeat_interleave(SIZE)
-    depths = torch.where(rows < SIZE // 2, 1.0, 2.0) * torch.tensor([[1.0], [7.0]])
-    first, second = panels(replace(gaussians, means=gaussians.means * depths[..., None]), scenes)["depth"]
-    torch.testing.assert_close(first, second, atol=1e-3, rtol=0)
+    torch.testing.assert_close(depth[0], depth[1], atol=1e-3, rtol=0)
 
 
 def test_distributions_are_of_all_values():
-    scenes = scene_batch()
-    values = distributions(two_layers(scenes))
+    values = distributions(two_layers(scene_batch()))
     count = 2 * 2 * SIZE * SIZE
     assert {name: len(of) for name, of in values.items()} == {
-        "opacity": count, "log10_scale": 3 * count, "depth": count,
-    }  # fmt: skip
+        "opacity": count,
+        "log10_scale": 3 * count,
+        "depth": count,
+    }
     assert np.allclose(values["log10_scale"], -3)
     assert np.unique(values["depth"].round(5)).tolist() == [1, 3]
-
-
-def test_percentiles():
-    """Of 0, 1, ..., 100, in any order, the n-th percentile is n."""
-    assert percentiles({"depth": np.random.default_rng(0).permutation(101).astype(float)}) == {
-        "depth_p10": 10, "depth_p50": 50, "depth_p90": 90,
-    }  # fmt: skip
+    shuffled = np.random.default_rng(0).permutation(101).astype(float)  # of 0 to 100 the n-th percentile is n
+    assert percentiles({"depth": shuffled}) == {"depth_p10": 10, "depth_p50": 50, "depth_p90": 90}
 
 
 def test_the_bits_of_the_channels_are_those_of_the_posterior():
-    posterior = Posterior(torch.randn(3, 4, 5, 6), torch.randn(3, 4, 5, 6))
+    means = torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]  # 0.05^2 / 2 nats are 0.0018 bits
+    posterior = Posterior(means, torch.zeros(3, 4, 5, 6))
     logged = latent_bits(posterior)
     bits = [logged[f"latent/bits_{channel}"] for channel in range(4)]
     assert logged["latent/bits"] == pytest.approx(sum(bits))
     assert sum(bits) == pytest.approx(posterior.kl().mean().item() / math.log(2), rel=1e-5)
-    assert logged["latent/active_channels"] == 4
-
-
-def test_a_channel_that_is_the_prior_carries_nothing():
-    means = (
-        torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]
-    )  # 0.05^2 / 2 nats: 0.0018 bits a value
-    logged = latent_bits(Posterior(means, torch.zeros(3, 4, 5, 6)))
-    assert logged["latent/bits_0"] == 0
-    assert 0 < logged["latent/bits_2"] < 1
+    assert bits[0] == 0 < bits[2] < 1
     assert logged["latent/active_channels"] == 2
-
-
-class Data:
-    def __init__(self, validation: list[SceneBatch]) -> None:
-        self.val_dataloader = lambda: validation
 
 
 def test_scenes_are_the_first_of_validation():
     several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
-    scenes = fixed_scenes(Data(several), 4)
+    data = SimpleNamespace(val_dataloader=lambda: several)
+    scenes = fixed_scenes(data, 4)
     assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
     assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
-    assert len(fixed_scenes(Data(several), 10)) == 5
+    assert len(fixed_scenes(data, 10)) == 5
 
 
 @pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (2, [0, 3]), (3, [0, 2, 4]), (6, range(6)), (9, range(6))])
 def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
     (whole,) = batch = [scene_batch(1, targets=6)]
-    (scene,) = fixed_scenes(Data(batch), 1, views)
+    (scene,) = fixed_scenes(SimpleNamespace(val_dataloader=lambda: batch), 1, views)
     assert torch.equal(scene.targets.images, whole.targets.images[0, list(chosen)])
 
 

@@ -1,25 +1,21 @@
 """Gaussians fitted once to whole sequences, and the VAE that is trained on their Splatter Images."""
 
-import re
+from types import SimpleNamespace
 
 import pytest
 import torch
 from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.scene import SceneBatch
 from completesplat.training.checkpoints import read_checkpoint
-from completesplat.training.fitted_scenes import FittedScenes
+from completesplat.training.preoptimized_vae import FittedScenes
 
-SETTINGS = [
-    "experiment=toy_var",
-    "model=preoptimized_vae",
-    "model.fitting.count=300",
-    "model.fitting.steps=3",
-    *SMALL,
-]
+MODEL = ["model=preoptimized_vae", "model.fitting.count=300", "model.fitting.steps=3"]
+SETTINGS = ["experiment=toy_var", *MODEL, *SMALL]
 MORE = ["trainer.max_steps=3", "test=false"]
 
 
@@ -54,14 +50,6 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
         )
         assert own == pytest.approx(after, abs=1e-3)
     assert len(list((run / "fitted").iterdir())) == 3  # the test keeps nothing
-
-
-def test_encoded_pictures_are_refused(command, toy_root, latent_cache):
-    refused = command(
-        "fit", *SETTINGS, f"data.root={toy_root}", f"data.latent_cache={latent_cache}", "data.color_jitter=null"
-    )
-    assert refused.status == 2
-    assert re.search(r"^error: data\.latent_cache is for latent diffusion", refused.err, re.MULTILINE)
 
 
 @pytest.mark.parametrize(("ablation", "layers"), [("full", 2), ("skips_first_two", 2), ("m1", 1)])
@@ -125,12 +113,15 @@ def test_a_scene_is_fitted_once_to_all_its_pictures_and_seen_from_any_of_its_cam
 
 def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tmp_path):
     calls = []
-
-    def fit(scenes: SceneBatch) -> Gaussians:
-        calls.append(scenes.names[0])
-        return known_gaussians()
-
     for settings in ("one", "one", "other"):
+        fit = lambda scenes: calls.append(scenes.names[0]) or known_gaussians()  # noqa: E731
         FittedScenes(tmp_path, [store], fit, settings).complete(store.names, progress=False)
     assert calls == [*store.names, *store.names]
-    assert not list(tmp_path.glob("*.unfinished"))
+    assert len(list(tmp_path.iterdir())) == len(calls)
+
+
+def test_encoded_pictures_are_refused():
+    module = instantiate(compose_config("fit", *SETTINGS).model, _convert_="all")
+    module._trainer = SimpleNamespace(datamodule=SimpleNamespace(latent_cache="folder"))
+    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is for model=latent_diffusion"):
+        module.on_fit_start()

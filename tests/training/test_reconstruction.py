@@ -9,6 +9,7 @@ from support import NETWORKS, compose_config
 
 from completesplat.errors import WeightsError
 from completesplat.training.checkpoints import read_checkpoint
+from completesplat.training.scene_module import copy_reference, repeat_image
 
 
 def module(*settings: str):
@@ -50,3 +51,11 @@ def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
     assert torch.equal(seen[0], images * scenes.visible if masked else images)
     assert torch.equal(compared[0], scenes.all_views().images)
     assert (compared[0][:, 0][..., 4:12, 2:9] > 0).any()
+
+
+def test_naive_predictions_are_the_reference_and_one_image():
+    scenes, image = scene_batch(), torch.rand(3, 16, 16)
+    truth, copied, repeated = scenes.all_views().images, copy_reference(scenes), repeat_image(image, scenes)
+    assert copied.shape == repeated.shape == truth.shape
+    assert all(torch.equal(copied[:, view], truth[:, 0]) for view in range(truth.shape[1]))
+    assert (repeated == image).all()

@@ -10,17 +10,16 @@ from completesplat.training.checkpoints import read_checkpoint
 SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4"]
 
 
-@pytest.fixture
-def run(command, toy_root, tmp_path):
-    assert command("fit", *SETTINGS, f"data.root={toy_root}", f"out={tmp_path / 'run'}").status == 0
-    return tmp_path / "run"
-
-
-def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path, run):
+def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
+    run = tmp_path / "run"
+    assert command("fit", *SETTINGS, f"data.root={toy_root}", f"out={run}").status == 0
     first = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
     # Only training pictures: validation and test have taken none.
     data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
-    assert {name for name, _ in first["model._extra_state"]} <= set(data.store("train").names)
+    source = data.source("train")
+    assert {name for name, _ in first["model._extra_state"]} <= set(source.names)
+    pictures = sum(len(source.read(name).frames) for name in source.names)
+    assert len(first["model.codes"]) == pictures == 8  # a row for every training picture
     assert 2 <= len(first["model._extra_state"]) <= 4  # two steps of two pictures
     resume = [f"ckpt_path={run / 'checkpoints/last.ckpt'}", "trainer.max_steps=4", f"out={tmp_path / 'more'}"]
     assert command("fit", *SETTINGS, f"data.root={toy_root}", *resume).status == 0
@@ -30,13 +29,6 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path, run):
     checkpoint = tmp_path / "more/checkpoints/last.ckpt"
     assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}", "trainer.accelerator=cpu").status == 0
     assert 0 < strict_json(tmp_path / "scores/metrics.json")["model"]["full"]["novel"]["psnr"] < 100
-
-
-def test_the_table_has_a_row_for_every_training_picture(toy_root, run):
-    data = instantiate(compose_config("fit", *SETTINGS, f"data.root={toy_root}").data, _convert_="all")
-    source = data.source("train")
-    pictures = sum(len(source.read(name).frames) for name in source.names)
-    assert len(read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]["model.codes"]) == pictures == 8
 
 
 @pytest.mark.parametrize("ablation", ["full", "skips_first_two"])

@@ -19,7 +19,7 @@ from completesplat.training.sample_pictures import SceneDrawings, evenly_spaced,
 SIDE = 32
 
 
-@pytest.mark.parametrize(("count", "most"), [(50, 8), (50, 2), (50, 1), (8, 8), (3, 8), (1, 8), (99, 7)])
+@pytest.mark.parametrize(("count", "most"), [(50, 8), (50, 1), (3, 8), (99, 7)])
 def test_what_is_kept_is_evenly_spaced_and_ends_with_the_last(count, most):
     chosen = evenly_spaced(count, most)
     assert chosen[-1] == count - 1

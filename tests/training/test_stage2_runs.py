@@ -18,14 +18,11 @@ from completesplat.generation import CompleteSplat
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.latent_diffusion import LatentDiffusion
 
-VAE = [
-    "conditioning=stable_diffusion",
-    "conditioning.channels=[8,8,16,16]",
-    "conditioning.layers_per_block=1",
-    "conditioning.norm_groups=4",
-]
+VAE = ["conditioning=stable_diffusion", "conditioning.channels=[8,8,16,16]"]
+VAE += ["conditioning.layers_per_block=1", "conditioning.norm_groups=4"]
 QUICK = [*SMALL, "sampler.steps=1", "test=false", "callbacks.pictures=null", "trainer.log_every_n_steps=1"]
 PREFIX = "completesplat."
+FROM_STAGE_1 = ["experiment=toy_diffusion", "model.autoreconstructor_checkpoint={var}"]
 
 
 @dataclass(frozen=True)
@@ -101,8 +98,14 @@ def test_the_weights_need_no_vae_any_more(run, pipeline):
     assert len(model(pipeline.photograph(), samples=1)) == 1
 
 
-def test_the_latents_are_measured_and_logged_once(run):
+def test_the_latents_and_the_losses_by_timestep_are_logged(run):
     table = pandas.read_csv(run.folder / "metrics.csv")
+    rows = table.groupby("step")[[name for name in table if name.startswith("train/loss")]].max()
+    for step in (0, 1):
+        # Two samples, both in one bucket or each in its own: the mean over the buckets is that over the samples.
+        row = rows.loc[step].dropna()
+        assert len(row) in (2, 3)
+        assert row.drop("train/loss").mean() == pytest.approx(row["train/loss"], rel=1e-5)
     values = table.filter(regex="^latent").dropna()
     assert len(values) == 1
     measured = values.iloc[0]
@@ -112,16 +115,6 @@ def test_the_latents_are_measured_and_logged_once(run):
     means, deviations = (measured[[f"latents/{of}_{i}" for i in range(4)]] for of in ("mean", "std"))
     variance = (deviations**2).mean() + means.var(ddof=0)
     assert variance == pytest.approx(measured["latents/std"] ** 2)
-
-
-def test_the_losses_of_two_samples_are_logged_by_timestep_at_every_step(run):
-    table = pandas.read_csv(run.folder / "metrics.csv")
-    rows = table.groupby("step")[[name for name in table if name.startswith("train/loss")]].max()
-    for step in (0, 1):
-        # Both in one bucket, or each in its own: the mean over the buckets is that over the samples.
-        row = rows.loc[step].dropna()
-        assert len(row) in (2, 3)
-        assert row.drop("train/loss").mean() == pytest.approx(row["train/loss"], rel=1e-5)
 
 
 def module(*settings: str) -> LatentDiffusion:
@@ -137,47 +130,34 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
     assert started.skip_weight == 0
 
 
-@pytest.mark.parametrize("stage", ["var", "diffusion"])
-def test_the_wrong_stages_checkpoint_is_refused(pipeline, stage):
-    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
-    setting = {"var": "checkpoint", "diffusion": "autoreconstructor_checkpoint"}[stage]
-    experiment = {"var": "toy_diffusion_masked", "diffusion": "toy_diffusion"}[stage]
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["experiment=toy_diffusion_masked", "model.checkpoint={var}"], "another architecture"),
+        (["experiment=toy_diffusion", "model.autoreconstructor_checkpoint={diffusion}"], "another architecture"),
+        ([*FROM_STAGE_1, "autoreconstructor.encoder.latent_channels=8"], "another architecture"),
+        ([*FROM_STAGE_1, "model.checkpoint={diffusion}"], "set model.autoreconstructor_checkpoint=null"),
+    ],
+)
+def test_starts_that_do_not_fit_are_refused(pipeline, settings, said):
+    files = {stage: getattr(pipeline, stage) / "checkpoints/last.ckpt" for stage in ("var", "diffusion")}
     with pytest.raises(InstantiationException) as caught:
-        module(f"experiment={experiment}", f"model.{setting}={checkpoint}")
+        module(*(setting.format(**files) for setting in settings))
     assert isinstance(caught.value.__cause__, WeightsError)
-
-
-def test_an_autoreconstructor_of_another_shape_is_refused(pipeline):
-    checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    given = ["experiment=toy_diffusion", f"model.autoreconstructor_checkpoint={checkpoint}"]
-    with pytest.raises(InstantiationException) as caught:
-        module(*given, "autoreconstructor.encoder.latent_channels=8")
-    assert isinstance(caught.value.__cause__, WeightsError)
-    assert "another architecture" in str(caught.value.__cause__)
-
-
-def test_two_starts_are_refused(pipeline):
-    one = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
-    with pytest.raises(InstantiationException) as caught:
-        module("experiment=toy_diffusion", one, f"model.checkpoint={pipeline.diffusion / 'checkpoints/last.ckpt'}")
-    assert "set model.autoreconstructor_checkpoint=null" in str(caught.value.__cause__)
+    assert said in str(caught.value.__cause__)
 
 
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
         (["model.autoreconstructor_checkpoint=null"], "give model.autoreconstructor_checkpoint=FILE"),
-        (["model.autoreconstructor_checkpoint={var}", *VAE], "give conditioning.pretrained=DIR"),
-        (
-            ["model.autoreconstructor_checkpoint={var}", "conditioning.channels=[8,8,16]"],
-            "latents are 4x4 and the conditioning's features 8x8 in size",
-        ),
+        ([FROM_STAGE_1[1], *VAE], "give conditioning.pretrained=DIR"),
+        ([FROM_STAGE_1[1], "conditioning.channels=[8,8,16]"], "latents are 4x4 and the conditioning's features 8x8"),
     ],
     ids=["no autoreconstructor", "random frozen conditioning", "conditioning of another resolution"],
 )
 def test_training_that_cannot_work_ends_in_one_line(command, pipeline, settings, reason):
-    var = pipeline.var / "checkpoints/last.ckpt"
-    given = [setting.format(var=var) for setting in settings]
+    given = [setting.format(var=pipeline.var / "checkpoints/last.ckpt") for setting in settings]
     finished = command("fit", "experiment=toy_diffusion", f"data.root={pipeline.toy}", *QUICK, *given, "out=run")
     assert finished.status == 2
     assert reason in finished.err.splitlines()[-1]

@@ -90,26 +90,21 @@ def test_a_run_logs_all_that_is_listed_and_nothing_else(run, kind):
 
 
 @pytest.mark.slow
-def test_pictures_and_histograms_are_those_of_the_run_directory(run):
-    wandb_run, out = run(STAGE1)
-    (picture,) = wandb_run.folder.glob("files/media/images/pictures_*.png")
-    drawn = out / "pictures/step_000002.png"
-    assert same(Image.open(picture), Image.open(drawn))
-    (shown,) = [row for row in wandb_run.history if "pictures/path" in row]
-    assert (shown["trainer/global_step"], shown["pictures/path"]) == (1, f"media/images/{picture.name}")
+@pytest.mark.parametrize(
+    ("stage", "names"),
+    [(STAGE1, {"pictures": "pictures/step"}), (STAGE2, {"samples": "samples/step", "denoising": "samples/strip"})],
+)
+def test_pictures_and_histograms_are_those_of_the_run_directory(run, stage, names):
+    wandb_run, out = run(stage)
+    for name, drawn in names.items():
+        (picture,) = wandb_run.folder.glob(f"files/media/images/{name}_*.png")
+        assert same(Image.open(picture), Image.open(out / f"{drawn}_000002.png"))
+        (shown,) = [row for row in wandb_run.history if f"{name}/path" in row]
+        assert (shown["trainer/global_step"], shown[f"{name}/path"]) == (1, f"media/images/{picture.name}")
+    values = wandb_run.merged()
     for name in ("opacity", "log10_scale", "depth"):
         # One validation scene of 32 x 32 pixels in two layers; scales have three axes.
-        assert sum(shown[f"histograms/{name}/values"]) == 32 * 32 * 2 * (3 if name == "log10_scale" else 1)
-    assert {f"latent/bits_{i}" for i in range(4)} <= wandb_run.merged().keys()
-
-
-@pytest.mark.slow
-def test_the_pictures_of_samples_are_those_of_the_run_directory(run):
-    wandb_run, out = run(STAGE2)
-    for name, kind in (("samples", "step"), ("denoising", "strip")):
-        (picture,) = wandb_run.folder.glob(f"files/media/images/{name}_*.png")
-        drawn = out / f"samples/{kind}_000002.png"
-        assert same(Image.open(picture), Image.open(drawn))
+        assert sum(values[f"histograms/{name}/values"]) == 32 * 32 * 2 * (3 if name == "log10_scale" else 1)
 
 
 def test_a_test_tells_each_scene_by_pictures_and_scores(run):
@@ -134,17 +129,11 @@ def test_a_test_tells_each_scene_by_pictures_and_scores(run):
     assert not same(pictures["sample 1"], pictures["sample 2"])
     assert len(imageio.imread(files[row["turntable"]["path"]], extension=".mp4")) == 48
     assert all(path.is_relative_to(out) for path in files.values())
-
-
-def test_the_tables_of_a_test_are_those_of_the_report(run):
-    wandb_run, out = run(TEST)
-    results = strict_json(out / "metrics.json")
     predictors, _ = wandb_run.table("test/predictors")
     assert [row["predictor"] for row in predictors] == [name for name in results if name != "protocol"]
     for row in predictors:
         assert row["full_novel_psnr"] == pytest.approx(results[row["predictor"]]["full"]["novel"]["psnr"])
-    rows, _ = wandb_run.table("report/own_1")
-    shown = [row["all pixels, novel views: PSNR ↑"] for row in rows]
+    shown = [row["all pixels, novel views: PSNR ↑"] for row in wandb_run.table("report/own_1")[0]]
     assert f"{results['best_of_k']['full']['novel']['psnr']:.2f}" in shown
 
 

@@ -57,7 +57,7 @@ def logger(out: Path, mode: str = "online") -> WandbRun:
     return WandbRun(str(out), mode, "some")
 
 
-@pytest.mark.parametrize(("status", "answered"), [(404, True), (401, True), (502, False), (504, False)])
+@pytest.mark.parametrize(("status", "answered"), [(401, True), (502, False)])
 def test_any_answer_counts_unless_a_proxy_gives_it(status, answered):
     with server(status) as url:
         assert answers(url, 5) == answered
@@ -133,15 +133,11 @@ def test_training_goes_on_when_the_process_of_wandb_dies(tmp_path, monkeypatch, 
     assert offline_runs(tmp_path)[-1].history[0]["a"] == 3
 
 
-@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_a_run_that_is_stopped_says_so(tmp_path, error):
-    def stopped() -> None:
-        with finished([one := logger(tmp_path, "offline")]):
-            one.log_metrics({"a": 1.0})
-            raise error
-
-    with pytest.raises(error):
-        stopped()
+def test_a_run_that_is_stopped_says_so(tmp_path):
+    one = logger(tmp_path, "offline")
+    one.log_metrics({"a": 1.0})
+    with pytest.raises(KeyboardInterrupt), finished([one]):
+        raise KeyboardInterrupt
     (run,) = offline_runs(tmp_path)
     assert run.only("exit").exit_code == 1
 
@@ -150,8 +146,5 @@ def test_a_run_that_was_never_begun_is_not_begun_to_be_closed(tmp_path):
     with finished([logger(tmp_path, "offline")]):
         pass
     assert list(tmp_path.iterdir()) == []
-
-
-def test_another_mode_is_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match=r"wandb\.mode=onlin: choose one of online"):
         logger(tmp_path, "onlin")

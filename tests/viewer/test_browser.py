@@ -19,12 +19,7 @@ viser = pytest.importorskip("viser", reason="the viewer's extra is not installed
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import (  # noqa: E402
-    Page,
-    Saver,
-    start_server,
-    write_page,
-)
+from completesplat.viewer.page import Page, Saver, start_server, write_page  # noqa: E402
 from completesplat.viewer.stage import Stage  # noqa: E402
 
 CHROMIUM = shutil.which("chromium")
@@ -165,17 +160,6 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     seed.press("Enter")
     until(lambda: page.stage.samples[0].settings.get("seed") == 9, "no new sample")
     changed(tab, first)
-
-
-def test_what_is_no_picture_is_refused_on_the_page(tab, page, tmp_path):
-    file = tmp_path / "notes.txt"
-    file.write_text("no picture")
-    before = page.stage.samples
-    with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load a picture").click()
-    chooser.value.set_files(file)
-    tab.get_by_text("notes.txt: not an image").wait_for(state="attached", timeout=1000 * SECONDS)
-    assert page.stage.samples is before
 
 
 def test_a_second_browser_shows_the_same_scene(tab, page, chromium):

@@ -13,7 +13,6 @@ from PIL import Image
 from support import tiny_generator
 from viewer_scenes import balls_sample
 
-from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import with_screen_space_dilation
 from completesplat.export.ply import read_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -76,11 +75,17 @@ def press(button, browser: Browser) -> None:
         callback(viser.GuiEvent(client=browser, client_id=0, target=button))
 
 
-def upload(completion: Completion, name: str, content: bytes, browser: Browser) -> None:
-    button = completion.controls.upload
-    button._impl.value = SimpleNamespace(name=name, content=content)
-    press(button, browser)
+def finish(completion: Completion) -> list:
+    """What is shown when nothing is left to do."""
     assert completion.page.worker.wait(SECONDS)
+    return completion.page.stage.samples
+
+
+def upload(completion: Completion, name: str = "photo.png", content: bytes | None = None, browser=None) -> list:
+    button = completion.controls.upload
+    button._impl.value = SimpleNamespace(name=name, content=picture() if content is None else content)
+    press(button, browser or Browser())
+    return finish(completion)
 
 
 def picture(level: int = 128) -> bytes:
@@ -104,10 +109,8 @@ def test_each_layer_of_each_sample_is_a_node_of_its_own(page):
 def test_a_layer_is_switched_off_and_on_in_all_samples(page):
     page.show([balls_sample(), balls_sample()])
     page.looking.layers[2].value = False
-    assert {name for name, node in nodes(page).items() if not node.visible} == {
-        "/sample_0/layer_2",
-        "/sample_1/layer_2",
-    }
+    hidden = {name for name, node in nodes(page).items() if not node.visible}
+    assert hidden == {"/sample_0/layer_2", "/sample_1/layer_2"}
     page.looking.layers[2].value = True
     assert all(node.visible for node in nodes(page).values())
 
@@ -140,10 +143,8 @@ def test_frusta_stand_where_the_cameras_are(page):
 
 
 def test_a_picture_that_is_loaded_is_completed_as_the_model_does(completion, model):
-    upload(completion, "photo.png", picture(), Browser())
-    shown = completion.page.stage.samples
-    photograph = completion.photograph[1]
-    for sample, expected in zip(shown, model(photograph, **START), strict=True):
+    shown = upload(completion)
+    for sample, expected in zip(shown, model(completion.photograph[1], **START), strict=True):
         assert sample.finished
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
@@ -151,66 +152,46 @@ def test_a_picture_that_is_loaded_is_completed_as_the_model_does(completion, mod
     assert completion.page.looking.chosen.options == ("all, side by side", "sample 1", "sample 2")
 
 
-def test_a_slider_draws_anew_with_its_value(completion):
-    upload(completion, "photo.png", picture(), Browser())
-    before = completion.page.stage.samples[0].gaussians.means
-    completion.controls.skip_weight.value = 0.25
-    assert completion.page.worker.wait(SECONDS)
-    sample = completion.page.stage.samples[0]
+def test_a_slider_draws_anew_with_its_value_unless_that_is_switched_off(completion):
+    before, controls = upload(completion)[0].gaussians.means, completion.controls
+    controls.skip_weight.value = 0.25
+    sample = finish(completion)[0]
     assert sample.settings["skip_weight"] == 0.25
     assert not torch.equal(sample.gaussians.means, before)
-
-
-def test_no_slider_draws_when_that_is_switched_off(completion):
-    upload(completion, "photo.png", picture(), Browser())
-    before = completion.page.stage.samples
-    completion.controls.live.value = False
-    completion.controls.seed.value = 7
-    assert completion.page.worker.wait(SECONDS)
-    assert completion.page.stage.samples is before
-    press(completion.controls.draw, Browser())
-    assert completion.page.worker.wait(SECONDS)
-    assert completion.page.stage.samples[0].settings["seed"] == 7
-
-
-def test_steps_move_to_a_number_that_the_sampler_can_make(completion):
-    upload(completion, "photo.png", picture(), Browser())
-    completion.controls.steps.value = 3
-    assert completion.controls.steps.value == 2
-    assert completion.page.worker.wait(SECONDS)
-    assert completion.page.stage.samples[0].settings["steps"] == 2
+    controls.steps.value = 3  # moves on to a number that the sampler can make
+    assert controls.steps.value == finish(completion)[0].settings["steps"] == 2
+    before = finish(completion)
+    controls.live.value, controls.seed.value = False, 7
+    assert finish(completion) is before
+    press(controls.draw, Browser())
+    assert finish(completion)[0].settings["seed"] == 7
 
 
 def test_earlier_samples_stay_if_that_is_wanted(completion):
-    upload(completion, "photo.png", picture(), Browser())
+    upload(completion)
     completion.controls.keep.value = True
-    completion.controls.seed.value = 1
-    assert completion.page.worker.wait(SECONDS)
-    assert [sample.settings["seed"] for sample in completion.page.stage.samples] == [0, 0, 1, 1]
-    for seed in (2, 3):
+    for seed in (1, 2, 3, 4):
         completion.controls.seed.value = seed
-        assert completion.page.worker.wait(SECONDS)
-    assert [sample.settings["seed"] for sample in completion.page.stage.samples] == [0, 0, 1, 1, 2, 2, 3, 3]
+        finish(completion)
+    assert [sample.settings["seed"] for sample in finish(completion)] == [1, 1, 2, 2, 3, 3, 4, 4]  # eight at most
 
 
-def test_a_refused_upload_is_told_to_who_sent_it_and_changes_nothing(completion, monkeypatch):
+def test_a_refusal_is_told_to_who_caused_it_and_changes_nothing(completion, monkeypatch):
     before, browser, other = completion.page.stage.samples, Browser(), Browser()
     monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser, 1: other})
-    upload(completion, "notes.txt", b"no picture", browser)
-    assert len(browser.messages) == 1
-    assert browser.messages[0].startswith("notes.txt: not an image")
-    assert other.messages == []
-    assert completion.page.stage.samples is before
-
-
-def test_drawing_without_a_picture_asks_for_one(completion):
-    browser = Browser()
     press(completion.controls.draw, browser)
-    assert browser.messages == ["load a picture first"]
+    assert upload(completion, "notes.txt", b"no picture", browser) is before
+    completion.page.show([])
+    press(completion.page.saving["ply"], browser)
+    finish(completion)
+    for message, start in zip(
+        browser.messages, ("load a picture", "notes.txt: not an", "there is nothing"), strict=True
+    ):
+        assert message.startswith(start)
+    assert other.messages == []
 
 
 def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
-    """Layers are switched while the denoiser stands still."""
     entered, release = threading.Event(), threading.Event()
     forward = model.denoiser.forward
     monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(SECONDS), forward(*a))[-1])
@@ -233,7 +214,7 @@ def test_the_scene_forms_in_sight(completion, monkeypatch):
     monkeypatch.setattr(
         completion.page, "show", lambda samples, status: (seen.append(samples[0]), show(samples, status))
     )
-    upload(completion, "photo.png", picture(), Browser())
+    upload(completion)
     assert [sample.finished for sample in seen] == [False, False, True]
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
@@ -243,10 +224,9 @@ def test_a_fault_is_told_and_the_page_goes_on(completion, model, monkeypatch, ca
     with monkeypatch.context() as broken, caplog.at_level(logging.CRITICAL):
         broken.setattr(completion.page.server, "get_clients", lambda: {0: browser})
         broken.setattr(model, "forward", lambda *_, **__: 1 / 0)
-        upload(completion, "photo.png", picture(), browser)
+        upload(completion, browser=browser)
     assert browser.messages == ["ZeroDivisionError: division by zero"]
-    upload(completion, "photo.png", picture(), browser)
-    assert len(completion.page.stage.samples) == 2
+    assert len(upload(completion)) == 2
 
 
 @pytest.mark.parametrize("kind", ["ply", "video", "html"])
@@ -282,21 +262,12 @@ def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page,
     """Our rasterizer adds its own; what was read from a file holds it already."""
     sample, drawn = replace(balls_sample(), exact=exact), []
     page.show([sample])
-    monkeypatch.setattr(
-        page_module,
-        "orbit_views",
-        lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None),
-    )
+    drawing = lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None)  # noqa: E731
+    monkeypatch.setattr(page_module, "orbit_views", drawing)
     (ply,), _ = page.saver.save("ply", [sample]), page.saver.save("video", [sample])
     wide = with_screen_space_dilation(sample.gaussians, sample.reference) if exact else sample.gaussians
     assert torch.allclose(read_ply(ply).scales, wide.scales, rtol=1e-5)
     assert torch.equal(drawn[0].scales, sample.gaussians.scales)
-
-
-def test_nothing_is_saved_of_an_empty_page(page):
-    page.show([])
-    with pytest.raises(CompleteSplatError, match="nothing to save"):
-        page.saver.save("ply", page.stage.shown)
 
 
 def test_a_port_that_is_taken_leads_to_the_next_one(server):

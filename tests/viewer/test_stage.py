@@ -74,26 +74,18 @@ def test_half_precision_keeps_the_shapes_at_every_size(size):
         assert found == pytest.approx(np.sort(scales), rel=0.01)
 
 
-def test_centers_and_bytes():
+def test_centers_and_bytes_of_what_is_finite():
     gaussians = balls(points=2)
     gaussians.colors[0] = torch.tensor([2.0, 0.5, 0.0])
     splats = to_splats(gaussians)
     assert splats.centers * splats.scale == pytest.approx(gaussians.means.numpy(), rel=1e-5, abs=1e-5)
     assert splats.colors[0].tolist() == [255, 128, 0]
     assert splats.opacities.tolist() == [[204]] * gaussians.count
-
-
-def test_what_is_not_finite_is_left_out():
-    gaussians = balls(points=2)
-    gaussians.means[3, 1] = torch.nan
-    gaussians.scales[5, 0] = torch.inf
+    gaussians.means[3, 1], gaussians.scales[5, 0] = torch.nan, torch.inf
     splats = to_splats(gaussians)
     assert len(splats.centers) == gaussians.count - 2
     assert all(np.isfinite(part).all() for part in splats[:4])
-
-
-def test_nothing_at_all_is_no_error():
-    assert to_splats(balls()[:0]).centers.shape == (0, 3)
+    assert to_splats(gaussians[:0]).centers.shape == (0, 3)
 
 
 def test_the_layers_are_the_parts_in_order():

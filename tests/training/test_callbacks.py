@@ -1,5 +1,6 @@
-"""Speed and memory of a run."""
+"""What training does around its steps: random numbers, speed and memory."""
 
+import itertools
 import time
 
 import pytest
@@ -8,9 +9,16 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.loggers.logger import Logger
 from scenes_for_training import scene_batch
 
+from completesplat.training.callbacks import StepSeeds, step_seed
 from completesplat.training.throughput import Throughput
 
 NAP = 0.03
+QUIET = {
+    "accelerator": "cpu",
+    "enable_checkpointing": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+}
 
 
 class Memory(Logger):
@@ -28,42 +36,49 @@ class Memory(Logger):
         self.rows.append((step, metrics))
 
 
-class Sleeper(LightningModule):
-    def __init__(self, training: float = 0, validation: float = 0) -> None:
+class OneNumber(LightningModule):
+    """A model of one weight."""
+
+    def __init__(self) -> None:
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.naps = training, validation
 
     def training_step(self, batch, index):
-        time.sleep(self.naps[0])
         return self.weight**2
-
-    def validation_step(self, batch, index):
-        time.sleep(self.naps[1])
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), 0.1)
 
 
-class SleepingLoader:
+class Sleeper(OneNumber):
+    def __init__(self, training: float = 0, validation: float = 0) -> None:
+        super().__init__()
+        self.naps = training, validation
+
+    def training_step(self, batch, index):
+        time.sleep(self.naps[0])
+        return super().training_step(batch, index)
+
+    def validation_step(self, batch, index):
+        time.sleep(self.naps[1])
+
+
+class SleepingLoader(list):
     def __init__(self, nap: float = 0) -> None:
+        super().__init__([scene_batch()] * 8)
         self.nap = nap
 
-    def __len__(self) -> int:
-        return 8
-
     def __iter__(self):
-        for _ in range(8):
+        for batch in super().__iter__():
             time.sleep(self.nap)
-            yield scene_batch()
+            yield batch
 
 
 def speeds(module: Sleeper, loader: SleepingLoader, **options) -> list[dict[str, float]]:
     memory = Memory()
     trainer = Trainer(
-        max_epochs=1, accelerator="cpu", logger=memory, log_every_n_steps=2, callbacks=[Throughput()],
-        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
-        **options,
+        max_epochs=1, logger=memory, log_every_n_steps=2, callbacks=[Throughput()], num_sanity_val_steps=0,
+        **QUIET, **options,
     )  # fmt: skip
     profiler = trainer.profiler
     trainer.fit(module, loader, SleepingLoader() if "val_check_interval" in options else None)
@@ -105,3 +120,36 @@ def test_memory_is_that_of_a_process_with_torch():
     assert after - before == pytest.approx(0.5, abs=0.2)
     assert "memory/gpu_gb" not in speeds(Sleeper(), SleepingLoader())[-1]
     del ballast
+
+
+class Drawer(OneNumber):
+    """Draws a number in every step, and before it as many others as it is told."""
+
+    def __init__(self, others: int = 0) -> None:
+        super().__init__()
+        self.others = others
+        self.drawn: list[float] = []
+
+    def on_train_batch_end(self, *_) -> None:
+        torch.rand(self.others)
+
+    def training_step(self, batch, index):
+        self.drawn.append(torch.rand(()).item())
+        return super().training_step(batch, index)
+
+
+def drawn(seed: int, others: int = 0) -> list[float]:
+    """Of three epochs of four batches, of which two share an optimizer step."""
+    module = Drawer(others)
+    trainer = Trainer(max_epochs=3, accumulate_grad_batches=2, logger=False, callbacks=[StepSeeds(seed)], **QUIET)
+    trainer.fit(module, torch.utils.data.DataLoader(range(4), generator=torch.Generator()))
+    return module.drawn
+
+
+def test_every_batch_draws_its_own_numbers_whatever_else_is_drawn():
+    first, again, other_seed = drawn(0), drawn(0, others=5), drawn(1)
+    assert first == again
+    assert len({*first, *other_seed}) == 2 * 12
+    seeds = {step_seed(*place) for place in itertools.product(range(3), repeat=4)}
+    assert len(seeds) == 3**4
+    assert all(0 <= seed < 2**64 for seed in seeds)

@@ -26,13 +26,10 @@ class SplatterImageUNet(nn.Module):
     - The last 3x3 convolution is the head; upstream has a 1x1 convolution behind it.
 
     Args:
-        parameterization: layers (one Gaussian a pixel upstream) and activations of the Splatter Image.
-        channels: width of each level, from full resolution down. The image's sides must be multiples of
-            2^(levels - 1).
+        channels: width of each level, from full resolution down; the image's sides are multiples of 2^(levels - 1).
         attention_levels: levels with self-attention (upstream: at 16 pixels, level 3 of images of 128).
         layers_per_block: residual blocks per level on the way down (the way up has one more).
         dropout: probability of a zero before the second convolution of each residual block.
-        norm_groups: groups of the group normalisation.
         gradient_checkpointing: recompute the residual blocks' activations in the backward pass.
     """
 
@@ -49,7 +46,8 @@ class SplatterImageUNet(nn.Module):
         super().__init__()
         self.parameterization = parameterization
         attends = [level in attention_levels for level in range(len(channels))]
-        network: Any = UNet2DModel(
+        unet: Any = UNet2DModel
+        network = unet(
             in_channels=3,
             out_channels=parameterization.channels,
             block_out_channels=tuple(channels),
