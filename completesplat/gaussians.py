@@ -61,10 +61,5 @@ class Gaussians(TensorDataclass):
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of the sets (of equal batch shape) in one."""
-    return Gaussians(
-        means=torch.cat([s.means for s in sets], dim=-2),
-        quaternions=torch.cat([s.quaternions for s in sets], dim=-2),
-        scales=torch.cat([s.scales for s in sets], dim=-2),
-        opacities=torch.cat([s.opacities for s in sets], dim=-1),
-        colors=torch.cat([s.colors for s in sets], dim=-2),
-    )
+    axis = sets[0].opacities.ndim - 1
+    return Gaussians(*(torch.cat(tensors, dim=axis) for tensors in zip(*(vars(s).values() for s in sets), strict=True)))

@@ -147,9 +147,10 @@ class CompleteSplat(nn.Module):
 
         return joined(in_parts(draw, len(noise), batch))
 
-    def _decode(self, latent: Tensor, skips: tuple, cameras: Cameras, depth_range: Tensor) -> Gaussians:
+    def _decode(self, latent: Tensor, skips: tuple[Any, ...], cameras: Cameras, depth_range: Tensor) -> Gaussians:
         splatter_image = self.autoreconstructor.reconstructor(latent / self.latent_scale, *skips)
-        return splatter_image.gaussians(cameras, depth_range)
+        gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
+        return gaussians
 
     def forward(
         self, image: Photograph | Path | str, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any

@@ -49,21 +49,16 @@ class SceneBatch(TensorDataclass):
 
     def all_views(self) -> Views:
         """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
-        reference, targets = self.reference, self.targets
-        cameras = Cameras(
-            _prepend(reference.cameras.world_to_camera, targets.cameras.world_to_camera, axis=-3),
-            _prepend(reference.cameras.intrinsics, targets.cameras.intrinsics, axis=-3),
-            reference.cameras.image_size,
-        )
-        depths = None
-        if reference.depths is not None and targets.depths is not None:
-            depths = _prepend(reference.depths, targets.depths, axis=-4)
-        return Views(
-            _prepend(reference.images, targets.images, axis=-4),
-            cameras,
-            _prepend(reference.masks, targets.masks, axis=-4),
-            depths,
-        )
+        one, many, axis = self.reference, self.targets, self.depth_range.ndim - 1
+
+        def prepend(first: Tensor, others: Tensor) -> Tensor:
+            return torch.cat([first.unsqueeze(axis), others], dim=axis)
+
+        world_to_camera = prepend(one.cameras.world_to_camera, many.cameras.world_to_camera)
+        intrinsics = prepend(one.cameras.intrinsics, many.cameras.intrinsics)
+        depths = None if one.depths is None or many.depths is None else prepend(one.depths, many.depths)
+        cameras = Cameras(world_to_camera, intrinsics, one.cameras.image_size)
+        return Views(prepend(one.images, many.images), cameras, prepend(one.masks, many.masks), depths)
 
 
 @dataclass(frozen=True)
@@ -84,7 +79,3 @@ class CachedScene(TensorDataclass):
     def __getitem__(self, index: int | slice) -> "CachedScene":
         """One scene of a batch, or some of them."""
         return replace(super().__getitem__(index), names=self.names[index])
-
-
-def _prepend(one: Tensor, many: Tensor, axis: int) -> Tensor:
-    return torch.cat([one.unsqueeze(axis), many], dim=axis)

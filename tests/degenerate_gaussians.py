@@ -1,11 +1,16 @@
 """Gaussians that no rasterizer should meet, but that training produces, and a healthy scene for them to spoil."""
 
 import math
+from functools import partial
 
 import torch
+from rasterizer_scenes import cotangents_for, render_with_gradients
+from torch import Tensor
 
-from completesplat.gaussians import Gaussians
+from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers import Rasterizer
+from completesplat.rasterizers.reference import ReferenceRasterizer
 
 NAN, INF = math.nan, math.inf
 SIZE = (14, 18)
@@ -80,3 +85,46 @@ def changed(values: dict) -> Gaussians:
 
 def camera() -> Cameras:
     return Cameras(torch.eye(4)[None, None], pinhole(50.0, SIZE[1])[None, None], SIZE)
+
+
+def draw(
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras | None = None, intrinsics: bool = True
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """All images in one tensor; gradients of the Gaussians and the cameras under random cotangents."""
+    cameras = (camera() if cameras is None else cameras).to(gaussians.means)
+    cotangents = [cotangent.to(gaussians.means) for cotangent in cotangents_for(cameras, 1)]
+    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents, intrinsics)
+    return torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=2), gradients
+
+
+def assert_as_good_as_absent(
+    rasterizer: Rasterizer, one: Gaussians, gradients_agree: float = 0.0, intrinsics: bool = True
+) -> None:
+    rest = healthy(12).to(one.means)
+    expected, expected_gradients = draw(rasterizer, rest, intrinsics=intrinsics)
+    images, gradients = draw(rasterizer, concatenate([one, rest]), intrinsics=intrinsics)
+    assert expected.any()
+    assert torch.equal(images, expected)
+    for name, without in expected_gradients.items():
+        gradient = gradients[name]
+        if name in vars(one):
+            assert not gradient[:, 0].any(), name
+            gradient = gradient[:, 1:]
+        assert (gradient - without).norm() <= gradients_agree * without.norm(), name
+
+
+def assert_drawn_as_by_the_reference(rasterizer: Rasterizer, kind: str, intrinsics: bool = True) -> None:
+    gaussians, of = concatenate([healthy(12), changed(DRAWN[kind])]), partial(draw, intrinsics=intrinsics)
+    images, gradients = of(rasterizer, gaussians)
+    expected, expected_gradients = of(ReferenceRasterizer(), gaussians.to(torch.float64))
+    assert not torch.equal(images, of(rasterizer, healthy(12))[0])
+    assert ((images - expected).abs() <= 1e-5 * expected.abs().clamp(min=1)).all()
+    for name, exact in expected_gradients.items():
+        assert gradients[name].isfinite().all()
+        parts = [(gradients[name], exact)]
+        if name in vars(gaussians):
+            parts = list(zip(*(x.split([12, 1], dim=1) for x in (gradients[name], exact)), strict=True))
+        if kind in FLAT and name == "quaternions":
+            assert parts.pop()[0].norm() <= 1e-4
+        for found, wanted in parts:
+            assert (found - wanted).norm() <= 2e-4 * wanted.norm(), name

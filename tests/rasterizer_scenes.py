@@ -16,6 +16,18 @@ OTHER_CONSTANTS = RenderingConstants(
 )
 
 
+CONSTANTS = RenderingConstants()
+
+
+def f64(*values: object) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def render(gaussians: Gaussians, camera: Cameras, constants: RenderingConstants = CONSTANTS) -> Rendering:
+    """One scene, one view, by the reference."""
+    return ReferenceRasterizer(constants)(gaussians[None], camera[None, None])
+
+
 def draw_scene(generator: torch.Generator, batch: int, views: int, size: tuple[int, int], count: int) -> tuple:
     """Thin and round Gaussians of all opacities about the origin, seen from cameras on a sphere."""
 
@@ -80,15 +92,21 @@ def scenes(
 
 
 def render_with_gradients(
-    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, cotangents: list[Tensor]
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, cotangents: list[Tensor], intrinsics: bool = True
 ) -> tuple[Rendering, dict[str, Tensor]]:
     """The images, and the gradients of all inputs under these cotangents of colour, depth and alpha."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     cameras = cameras.map(lambda tensor: tensor.detach().requires_grad_())
-    inputs = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+    inputs = vars(gaussians) | {"world_to_camera": cameras.world_to_camera}
+    if intrinsics:
+        inputs |= {"intrinsics": cameras.intrinsics}
+    else:
+        cameras.intrinsics.requires_grad_(False)
     rendering = rasterizer(gaussians, cameras)
     images = [rendering.color, rendering.depth, rendering.alpha]
-    gradients = torch.autograd.grad(images, list(inputs.values()), cotangents)
+    # In one sum: an image of nothing but constants has no gradient of its own.
+    total = sum((image * cotangent).sum() for image, cotangent in zip(images, cotangents, strict=True))
+    gradients = torch.autograd.grad(total, list(inputs.values()))
     return rendering.detach(), dict(zip(inputs, gradients, strict=True))
 
 

@@ -42,7 +42,7 @@ def same(first, second) -> bool:
 
 def test_what_is_saved_is_loaded_bit_for_bit(model, folder, picture):
     loaded = CompleteSplat.from_pretrained(folder)
-    assert loaded.architecture == model.architecture
+    assert loaded.architecture == model.architecture == json.loads(json.dumps(model.architecture))
     for name, value in model.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value)
     for ours, theirs in zip(model(picture, samples=2), loaded(picture, samples=2), strict=True):
@@ -110,7 +110,7 @@ def half(model):
     return visible
 
 
-@pytest.mark.parametrize("batch", [1, 2, 3, 7])
+@pytest.mark.parametrize("batch", [1, 3, 7])
 @pytest.mark.parametrize("guidance_weight", [0.0, 0.5])
 def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, picture, batch, guidance_weight):
     sizes = []
@@ -126,14 +126,6 @@ def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, pi
             torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-4, rtol=1e-4)
 
 
-def test_without_guidance_a_step_is_one_denoiser_call_for_all_samples(model, picture):
-    sizes = []
-    hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
-    model(picture, samples=3, steps=5)
-    hook.remove()
-    assert sizes == [3] * 5
-
-
 def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
     photograph = model.read(picture)
     other = replace(photograph, image=torch.where(half > 0, photograph.image, 1 - photograph.image))
@@ -141,10 +133,6 @@ def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
     for first, second in zip(model(photograph, half, samples=2), model(other, half, samples=2), strict=True):
         assert same(first, second)
     assert not same(model(photograph)[0], model(other)[0])
-
-
-def test_what_is_visible_has_an_influence(model, picture, half):
-    photograph = model.read(picture)
     other = replace(photograph, image=torch.where(half > 0, 1 - photograph.image, photograph.image))
     assert not same(model(photograph, half)[0], model(other, half)[0])
 
@@ -158,7 +146,7 @@ def test_skips_are_off_where_something_is_hidden_and_cannot_be_on(model, picture
 
 
 @pytest.mark.parametrize("name", ["skip_weight", "guidance_weight"])
-@pytest.mark.parametrize("weight", [-0.5, 7, float("nan")])
+@pytest.mark.parametrize("weight", [-0.5, float("nan")])
 def test_weights_outside_of_0_to_1_are_refused(model, picture, half, name, weight):
     for visible in (None, half):
         with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
@@ -185,51 +173,31 @@ def test_another_sampler_is_saved_with_the_weights(model, picture, tmp_path):
     assert same(loaded(picture)[0], changed(picture)[0])
 
 
-def test_another_sampler_cannot_name_foreign_code(model):
-    with pytest.raises(WeightsError, match="no part of a model"):
-        model.replace_sampler({"_target_": "os.system", "scheduler": {}})
-
-
-@pytest.mark.parametrize("name", [CONFIG_FILE, WEIGHTS_FILE])
-def test_missing_files_are_named(folder, name):
-    (folder / name).unlink()
-    with pytest.raises(WeightsError, match=name):
-        CompleteSplat.from_pretrained(folder)
-
-
-def test_a_damaged_file_is_refused(unsealed):
+def test_files_that_are_damaged_missing_or_of_another_model_are_refused(unsealed):
     path = unsealed / WEIGHTS_FILE
-    path.write_bytes(path.read_bytes()[:-1000])
-    with pytest.raises(WeightsError, match="cannot be loaded"):
-        CompleteSplat.from_pretrained(unsealed)
-
-
-def test_weights_of_another_model_are_refused(unsealed):
-    weights = load_file(unsealed / WEIGHTS_FILE)
+    content, weights = path.read_bytes(), load_file(path)
     weights.pop("latent_scale")
-    save_file(weights, unsealed / WEIGHTS_FILE)
+    save_file(weights, path)
     with pytest.raises(WeightsError, match="cannot be loaded"):
         CompleteSplat.from_pretrained(unsealed)
+    path.write_bytes(content[:-1000])
+    with pytest.raises(WeightsError, match="cannot be loaded"):
+        CompleteSplat.from_pretrained(unsealed)
+    for name in (WEIGHTS_FILE, CONFIG_FILE):
+        (unsealed / name).unlink()
+        with pytest.raises(WeightsError, match=name):
+            CompleteSplat.from_pretrained(unsealed)
 
 
 @pytest.mark.parametrize(
     "target",
-    [
-        "os.system",
-        "torch.load",
-        "builtins.eval",
-        "completesplat.generation.torch.load",
-        "completesplat.generation.json.loads",
-    ],
+    ["os.system", "builtins.eval", "completesplat.generation.torch.load"],
 )
-def test_a_configuration_cannot_name_foreign_code(unsealed, target, tmp_path):
+def test_a_configuration_cannot_name_foreign_code(model, unsealed, target, tmp_path):
+    with pytest.raises(WeightsError, match="no part of a model"):
+        model.replace_sampler({"_target_": target, "scheduler": {}})
     config = json.loads((unsealed / CONFIG_FILE).read_text())
     config["sampler"]["scheduler"] = {"_target_": target, "f": str(tmp_path / "canary")}
     (unsealed / CONFIG_FILE).write_text(json.dumps(config))
     with pytest.raises(WeightsError, match="no part of a model"):
         CompleteSplat.from_pretrained(unsealed)
-
-
-def test_the_architecture_is_plain_data(model):
-    assert json.loads(json.dumps(model.architecture)) == model.architecture
-    assert not OmegaConf.is_config(model.architecture["denoiser"])

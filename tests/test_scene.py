@@ -37,22 +37,12 @@ def test_a_scene_without_batch_axis_puts_the_reference_first() -> None:
     assert views.cameras.image_size == SIZE
 
 
-def test_a_batch_of_scenes_keeps_scenes_and_views_apart() -> None:
-    batch = stack([make_scene(0), make_scene(1)])
-    assert batch.names == ("scene0", "scene1")
-    assert batch.depth_range.shape == (2, 2)
-    assert torch.equal(batch.visible[:, 0, 0, 0], torch.tensor([0.0, 0.1]))
-    views = batch.all_views()
-    expected = torch.tensor([[0.0, 1, 2, 3], [10, 11, 12, 13]])
-    assert views.images.shape == (2, 4, 3, *SIZE)
-    assert torch.equal(views.images[:, :, 0, 0, 0], expected)
-    assert torch.equal(views.cameras.world_to_camera[:, :, 0, 3], expected)
-    assert torch.equal(views.masks[:, :, 0, 0, 0], expected / 100)
-
-
 def test_all_views_commutes_with_collation() -> None:
     scenes = [make_scene(0), make_scene(1)]
-    one, other = stack(scenes).all_views(), stack([scene.all_views() for scene in scenes])
+    batch = stack(scenes)
+    assert batch.names == ("scene0", "scene1")
+    assert torch.equal(batch.visible[:, 0, 0, 0], torch.tensor([0.0, 0.1]))
+    one, other = batch.all_views(), stack([scene.all_views() for scene in scenes])
     assert torch.equal(one.images, other.images)
     assert torch.equal(one.cameras.world_to_camera, other.cameras.world_to_camera)
     assert torch.equal(one.masks, other.masks)

@@ -149,7 +149,8 @@ def _read_config(path: Path) -> dict[str, Any]:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise WeightsError(f"{path}: cannot be read: {_first_line(error)}") from error
-    kind = config.get("_class_name") if isinstance(config, dict) else None
+    config = config if isinstance(config, dict) else {}
+    kind = config.get("_class_name")
     if kind != "AutoencoderKL":
         raise WeightsError(f"{path}: describes {kind or 'no model'}; give the folder of an AutoencoderKL")
     if config.get("act_fn", "silu") != "silu":

@@ -85,7 +85,7 @@ def is_decided(
     chosen = gaussians[visible][order]
     centers, _, covariances = project_gaussians(chosen, camera, constants)
     marks = []
-    for chunk in pixels.split(PIXELS_AT_ONCE):
+    for chunk in torch.split(pixels, PIXELS_AT_ONCE):
         alphas = alphas_at(chunk, centers, covariances, chosen.opacities, replace(constants, min_alpha=0.0))
         drawn = torch.where(alphas >= constants.min_alpha, alphas, 0)
         behind = torch.cumprod(1 - drawn, dim=0)

@@ -282,7 +282,7 @@ def _built(model: CompleteSplat, sampler: Mapping[str, Any]) -> Sampler:
     """The sampler of a configuration, for what the model's denoiser was trained with."""
     own, config = model.sampler, model.architecture["sampler"]
     model.replace_sampler(sampler)
-    built = model.sampler
+    built: Sampler = model.sampler
     model.sampler, model.architecture["sampler"] = own, config
     return built
 

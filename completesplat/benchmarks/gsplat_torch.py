@@ -17,7 +17,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.tensors import TensorDataclass, stack
 
 TILE_SIZE = 8  # px; a fifth faster here than gsplat's default of 16
@@ -62,7 +62,7 @@ class GsplatTorchRasterizer:
         weights = weights_along_rays(alphas, pixels)[:, None]
         image = torch.zeros(view * height * width, 5).index_add(0, pixels, weights * splats.channels[numbers])
         image = image.reshape(view, height, width, 5).permute(0, 3, 1, 2)
-        return Rendering(*image.split([3, 1, 1], dim=1))
+        return Rendering(*torch.split(image, [3, 1, 1], dim=1))
 
     def _project(self, gaussians: Gaussians, cameras: Cameras) -> "_Splats":
         covariances, _ = self.gsplat._quat_scale_to_covar_preci(

@@ -162,7 +162,8 @@ def _first_batch(data: Mapping[str, Any], folder: str) -> SceneBatch:
     """The first batch of training scenes, which are made in a folder."""
     made = instantiate(data, root=f"{folder}/scenes", _convert_="all")
     made.prepare_data()
-    return next(iter(made.train_dataloader()))
+    batch: SceneBatch = next(iter(made.train_dataloader()))
+    return batch
 
 
 def _rows_of_stage(

@@ -112,7 +112,8 @@ def _step_rows(
     size, batch, targets = settings["size"], settings["batch"], settings["targets"]
 
     def make_module(rasterizer: Rasterizer) -> LightningModule:
-        return instantiate(model, rasterizer=rasterizer, _convert_="all")
+        module: LightningModule = instantiate(model, rasterizer=rasterizer, _convert_="all")
+        return module
 
     found = []
     for backend in (backend for backend in backends if backend.name in settings["backends"]):

@@ -26,7 +26,7 @@ from completesplat.benchmarks.torch_tiles import (
 )
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.rasterizers import Rendering, RenderingConstants
 
 ROUND = 32  # entries of a tile's list that are drawn before it is seen whether any of its pixels needs more
 CHUNK = 2048  # tiles at a time: blocks of 8 MiB
@@ -48,10 +48,10 @@ class TorchTiledRasterizer:
         splats = project(gaussians, cameras, self.constants)
         lists = list_splats(splats, batch * view, cameras.image_size, self.constants)
         rows, columns = lists.grid
-        tiles = _Composite.apply(*vars(splats).values(), lists, self.constants)
+        tiles = _Composite.apply(*vars(splats).values(), lists, self.constants)  # type: ignore[no-untyped-call]
         tiles = tiles.reshape(batch, view, rows, columns, 5, TILE_HEIGHT, TILE_WIDTH).permute(0, 1, 4, 2, 5, 3, 6)
         image = tiles.reshape(batch, view, 5, rows * TILE_HEIGHT, columns * TILE_WIDTH)[..., :height, :width]
-        return Rendering(*image.split([3, 1, 1], dim=2))
+        return Rendering(*torch.split(image, [3, 1, 1], dim=2))
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class _Round:
         self.left = board.lengths.index_select(0, tiles) - step * ROUND
         self.ids = board.windows.index_select(0, first).long()
         rows = board.rows.index_select(0, self.ids.flatten())
-        self.blended = rows[:, BLENDED].unflatten(0, self.ids.shape)
+        self.blended = rows[:, BLENDED].reshape(*self.ids.shape, -1)
         # A product with the identity: the fastest way to turn columns into contiguous rows.
-        fields = torch.mm(torch.eye(ROW)[SHAPE], rows.T).unflatten(1, self.ids.shape)
+        fields = torch.mm(torch.eye(ROW)[SHAPE], rows.T).reshape(-1, *self.ids.shape)
         self.root_x, self.root_y, self.rest_y = fields[1].clone(), fields[2].clone(), fields[8]
         self.dx, self.dy = board.centers.index_select(0, tiles).T[:, :, None] - fields[6:8]
         self.root = (self.root_x * self.dx).addcmul_(self.root_y, self.dy)
@@ -126,7 +126,7 @@ class _Round:
         if board.clamped:
             alphas.clamp_(max=board.constants.max_alpha)
         below = float(np.nextafter(np.float32(board.constants.min_alpha), np.float32(0)))
-        return torch.threshold_(alphas, below, 0.0).unflatten(0, self.ids.shape)
+        return torch.threshold_(alphas, below, 0.0).reshape(*self.ids.shape, -1)
 
     def transmittances(self, first: Float[Tensor, "tile pixel"]) -> Float[Tensor, "tile entry_and_one pixel"]:
         """Before each entry, and after the last."""
@@ -144,7 +144,7 @@ class _Round:
 
         With g for d_exponents and (dx, dy) and root at the pixels: g, g root dx, g root dy, g dy^2, g root, g dy.
         """
-        one, x, y, xx, xy, yy = torch.mm(board.monomials, d_exponents.flatten(0, 1).T).unflatten(1, self.ids.shape)
+        one, x, y, xx, xy, yy = torch.mm(board.monomials, d_exponents.flatten(0, 1).T).reshape(-1, *self.ids.shape)
         to_opacity, to_root_x, to_root_y, to_rest_y, root, dy = out
         to_opacity.copy_(one)
         torch.mul(self.root, one, out=root).addcmul_(self.root_x, x).addcmul_(self.root_y, y)
@@ -158,7 +158,8 @@ class _Round:
 
 def _keep_where_above(values: Tensor, compared: Tensor, threshold: float) -> Tensor:
     """Zero `values` where `compared` is not above the threshold, in one pass (the kernel of a ReLU's backward)."""
-    return torch.ops.aten.threshold_backward.grad_input(values, compared, threshold, grad_input=values)
+    kept: Tensor = torch.ops.aten.threshold_backward.grad_input(values, compared, threshold, grad_input=values)
+    return kept
 
 
 class _Composite(torch.autograd.Function):
@@ -172,7 +173,7 @@ class _Composite(torch.autograd.Function):
         active, step, rounds = board.lengths.nonzero().squeeze(1), 0, []
         while active.numel():
             unfinished = []
-            for tiles in active.split(CHUNK):
+            for tiles in torch.split(active, CHUNK):
                 entries, before = _Round(board, tiles, step), transmittance.index_select(0, tiles)
                 transmittances = entries.transmittances(before)
                 weights = entries.alphas.mul_(transmittances[:, :-1])

@@ -18,7 +18,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import quaternion_to_matrix
-from completesplat.rasterizers.protocol import RenderingConstants
+from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 from completesplat.tensors import TensorDataclass
 
@@ -70,7 +70,7 @@ def project(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstant
     (batch, view), count = cameras.intrinsics.shape[:2], gaussians.count
     rotation = cameras.world_to_camera[..., :3, :3].reshape(batch, 3 * view, 3)
     translation = cameras.world_to_camera[..., :3, 3].reshape(batch, 3 * view, 1)
-    points = (rotation @ sane.means.mT + translation).unflatten(1, (view, 3))
+    points = (rotation @ sane.means.mT + translation).reshape(batch, view, 3, count)
     roots = (quaternion_to_matrix(sane.quaternions) * sane.scales[..., None, :]).permute(0, 2, 3, 1)
     roots = (rotation @ roots.reshape(batch, 3, 3 * count)).reshape(batch, view, 3, 3, count)
 

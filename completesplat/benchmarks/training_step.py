@@ -29,11 +29,11 @@ class StopWatch:
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render as the rasterizer would."""
-        gaussians = Gaussians(*_OnBackward.apply(self._stop, *vars(gaussians).values()))
+        gaussians = Gaussians(*_OnBackward.apply(self._stop, *vars(gaussians).values()))  # type: ignore[no-untyped-call]
         self._start()
         rendering = self.rasterizer(gaussians, cameras)
         self._stop()
-        return Rendering(*_OnBackward.apply(self._start, *vars(rendering).values()))
+        return Rendering(*_OnBackward.apply(self._start, *vars(rendering).values()))  # type: ignore[no-untyped-call]
 
     def _start(self) -> None:
         self.seconds -= time.perf_counter()
@@ -42,7 +42,7 @@ class StopWatch:
         self.seconds += time.perf_counter()
 
 
-class Repeated(Dataset):
+class Repeated(Dataset[Any]):
     """The same item a number of times."""
 
     def __init__(self, item: Any, count: int) -> None:

@@ -14,7 +14,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses.lpips import URL as VGG_URL
 from completesplat.metrics.image_sets import URL as INCEPTION_URL
-from completesplat.rasterizers.protocol import Rasterizer, RenderingConstants
+from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, TOLERANCE, failure
 from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, weights_folder

@@ -60,7 +60,8 @@ class LearnedConditioning(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Features of sRGB images in [0, 1], at the latent's resolution."""
-        return self.network(images * 2 - 1)
+        features: Tensor = self.network(images * 2 - 1)
+        return features
 
 
 class StableDiffusionConditioning(nn.Module):
@@ -102,8 +103,8 @@ class StableDiffusionConditioning(nn.Module):
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Features of sRGB images in [0, 1], at an eighth of their resolution."""
-        posterior, _ = self.encoder(images)
-        return posterior.mean * STABLE_DIFFUSION_SCALE
+        mean: Tensor = self.encoder(images)[0].mean
+        return mean * STABLE_DIFFUSION_SCALE
 
 
 def _load_encoder(encoder: Encoder, source: str) -> None:

@@ -45,7 +45,7 @@ class TextlessStableDiffusion(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
-        network: Any = UNet2DConditionModel(
+        network: Any = UNet2DConditionModel(  # type: ignore[no-untyped-call]
             in_channels=conditioning_channels + latent_channels,
             out_channels=latent_channels,
             block_out_channels=tuple(channels),
@@ -68,7 +68,9 @@ class TextlessStableDiffusion(nn.Module):
     ) -> Float[Tensor, "batch channel height width"]:
         """Predict the noise in h_t (paper, Eq. 3), or what else it is trained for (`objective.target`), in float32."""
         context = self.context.expand(len(noisy_latent), -1, -1)
-        return self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep, context).sample.float()
+        inputs = torch.cat([conditioning, noisy_latent], dim=1)
+        sample: Tensor = self.network(inputs, timestep, context).sample
+        return sample.float()
 
 
 class Denoiser(nn.Module):
@@ -96,7 +98,7 @@ class Denoiser(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_channels = latent_channels
-        network: Any = UNet2DModel(
+        network: Any = UNet2DModel(  # type: ignore[no-untyped-call]
             in_channels=conditioning_channels + latent_channels,
             out_channels=latent_channels,
             block_out_channels=tuple(channels),
@@ -116,7 +118,8 @@ class Denoiser(nn.Module):
         conditioning: Float[Tensor, "batch features height width"],
     ) -> Float[Tensor, "batch channel height width"]:
         """As `TextlessStableDiffusion`."""
-        return self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample.float()
+        sample: Tensor = self.network(torch.cat([conditioning, noisy_latent], dim=1), timestep).sample
+        return sample.float()
 
 
 def _blocks(attention: str, levels: int, attention_levels: Sequence[int]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def target(
         return noise
     if kind == "sample":
         return latent
-    alpha_bar = scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
+    alpha_bar: Tensor = scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
     return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * latent
 
 
@@ -48,7 +48,7 @@ def clean_estimate(
     kind = prediction_type(scheduler)
     if kind == "sample":
         return predicted
-    alpha_bar = scheduler.alphas_cumprod.to(noisy_latent)[timestep]
+    alpha_bar: Tensor = scheduler.alphas_cumprod.to(noisy_latent)[timestep]
     signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
     if kind == "epsilon":
         return (noisy_latent - noise * predicted) / signal
@@ -61,7 +61,7 @@ def prediction_type(scheduler: Any) -> str:
     Raises:
         CompleteSplatError: the scheduler has another one.
     """
-    kind = scheduler.config.prediction_type
+    kind: str = scheduler.config.prediction_type
     if kind not in PREDICTION_TYPES:
         raise CompleteSplatError(
             f"sampler.scheduler.prediction_type={kind}: unknown; choose one of {', '.join(PREDICTION_TYPES)}"

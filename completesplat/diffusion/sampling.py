@@ -60,7 +60,7 @@ class Sampler:
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)
-        latent = noise * scheduler.init_noise_sigma
+        latent: Tensor = noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
             level = timestep.round().long()
             inputs = scheduler.scale_model_input(latent, timestep)
@@ -85,13 +85,14 @@ class Sampler:
         self, latent: Float[Tensor, "batch channel height width"], noise: Tensor, timestep: Tensor
     ) -> Float[Tensor, "batch channel height width"]:
         """The forward process h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps (paper, Eq. 2)."""
-        alpha_bar = self.scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
+        alpha_bar: Tensor = self.scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
         return alpha_bar.sqrt() * latent + (1 - alpha_bar).sqrt() * noise
 
     @property
     def training_timesteps(self) -> int:
         """T, the number of noise levels of the forward process."""
-        return self.scheduler.config.num_train_timesteps
+        steps: int = self.scheduler.config.num_train_timesteps
+        return steps
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:

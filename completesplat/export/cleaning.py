@@ -10,7 +10,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
-from completesplat.rasterizers.protocol import RenderingConstants
+from completesplat.rasterizers import RenderingConstants
 
 # Renderers square scales and positions, in float32.
 LARGEST = 1e18

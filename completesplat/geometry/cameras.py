@@ -46,11 +46,13 @@ class Cameras(TensorDataclass):
 def invert_rigid(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Inverse of a rotation and translation: (R, t) -> (R^T, -R^T t)."""
     rotation = matrix[..., :3, :3].mT
-    inverse = torch.zeros_like(matrix)
-    inverse[..., :3, :3] = rotation
-    inverse[..., :3, 3] = -(rotation @ matrix[..., :3, 3:]).squeeze(-1)
-    inverse[..., 3, 3] = 1
-    return inverse
+    return _rigid(rotation, -(rotation @ matrix[..., :3, 3:]))
+
+
+def _rigid(rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3 1"]) -> Tensor:
+    matrix = rotation.new_zeros(*rotation.shape[:-2], 4, 4)
+    matrix[..., :3, :3], matrix[..., :3, 3:], matrix[..., 3, 3] = rotation, translation, 1
+    return matrix
 
 
 def transform_points(
@@ -97,9 +99,9 @@ def pixel_centers(
 
 def pixel_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
     """Camera-frame rays through all pixel centres, scaled so that z = 1."""
-    height, width = cameras.image_size
-    pixels = pixel_centers(height, width, cameras.intrinsics.device, cameras.intrinsics.dtype)
-    return rays_through(cameras.intrinsics, pixels.flatten(0, 1)).unflatten(-2, (height, width))
+    k = cameras.intrinsics
+    pixels = pixel_centers(*cameras.image_size, k.device, k.dtype).flatten(0, 1)
+    return rays_through(k, pixels).reshape(*k.shape[:-2], *cameras.image_size, 3)
 
 
 def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
@@ -133,13 +135,9 @@ def look_at(
     eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """`world_to_camera` of a camera at `eye` that sees `target` in its centre and `up` pointing up in the image."""
-    eye, target, up = torch.broadcast_tensors(eye, target, up)
+    eye, target, up = torch.broadcast_tensors(eye, target, up)  # type: ignore[no-untyped-call]
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack([right, down, forward], dim=-2)
-    matrix = torch.zeros(*eye.shape[:-1], 4, 4, dtype=eye.dtype, device=eye.device)
-    matrix[..., :3, :3] = rotation
-    matrix[..., :3, 3] = -(rotation @ eye[..., None]).squeeze(-1)
-    matrix[..., 3, 3] = 1
-    return matrix
+    return _rigid(rotation, -(rotation @ eye[..., None]))

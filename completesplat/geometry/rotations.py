@@ -30,7 +30,7 @@ def quaternion_to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor,
         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return torch.stack(rows, dim=-1).reshape(*w.shape, 3, 3)
 
 
 def matrix_to_quaternion(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -39,22 +39,15 @@ def matrix_to_quaternion(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "
     The largest of the four components is found first and the others are divided by it, which keeps full
     precision for every rotation (Shepperd, "Quaternion from rotation matrix", 1978).
     """
-    m = matrix
+    m, diagonal = matrix, torch.diagonal(matrix, dim1=-2, dim2=-1)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    diagonal = torch.diagonal(m, dim1=-2, dim2=-1)
     # Four times the squared component, for w, x, y, z.
     squares = torch.cat([1 + trace[..., None], 1 + 2 * diagonal - trace[..., None]], dim=-1)
-    products_w = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-    candidates = torch.stack(
-        [
-            torch.stack([squares[..., 0], *products_w], dim=-1),
-            torch.stack([products_w[0], squares[..., 1], xy, xz], dim=-1),
-            torch.stack([products_w[1], xy, squares[..., 2], yz], dim=-1),
-            torch.stack([products_w[2], xz, yz, squares[..., 3]], dim=-1),
-        ],
-        dim=-2,
-    )
+    ww, xx, yy, zz = squares.unbind(-1)
+    rows = [[ww, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]]
+    candidates = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
     best = squares.argmax(dim=-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
     quaternion = normalize_quaternion(candidates.gather(-2, best).squeeze(-2))
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
@@ -66,12 +59,6 @@ def quaternion_multiply(
     """Hamilton product: the rotation `right` followed by the rotation `left`."""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
-    return torch.stack(
-        [
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ],
-        dim=-1,
-    )
+    w, x = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2, w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2
+    y, z = w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2, w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2
+    return torch.stack([w, x, y, z], dim=-1)

@@ -84,5 +84,5 @@ def _sideways(
 def _looking_at(
     reference: Cameras, eyes: Float[Tensor, "frame 3"], pivot: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> Cameras:
-    world_to_camera = look_at(eyes, pivot, up)
-    return replace(reference, world_to_camera=world_to_camera, intrinsics=reference.intrinsics.expand(len(eyes), 3, 3))
+    intrinsics = reference.intrinsics.expand(len(eyes), 3, 3)
+    return replace(reference, world_to_camera=look_at(eyes, pivot, up), intrinsics=intrinsics)

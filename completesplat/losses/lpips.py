@@ -140,4 +140,6 @@ class LearnedPerceptualSimilarity:
         with torch.inference_mode(False):
             self.distance.to(device)
         with torch.autocast(device.type, enabled=False):
-            return self.distance(prediction.images.flatten(0, 1).float(), truth.images.flatten(0, 1).float()).mean()
+            pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
+            distances: Tensor = self.distance(*pair)
+            return distances.mean()

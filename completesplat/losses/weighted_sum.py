@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -49,7 +49,7 @@ class WeightedSum:
         CompleteSplatError: there is nothing to train on at step 0.
     """
 
-    def __init__(self, terms: Mapping[str, Mapping | None]) -> None:
+    def __init__(self, terms: Mapping[str, Mapping[str, Any] | None]) -> None:
         self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry and entry["weight"]}
         if all(entry.start_step > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")

@@ -1,10 +1,80 @@
-"""Swappable rasterizers: one protocol, one file per backend.
+"""Swappable rasterizers: what every one takes and gives, and one file per backend.
 
 Every backend computes the same function, with gsplat's conventions: 0.3 px^2 of blur on the diagonal of the
 projected covariance, alpha = min(max_alpha, opacity * exp(-sigma)) skipped below 1/255, front-to-back compositing
 that stops before the transmittance would reach 1e-4. The constants come from one shared config.
 """
 
-from completesplat.rasterizers.protocol import Rasterizer, Rendering, RenderingConstants
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
-__all__ = ["Rasterizer", "Rendering", "RenderingConstants"]
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.tensors import TensorDataclass
+
+
+@dataclass(frozen=True)
+class RenderingConstants:
+    """The constants on which all backends agree (values of gsplat 1.5.3, `RasterizeToPixels3DGSFwd.cu`).
+
+    Attributes:
+        blur: added to the diagonal of the projected covariance, in px^2.
+        near_plane: Gaussians whose centre is not further than this are culled, in world units.
+        max_alpha: clamp on a Gaussian's alpha at a pixel (0.999 in gsplat 1.5.3, 0.99 in 1.6).
+        min_alpha: contributions below it are skipped.
+        min_transmittance: a pixel stops before the Gaussian that would bring its transmittance to this or less.
+        frustum_margin: the Jacobian is evaluated at a point clamped to this multiple of half the field of view
+            beyond the image's border (`_torch_impl.py:105`).
+    """
+
+    blur: float = 0.3
+    near_plane: float = 0.01
+    max_alpha: float = 0.999
+    min_alpha: float = 1 / 255
+    min_transmittance: float = 1e-4
+    frustum_margin: float = 0.3
+
+
+@dataclass(frozen=True)
+class Rendering(TensorDataclass):
+    """Rendered views [batch view] before a background: sums weighted by each Gaussian's contribution.
+
+    `depth` is the accumulated depth (gsplat's "D"): divide by alpha for the expected depth.
+    """
+
+    color: Float[Tensor, "*batch 3 height width"]
+    depth: Float[Tensor, "*batch 1 height width"]
+    alpha: Float[Tensor, "*batch 1 height width"]
+
+    def over(
+        self, background: Float[Tensor, "*#batch 3 #height #width"] | float
+    ) -> Float[Tensor, "*batch 3 height width"]:
+        """The image in front of a background colour or picture."""
+        return self.color + (1 - self.alpha) * background
+
+    def expected_depth(self) -> Float[Tensor, "*batch 1 height width"]:
+        """Mean depth of what is seen at a pixel; 0 where nothing is."""
+        return self.depth / self.alpha.clamp(min=1e-10)
+
+
+@runtime_checkable
+class Rasterizer(Protocol):
+    """Renders a batch of scenes, each from several cameras."""
+
+    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        """Gaussians of batch shape [batch], cameras of batch shape [batch view]."""
+        ...
+
+
+def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:
+    """Refuse, for the rasterizer of this name, tensors of another dtype or device with a `CompleteSplatError`."""
+    tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
+    for key, tensor in tensors.items():
+        if tensor.dtype != torch.float32 or tensor.device != device:
+            found = f"{key} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
+            raise CompleteSplatError(f"the {name} rasterizer takes float32 tensors on {device}, but {found}")

@@ -13,7 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 DEVICE = "cuda"
@@ -69,19 +69,15 @@ class CudaRasterizer:
         home = gaussians.means.device
         if home.type != DEVICE:
             return self(gaussians.to(DEVICE), cameras.to(DEVICE)).to(home)
-        _check(gaussians, cameras)
+        require_float32("cuda", gaussians, cameras, home)
+        if torch.is_grad_enabled() and cameras.intrinsics.requires_grad:
+            message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=tiled"
+            raise CompleteSplatError(message)
         height, width = cameras.image_size
         prepared = prepare(gaussians, drawable(gaussians, cameras, self.constants))
         images, alphas, _ = self._rasterization(
-            means=prepared.means,
-            quats=prepared.quaternions,
-            scales=prepared.scales,
-            opacities=prepared.opacities,
-            colors=prepared.colors,
-            viewmats=cameras.world_to_camera,
-            Ks=cameras.intrinsics,
-            width=width,
-            height=height,
+            **dict(zip(("means", "quats", "scales", "opacities", "colors"), vars(prepared).values(), strict=True)),
+            **{"viewmats": cameras.world_to_camera, "Ks": cameras.intrinsics, "width": width, "height": height},
             near_plane=self._near_plane,
             far_plane=FARTHEST,
             eps2d=self.constants.blur,
@@ -111,18 +107,6 @@ def compiled_constants() -> dict[str, float]:
         "min_alpha": stated.ALPHA_THRESHOLD,
         "min_transmittance": stated.TRANSMITTANCE_THRESHOLD,
     }
-
-
-def _check(gaussians: Gaussians, cameras: Cameras) -> None:
-    tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
-    home = gaussians.means.device
-    for name, tensor in tensors.items():
-        if tensor.dtype != torch.float32 or tensor.device != home:
-            found = f"{name} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
-            raise CompleteSplatError(f"the cuda rasterizer takes float32 tensors on one device ({home}), but {found}")
-    if torch.is_grad_enabled() and cameras.intrinsics.requires_grad:
-        message = "the cuda rasterizer has no gradient to the intrinsics: detach them, or take rasterizer=tiled"
-        raise CompleteSplatError(message)
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ from torch.utils.checkpoint import checkpoint
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_centers, transform_points
-from completesplat.rasterizers.protocol import Rendering, RenderingConstants
+from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.tensors import stack
 
 # In px and px^2. Products of two such numbers are still finite in float32.
@@ -33,9 +33,8 @@ class ReferenceRasterizer:
         return stack(scenes)
 
     def _render(self, gaussians: Gaussians, camera: Cameras) -> Rendering:
-        height, width = camera.image_size
-        pixels = pixel_centers(height, width, gaussians.means.device, gaussians.means.dtype).flatten(0, 1)
-        image = self.at_pixels(gaussians, camera, pixels).mT.unflatten(-1, (height, width))
+        pixels = pixel_centers(*camera.image_size, gaussians.means.device, gaussians.means.dtype).flatten(0, 1)
+        image = self.at_pixels(gaussians, camera, pixels).mT.reshape(5, *camera.image_size)
         return Rendering(image[:3], image[3:4], image[4:])
 
     def at_pixels(
@@ -50,7 +49,7 @@ class ReferenceRasterizer:
         chosen = gaussians[visible][depth_order]
         centers, depths, covariances = project_gaussians(chosen, camera, self.constants)
         values = torch.cat([chosen.colors, depths[:, None], torch.ones_like(depths)[:, None]], dim=-1)
-        chunks = pixels.split(max(1, PAIRS_AT_ONCE // max(1, chosen.count)))
+        chunks = torch.split(pixels, max(1, PAIRS_AT_ONCE // max(1, chosen.count)))
         inputs = (centers, covariances, chosen.opacities, values)
         return torch.cat([checkpoint(self._chunk, chunk, *inputs, use_reentrant=False) for chunk in chunks])
 
@@ -89,13 +88,8 @@ def project_gaussians(
     slope_x = _clamp_slope(x / z, fx, cx, width, constants.frustum_margin)
     slope_y = _clamp_slope(y / z, fy, cy, height, constants.frustum_margin)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            torch.stack([fx / z, zero, -fx * slope_x / z], -1),
-            torch.stack([zero, fy / z, -fy * slope_y / z], -1),
-        ],
-        dim=-2,
-    )
+    rows = ([fx / z, zero, -fx * slope_x / z], [zero, fy / z, -fy * slope_y / z])
+    jacobian = torch.stack([torch.stack(row, -1) for row in rows], dim=-2)
     to_image = jacobian @ camera.world_to_camera[:3, :3]
     blur = constants.blur * torch.eye(2, dtype=z.dtype, device=z.device)
     return centers, z, to_image @ gaussians.covariances() @ to_image.mT + blur
@@ -108,12 +102,9 @@ def _clamp_slope(slope: Tensor, focal: Tensor, principal: Tensor, extent: int, m
 
 
 def alphas_at(
-    pixels: Float[Tensor, "pixel 2"],
-    centers: Float[Tensor, "gaussian 2"],
-    covariances: Float[Tensor, "gaussian 2 2"],
-    opacities: Float[Tensor, " gaussian"],
-    constants: RenderingConstants,
-) -> Float[Tensor, "gaussian pixel"]:
+    pixels: Float[Tensor, "pixel 2"], centers: Float[Tensor, "gaussian 2"],
+    covariances: Float[Tensor, "gaussian 2 2"], opacities: Float[Tensor, " gaussian"], constants: RenderingConstants,
+) -> Float[Tensor, "gaussian pixel"]:  # fmt: skip
     """min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     # The determinant of M + blur * 1 is at least blur * (trace of M + blur) for a covariance M; the difference of

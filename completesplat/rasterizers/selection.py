@@ -9,8 +9,8 @@ import torch
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.cuda import CudaRasterizer
-from completesplat.rasterizers.protocol import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 logger = logging.getLogger(__name__)

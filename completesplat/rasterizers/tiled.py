@@ -9,9 +9,9 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers.kernels import layout
+from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
+from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
-from completesplat.rasterizers.protocol import Rendering, RenderingConstants
 
 WIDTHS: dict[str, list[int]] = {"means": [3], "quaternions": [4], "scales": [3], "opacities": [], "colors": [3]}
 SMALLEST_BLUR = 1e-5  # px^2; it keeps the reference's clamp on the determinant (1e-10) out of reach
@@ -41,28 +41,21 @@ class TiledRasterizer:
         if gaussians.means.is_cuda:
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
-        parameters = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.colors)
-        matrices = (cameras.world_to_camera, cameras.intrinsics)
-        return Rendering(*_Rasterize.apply(*parameters, *matrices, cameras.image_size, self.constants))
+        tensors = (*vars(gaussians).values(), cameras.world_to_camera, cameras.intrinsics)
+        return Rendering(*_Rasterize.apply(*tensors, cameras.image_size, self.constants))  # type: ignore[no-untyped-call]
 
 
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
     # The kernels do not check bounds: an array that is too small would be read beyond its end.
     for name, widths in WIDTHS.items():
-        shape = [cameras.world_to_camera.shape[0], gaussians.count, *widths]
-        if list(getattr(gaussians, name).shape) != shape:
-            raise CompleteSplatError(
-                f"{name} should have the shape {shape}, not {list(getattr(gaussians, name).shape)}"
-            )
-    tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
-    for name, tensor in tensors.items():
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            found = f"{name} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
-            raise CompleteSplatError(f"the tiled rasterizer takes float32 tensors on the CPU, but {found}")
+        shape, found = [len(cameras.world_to_camera), gaussians.count, *widths], list(getattr(gaussians, name).shape)
+        if found != shape:
+            raise CompleteSplatError(f"{name} should have the shape {shape}, not {found}")
+    require_float32("tiled", gaussians, cameras, torch.device("cpu"))
 
 
 def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
-    """Cameras as the kernels take them, [batch view 20] float64 (see `kernels/layout.py`)."""
+    """Cameras as the kernels take them, [batch view 20] float64 (see `kernels/array_layout.py`)."""
     matrices = cameras.world_to_camera.detach().double().numpy()
     intrinsics = cameras.intrinsics.detach().double().numpy()
     packed = np.empty((*matrices.shape[:2], layout.CAMERA_WIDTH))

@@ -84,32 +84,11 @@ def test_skip_weight_acts_per_sample(images, levels):
         assert (mixed[1] - model.reconstructor(latent, features, 0.0).raw[1]).abs().max() > 1e-3
 
 
-def test_skip_dropout_zeroes_whole_samples_at_its_rate(images):
-    model = trained_skips((0,)).train()
-    model.encoder.quant_conv.weight.data.zero_()
-    model.encoder.quant_conv.bias.data[4:] = -30  # no noise in the latent: only the skips vary
-    many = images[:1].repeat(400, 1, 1, 1)[:, :, :8, :8]
-    torch.manual_seed(0)
-    with torch.no_grad():
-        raw = model(many).splatter_image.raw
-        posterior, features = model.encoder(many[:1])
-        with_skip = model.reconstructor(posterior.mode(), features, 1.0).raw[0]
-        without = model.reconstructor(posterior.mode(), features, 0.0).raw[0]
-    near_with = (raw - with_skip).abs().amax((1, 2, 3, 4)) < 1e-3
-    near_without = (raw - without).abs().amax((1, 2, 3, 4)) < 1e-3
-    assert (near_with ^ near_without).all()
-    assert 0.4 < near_with.float().mean() < 0.6
-
-
-def test_evaluation_draws_nothing(images):
+def test_evaluation_draws_nothing_and_training_samples_the_posterior(images):
     model = trained_skips((0,)).eval()
     with torch.no_grad():
         first, second = model(images), model(images)
-    torch.testing.assert_close(first.splatter_image.raw, second.splatter_image.raw, rtol=0, atol=0)
-
-
-def test_training_samples_the_posterior(images):
-    model = build().train()
-    with torch.no_grad():
+        torch.testing.assert_close(first.splatter_image.raw, second.splatter_image.raw, rtol=0, atol=0)
+        model = build().train()
         first, second = model(images), model(images)
     assert (first.splatter_image.raw - second.splatter_image.raw).abs().max() > 1e-4

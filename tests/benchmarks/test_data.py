@@ -93,28 +93,8 @@ def test_nothing_is_left_behind_when_writing_fails(command, tmp_path):
     assert not list((tmp_path / "out").glob("bench_data_*"))
 
 
-def test_help_lists_the_settings(command):
-    finished = command("bench", "data", "--help")
-    assert finished.status == 0
-    for setting in ("opening", "sequences: 1000", "references_per_sequence", "codecs", "size: 800", "keep: false"):
-        assert setting in finished.out
-
-
-@pytest.mark.parametrize(
-    ("argument", "said"),
-    [
-        ("repeats=0", "repeats=0: must be at least 1"),
-        ("workers=2", "workers=2: must be a list, such as workers=[2]"),
-        ("workers=[]", "workers=[]: must not be empty"),
-        ("workers=[0,-1]", "workers=[0, -1]: must be at least 0"),
-        ("codecs=png", "codecs=png: must be a list, such as codecs=[png]"),
-        ("codecs=[png,webp]", "codecs=['png', 'webp']: choose one of png, jpeg, bmp"),
-        ("opening.sequences=1", "opening.sequences=1: must be at least 2"),
-        ("opening.epochs=0", "opening.epochs=0: must be at least 1"),
-    ],
-)
-def test_refusals_are_one_line_and_status_two(command, tmp_path, argument, said):
-    finished = command(*QUICK, argument, f"out={tmp_path / 'out'}")
+def test_a_refusal_is_one_line_and_status_two(command, tmp_path):
+    finished = command(*QUICK, "codecs=[png,webp]", f"out={tmp_path / 'out'}")
     assert finished.status == 2
-    assert finished.err == f"error: {said}\n"
+    assert finished.err == "error: codecs=['png', 'webp']: choose one of png, jpeg, bmp\n"
     assert not list((tmp_path / "out").glob("*data*"))

@@ -75,17 +75,8 @@ def test_what_fails_has_the_reason_in_its_row(monkeypatch):
     assert row == {"name": "samples", "way": "float32", "not_measured": "RuntimeError: out of memory"}
 
 
-@pytest.mark.parametrize(
-    ("argument", "said"),
-    [
-        ("repeats=0", "repeats=0: must be at least 1"),
-        ("device=tpu", "device=tpu: choose one of cuda, cpu"),
-        ("device=cuda", "the paper's figures are a GPU's, and there is none here"),
-    ],
-)
-def test_refusals_are_one_line_and_status_two(command, tmp_path, monkeypatch, argument, said):
+def test_a_refusal_is_one_line_and_status_two(command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    finished = command("bench", "paper", argument, f"out={tmp_path / 'out'}")
+    finished = command("bench", "paper", "device=cuda", f"out={tmp_path / 'out'}")
     assert finished.status == 2
-    assert finished.err.splitlines()[-1].startswith("error: ")
-    assert said in finished.err
+    assert finished.err.splitlines()[-1].startswith("error: the paper's figures are a GPU's, and there is none here")

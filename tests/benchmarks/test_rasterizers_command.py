@@ -17,16 +17,9 @@ QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
 def garden(tmp_path: Path) -> Path:
     """A scene file without rotations, scales and opacities, as gsplat's is; for images of 24 x 16."""
     gaussians, cameras = splatter_scene(10, 2, "trained", 24)
-    path = tmp_path / "garden.npz"
-    np.savez(
-        path,
-        means3d=gaussians.means[0],
-        colors=(gaussians.colors[0] * 255).byte(),
-        viewmats=cameras.world_to_camera[0],
-        Ks=cameras.intrinsics[0],
-        width=24,
-        height=16,
-    )
+    colors, path = (gaussians.colors[0] * 255).byte(), tmp_path / "garden.npz"
+    matrices = {"viewmats": cameras.world_to_camera[0], "Ks": cameras.intrinsics[0]}
+    np.savez(path, means3d=gaussians.means[0], colors=colors, **matrices, width=24, height=16)
     return path
 
 
@@ -83,12 +76,8 @@ def test_backends_are_compared_on_a_scene_from_a_file(command, tmp_path, garden)
     assert finished.status == 0
     results = strict_json(tmp_path / "out/rasterizers.json")
     assert set(results) == {"machine", "not_measured", "rows", "scene", "agreement"}
-    assert results["scene"] == {
-        "file": str(garden),
-        "height": 16,
-        "width": 24,
-        "defaults": ["quats", "scales", "opacities"],
-    }
+    defaults = ["quats", "scales", "opacities"]
+    assert results["scene"] == {"file": str(garden), "height": 16, "width": 24, "defaults": defaults}
     assert [row["backend"] for row in results["rows"]] == ["tiled", "reference"]
     for row in results["rows"]:
         assert (row["size"], row["gaussians"], row["views"], row["opacity"]) == (24, 200, 2, "file")
@@ -98,21 +87,8 @@ def test_backends_are_compared_on_a_scene_from_a_file(command, tmp_path, garden)
     assert "opacities=0.5" in finished.out + finished.err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["scene=nowhere.npz"], "nowhere.npz: no such file"),
-        (["backends=[nonsense]"], "no backend 'nonsense'"),
-        (["repeats=0"], "repeats=0: must be at least 1"),
-        (["sizes=64"], "sizes=64: must be a list"),
-        (["sizes=[16,0]"], "sizes=[16, 0]: must be at least 1"),
-        (["views=[-1]"], "views=[-1]: must be at least 1"),
-    ],
-)
-def test_refusals_are_one_line_and_status_two(command, tmp_path, arguments, said):
-    finished = command("bench", "rasterizers", *arguments, f"out={tmp_path / 'out'}")
+def test_a_refusal_is_one_line_and_status_two(command, tmp_path):
+    finished = command("bench", "rasterizers", "sizes=[16,0]", f"out={tmp_path / 'out'}")
     assert finished.status == 2
-    assert finished.err.startswith("error: ")
-    assert finished.err.count("\n") == 1
-    assert said in finished.err
+    assert finished.err == "error: sizes=[16, 0]: must be at least 1\n"
     assert not (tmp_path / "out/rasterizers.json").exists()

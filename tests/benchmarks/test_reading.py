@@ -42,14 +42,8 @@ def loader() -> SceneLoader:
 
 def test_an_epoch_counts_batches_scenes_and_images(loader: SceneLoader, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reading, "time", SimpleNamespace(perf_counter=iter([3.0, 5.5]).__next__))
-    assert read_epoch(loader, 0) == Epoch(2.5, batches=3, scenes=5, images=15)
-
-
-def test_every_epoch_has_its_own_draws(loader: SceneLoader) -> None:
-    assert loader.sampler is not None
-    for number in (3, 7):
-        read_epoch(loader, number)
-        assert loader.sampler.epoch == number
+    assert read_epoch(loader, 7) == Epoch(2.5, batches=3, scenes=5, images=15)
+    assert loader.sampler.epoch == 7  # every epoch has its own draws
 
 
 def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,37 +85,24 @@ def test_sequences_come_again_under_other_names() -> None:
         assert (found.name, found.frames) == (name, expected.frames)
         assert torch.equal(found.cameras.world_to_camera, expected.cameras.world_to_camera)
         assert torch.equal(found.read(1).image, expected.read(1).image)
+    assert sorted(number for group in many.groups(many.names) for number in group) == list(range(7))
 
 
-def test_their_groups_hold_every_one_once() -> None:
-    many = RepeatedSource(ListedSource(["a", "b"]), 5)
-    assert sorted(number for group in many.groups(many.names) for number in group) == list(range(5))
-
-
-@needs_proc
-def test_what_an_array_takes_is_memory_of_the_process_itself() -> None:
+def test_memory_of_the_process_itself_and_pages_of_a_mapped_file_are_counted_apart(tmp_path: Path) -> None:
+    np.save(tmp_path / "array.npy", np.ones(60 * 2**20, np.uint8))
     before = resident_megabytes()
     # Fresh pages from the system: an allocator may give out memory that the process has already.
     kept = np.frombuffer(mmap.mmap(-1, 60 * 2**20, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.uint8)
     kept[:] = 1
-    after = resident_megabytes()
-    assert before is not None
-    assert after is not None
-    assert 55 < after["anonymous"] - before["anonymous"] < 70
-    assert kept.all()
-
-
-@needs_proc
-def test_pages_of_a_mapped_file_are_counted_apart(tmp_path: Path) -> None:
-    np.save(tmp_path / "array.npy", np.ones(60 * 2**20, np.uint8))
-    before = resident_megabytes()
+    between = resident_megabytes()
     mapped = np.load(tmp_path / "array.npy", mmap_mode="r")
     assert all(mapped[::4096])
     after = resident_megabytes()
-    assert before is not None
-    assert after is not None
-    assert 55 < after["file"] - before["file"] < 70
-    assert after["anonymous"] - before["anonymous"] < 20
+    assert all((before, between, after))
+    assert 55 < between["anonymous"] - before["anonymous"] < 70
+    assert 55 < after["file"] - between["file"] < 70
+    assert after["anonymous"] - between["anonymous"] < 20
+    assert kept.all()
 
 
 def test_without_proc_memory_is_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -149,14 +130,6 @@ def test_a_stopwatch_adds_up_what_the_functions_take(monkeypatch: pytest.MonkeyP
     with pytest.raises(ValueError, match="literal"):
         watch.wrap(int)("x")
     assert watch.seconds == 2.5
-
-
-def test_what_is_let_go_is_no_longer_in_memory() -> None:
-    counter = Counter()
-    read = counter.wrap(lambda number: {"number": number})
-    for number in range(4):
-        assert read(number) == {"number": number}
-    assert (counter.calls, counter.most) == (4, 1)
 
 
 def test_what_is_held_counts_with_the_one_that_is_being_made() -> None:

@@ -23,26 +23,12 @@ def everywhere(normal: Tensor, depth: Tensor) -> Tensor:
     return normal[:, None, None].expand(3, *depth.shape[-2:])
 
 
-@pytest.mark.parametrize("normal", [[0.0, 0, -1], [0.6, 0, -0.8], [0, -0.6, -0.8], [-0.36, 0.48, -0.8]])
+@pytest.mark.parametrize("normal", [[0.0, 0, -1], [0, -0.6, -0.8], [0.6, 0, -0.8], [-0.36, 0.48, -0.8]])
 def test_a_plane_has_one_normal_at_every_pixel(normal: list[float]) -> None:
     expected = torch.tensor(normal, dtype=torch.float64)
     depth = plane(expected, -2.0, camera())
     assert (depth > 0).all()
     torch.testing.assert_close(normals_from_depth(depth, camera()), everywhere(expected, depth))
-
-
-def test_constant_depth_is_flat() -> None:
-    normals = normals_from_depth(torch.full((1, 12, 16), 3.0), camera().to(torch.float32))
-    torch.testing.assert_close(normals, everywhere(torch.tensor([0.0, 0, -1]), normals))
-
-
-def test_the_floor_points_up_and_the_wall_on_the_right_points_left() -> None:
-    """Axes are OpenCV's: up is -y."""
-    view = Cameras(torch.eye(4), torch.tensor([[8.0, 0, 0], [0, 8, 0], [0, 0, 1]]), (8, 8))
-    for normal in ([0.0, -1, 0], [-1.0, 0, 0]):
-        expected = torch.tensor(normal)
-        depth = plane(expected, -1.0, view)
-        torch.testing.assert_close(normals_from_depth(depth, view), everywhere(expected, depth), atol=1e-4, rtol=0)
 
 
 def sphere_error(size: int) -> float:

@@ -12,7 +12,7 @@ from vgg_weights import CONVOLUTIONS, digest
 
 from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction
-from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity, load_heads, load_vgg16
+from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity, load_heads
 from completesplat.scene import Views
 
 POOLINGS = (4, 9, 16, 23, 30)
@@ -21,7 +21,10 @@ SHAPE = (2, 3, 3, 32, 32)
 
 @pytest.fixture(scope="module")
 def term(vgg_file):
-    return LearnedPerceptualSimilarity(str(vgg_file))
+    before = torch.get_rng_state()
+    made = LearnedPerceptualSimilarity(str(vgg_file))
+    assert torch.equal(torch.get_rng_state(), before)  # it draws no random numbers
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -98,12 +101,6 @@ def test_equal_images_cost_nothing(term, pair):
     assert term(prediction(pair[0]), views(pair[0])).item() == 0
 
 
-def test_views_do_not_influence_each_other(term, pair):
-    one, other = flat(pair)
-    alone = torch.cat([term.distance(a[None], b[None]) for a, b in zip(one, other, strict=True)])
-    torch.testing.assert_close(term.distance(one, other), alone, rtol=1e-5, atol=0)
-
-
 def test_the_gradient_is_finite_and_reaches_the_images_only(term, pair):
     images = pair[0].clone().requires_grad_()
     term(prediction(images), views(pair[1])).backward()
@@ -146,20 +143,6 @@ def test_autocast_and_half_precision_images_do_not_lower_the_precision(term, pai
     expected = term(prediction(one.float()), views(other.float()))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert term(prediction(one), views(other)) == expected
-
-
-def test_weights_in_half_precision_are_computed_with_in_float32(weights, tmp_path):
-    torch.save({key: value.half() for key, value in weights.items()}, tmp_path / "half.pth")
-    network = load_vgg16(str(tmp_path / "half.pth"))
-    (tmp_path / "half.pth").unlink()
-    assert {value.dtype for value in network.parameters()} == {torch.float32}
-
-
-def test_making_the_loss_draws_no_random_numbers(vgg_file):
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    LearnedPerceptualSimilarity(str(vgg_file))
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_stage_two_adds_lpips_to_stage_one_and_nothing_to_the_checkpoint(vgg_file):

@@ -26,10 +26,6 @@ def refusal(vgg_weights: object, sha256: str | None = None) -> str:
     return message
 
 
-def test_a_missing_file_is_refused(tmp_path):
-    assert f"{tmp_path / 'none.pth'}: no such file" in refusal(tmp_path / "none.pth")
-
-
 def test_another_file_than_the_hash_says_is_refused(vgg_file):
     message = refusal(vgg_file, "0" * 64)
     assert digest(vgg_file) in message
@@ -41,6 +37,7 @@ def test_a_file_that_is_no_state_dict_is_refused(tmp_path):
     assert "not a readable state dict" in refusal(tmp_path / "page.pth")
     torch.save([1, 2], tmp_path / "list.pth")
     assert "not a readable state dict" in refusal(tmp_path / "list.pth")
+    assert f"{tmp_path / 'none.pth'}: no such file" in refusal(tmp_path / "none.pth")
 
 
 class Malicious:
@@ -66,7 +63,9 @@ def test_code_in_a_file_is_not_run(tmp_path, monkeypatch):
 )
 def test_weights_of_another_layout_are_refused(key, value, said, tmp_path):
     changed = blank()
-    load_vgg16(str(saved(changed, tmp_path / "right.pth")))
+    half = {name: tensor.half() for name, tensor in changed.items()}
+    network = load_vgg16(str(saved(half, tmp_path / "right.pth")))
+    assert {value.dtype for value in network.parameters()} == {torch.float32}
     if value is None:
         del changed[key]
     else:

@@ -4,18 +4,12 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
+from rasterizer_scenes import CONSTANTS, f64, render
 
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rasterizer, Rendering, RenderingConstants
+from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians
-
-CONSTANTS = RenderingConstants()
-
-
-def f64(*values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def straight_camera(
@@ -34,27 +28,18 @@ def at_pixel(
     return Gaussians(mean[None], f64([1, 0, 0, 0]), f64([1e-6] * 3), f64(opacity), f64(color))
 
 
-def render(gaussians: Gaussians, camera: Cameras, constants: RenderingConstants = CONSTANTS) -> Rendering:
-    """One scene, one view."""
-    return ReferenceRasterizer(constants)(gaussians[None], camera[None, None])
-
-
 @pytest.mark.parametrize(("column", "row"), [(0, 0), (15, 0), (0, 11), (15, 11), (3, 9), (11, 2)])
-@pytest.mark.parametrize("center", [(8.0, 6.0), (2.25, 9.5), (20.0, -3.0)])
-def test_an_opaque_point_lands_on_its_pixel_with_its_colour(column: int, row: int, center: tuple[float, float]) -> None:
-    camera = straight_camera(center=center)
+@pytest.mark.parametrize("center", [(8.0, 6.0), (20.0, -3.0)])
+@pytest.mark.parametrize("size", [(12, 16), (1, 7), (13, 1)])
+def test_an_opaque_point_lands_on_its_pixel_with_its_colour(
+    column: int, row: int, center: tuple[float, float], size: tuple[int, int]
+) -> None:
+    column, row = min(column, size[1] - 1), min(row, size[0] - 1)
+    camera = straight_camera(size, center=center)
     rendering = render(at_pixel(camera, column, row, depth=3, opacity=1, color=(0.2, 0.5, 0.9)), camera)
-    assert rendering.alpha.argmax().item() == row * 16 + column
+    assert rendering.alpha.argmax().item() == row * size[1] + column
     color = rendering.color[0, 0, :, row, column]
     torch.testing.assert_close(color, 0.999 * f64(0.2, 0.5, 0.9))
-
-
-def test_moving_right_goes_to_higher_columns_and_down_to_higher_rows() -> None:
-    camera = straight_camera(center=(5.5, 4.5))
-    for shift, (row, column) in {(0, 0): (4, 5), (4, 0): (4, 9), (0, 4): (8, 5), (-3, -2): (2, 2)}.items():
-        mean = f64([shift[0] * 2 / 20, shift[1] * 2 / 20, 2])
-        point = Gaussians(mean, f64([1, 0, 0, 0]), f64([1e-6] * 3), f64(1), f64([1, 1, 1]))
-        assert render(point, camera).alpha.argmax().item() == row * 16 + column
 
 
 def test_alpha_of_one_gaussian_in_closed_form() -> None:
@@ -148,15 +133,6 @@ def test_outside_the_frustum_the_jacobian_is_that_of_the_clamped_direction(
     assert centers[0, axis].item() == pytest.approx(10 * slope + 6.8)  # the centre itself is not clamped
     expected = (10 / depth) ** 2 * (gaussian.scales[0, axis].item() ** 2 + (clamped * 0.4) ** 2) + 0.3
     assert covariances[0, axis, axis].item() == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (13, 1)])
-def test_images_of_one_row_or_column(size: tuple[int, int]) -> None:
-    camera = straight_camera(size=size, center=(size[1] / 2, size[0] / 2))
-    row, column = size[0] // 2, size[1] // 2
-    alpha = render(at_pixel(camera, column, row, 2, 0.7), camera).alpha
-    assert alpha.shape == (1, 1, 1, *size)
-    assert alpha[0, 0, 0, row, column].item() == pytest.approx(0.7, rel=1e-12)
 
 
 def test_a_backend_is_recognised_as_a_rasterizer_at_run_time() -> None:

@@ -107,11 +107,6 @@ def test_gradients_agree_with_finite_differences(make, name: str) -> None:  # ty
     assert gradient.abs().max() > 1e-4
 
 
-def test_gradients_of_all_inputs_together() -> None:
-    values = tuple(value.clone().requires_grad_() for value in soft_scene().values())
-    assert torch.autograd.gradcheck(render, values, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=False)
-
-
 def test_single_precision_gradients_agree_with_double() -> None:
     scene = soft_scene()
     gradients = []

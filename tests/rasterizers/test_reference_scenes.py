@@ -3,23 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from rasterizer_scenes import CONSTANTS, f64, render
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, transform_points
-from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians
-
-CONSTANTS = RenderingConstants()
-
-
-def f64(*values: object) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def render(gaussians: Gaussians, camera: Cameras, constants: RenderingConstants = CONSTANTS) -> Rendering:
-    """One scene, one view."""
-    return ReferenceRasterizer(constants)(gaussians[None], camera[None, None])
 
 
 def random_scene(
@@ -72,8 +61,6 @@ def test_over_puts_the_background_behind() -> None:
     torch.testing.assert_close(white - rendering.color, (1 - rendering.alpha).expand_as(white))
     picture = torch.rand(2, 2, 3, 10, 14, dtype=torch.float64)
     torch.testing.assert_close(rendering.over(picture), rendering.color + (1 - rendering.alpha) * picture)
-    color = f64(0.1, 0.2, 0.3).reshape(1, 1, 3, 1, 1)
-    torch.testing.assert_close(rendering.over(color)[1, 0], rendering.over(color.expand(2, 2, 3, 10, 14))[1, 0])
 
 
 def test_a_scene_of_one_colour_over_that_colour_is_that_colour() -> None:
@@ -97,15 +84,6 @@ def test_scenes_and_views_of_a_batch_do_not_mix() -> None:
             alone = render(gaussians[b], cameras[b, v])
             assert torch.equal(together[b, v].color, alone.color[0, 0])
             assert torch.equal(together[b, v].depth, alone.depth[0, 0])
-
-
-def test_single_and_double_precision_agree() -> None:
-    gaussians, cameras = random_scene(3, 2, 80, seed=5)
-    double = ReferenceRasterizer()(gaussians, cameras)
-    single = ReferenceRasterizer()(gaussians.to(torch.float32), cameras.to(torch.float32))
-    assert single.color.dtype == torch.float32
-    for name in ("color", "depth", "alpha"):
-        torch.testing.assert_close(getattr(single, name).double(), getattr(double, name), atol=1e-5, rtol=0)
 
 
 def loop(gaussians: Gaussians, camera: Cameras) -> np.ndarray:

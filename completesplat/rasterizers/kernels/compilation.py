@@ -26,24 +26,19 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: Callable[..., Any]) -> Any:
     """Compile an entry point on its first call; later processes load it from the cache."""
-    function = _original(function)
     directory = _cache_directory()
     if directory is None:
-        return numba.njit(**OPTIONS)(function)
+        return numba.njit(**OPTIONS)(inspect.unwrap(function))
     with _numba_cache_in(directory):
-        return numba.njit(cache=True, **OPTIONS)(function)
+        return numba.njit(cache=True, **OPTIONS)(inspect.unwrap(function))
 
 
-def helper(function: Callable) -> Callable:
+def helper(function: Callable[..., Any]) -> Any:
     """A part of a kernel that is always inlined."""
-    return numba.njit(forceinline=True, **OPTIONS)(_original(function))
-
-
-def _original(function: Callable) -> Callable:
-    """The function under the wrappers of a type checker, which numba could not compile."""
-    return inspect.unwrap(function)
+    # What is unwrapped are a type checker's wrappers, which numba could not compile.
+    return numba.njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
 
 
 @cache

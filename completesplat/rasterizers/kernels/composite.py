@@ -1,44 +1,54 @@
-"""Front-to-back compositing of one view's Gaussians over a band of block rows, and its backward pass."""
+"""Front-to-back compositing of one view's Gaussians over a band of block rows, and its backward pass.
+
+`open_words` [row word] uint64 holds one bit for each block of the band that has a pixel that is not opaque yet, 64
+blocks of a row to the word.
+"""
 
 import numpy as np
 
-from completesplat.rasterizers.kernels import layout
-from completesplat.rasterizers.kernels.blocks import (
-    BIT,
-    BLOCK,
-    ONE,
-    ROWS_AT_ONCE,
-    WORD_SHIFT,
-    ZERO,
-    alpha_at,
-    attenuate,
-    close_block,
-    column_offset,
-    open_all_blocks,
-    open_pixels,
-    row_spans,
-    row_terms,
-    span_offset,
-    state_vector,
-    word_mask,
-)
+from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.rasterizers.kernels.simd import (
     LANES,
     any_lane,
+    exp2,
     keep,
     lane_constant,
     lane_sums,
+    load,
     lowest_bit,
     splat,
+    square_root,
     store,
-)
+    store_blocks,
+)  # fmt: skip
 
 Array = np.ndarray
 
-FORWARD_STATE_VECTORS = 6  # transmittance, red, green, blue, depth, alpha
-BACKWARD_STATE_VECTORS = 6  # transmittance, sum behind, gradients of red, green, blue, depth
+# Of a block. Forward: transmittance, red, green, blue, depth, alpha. Backward: transmittance, sum behind, gradients of
+# red, green, blue, depth.
+STATE_VECTORS = 6
 reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
+BLOCK = layout.BLOCK
+SLACK = np.float32(layout.SLACK)
+WORD_BITS = 64
+WORD_SHIFT = 6
+ZERO, ONE = np.float32(0), np.float32(1)
+ALL_BITS = np.uint64(2**64 - 1)
+BIT, TWO_BITS = np.uint64(1), np.uint64(2)
+# Blocks are chosen a little generously, in px, against rounding. What counts is the test at the pixel itself.
+MARGIN = np.float32(0.01)
+
+ROWS_AT_ONCE = LANES // 2  # in `row_spans`
+
+# Pixel centres relative to the block's corner.
+lane_x = lane_constant([lane % BLOCK + 0.5 for lane in range(LANES)])
+lane_y = lane_constant([lane // BLOCK + 0.5 for lane in range(LANES)])
+# For the left ends of block rows, then for the right ends: top pixel row, direction, and limits of the pixel column.
+row_tops = lane_constant([lane % ROWS_AT_ONCE * BLOCK + 0.5 for lane in range(LANES)])
+side = lane_constant([-1] * ROWS_AT_ONCE + [1] * ROWS_AT_ONCE)
+is_left = lane_constant([1] * ROWS_AT_ONCE + [0] * ROWS_AT_ONCE)
+lowest_pixel = lane_constant([0] * ROWS_AT_ONCE + [-BLOCK] * ROWS_AT_ONCE)
 
 
 @kernel
@@ -47,111 +57,36 @@ def composite(
     max_alpha: float, log2_min_alpha: float, min_transmittance: float,
     state: Array, open_words: Array, spans: Array,
     color: Array, depth: Array, alpha: Array,
+    grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None, gradients: Array | None,
 ) -> None:  # fmt: skip
-    """Draw the block rows first_row..end_row - 1 of one view.
+    """Draw the block rows first_row..end_row - 1 of one view, or add up every Gaussian's gradients over them.
+
+    Each of the two is compiled by itself, without what is only for the other.
 
     Args:
         records: [gaussian 16], of which the first `count` are used.
         state: scratch [block * 6 * 16], all blocks of the band.
         open_words: scratch [row word] uint64.
         spans: scratch [2 * row + 32] int32.
-        color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written.
+        color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written, or read.
+        grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
+        gradients: [gaussian 16], see `array_layout`; rows of Gaussians that are not visible are not written.
     """
     height, width = alpha.shape
     columns = (width + BLOCK - 1) // BLOCK
     integers = records.view(np.int32)
-    begin_forward(first_row, end_row, columns, height, width, state)
-    blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
-    for j in range(count):
-        rows = integers[j, layout.ROWS]
-        top, bottom = max(rows & 0xFFFF, first_row), min(rows >> 16, end_row - 1)
-        if bottom < top:
-            continue
-        row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
-        red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
-        z = records[j, layout.DEPTH]
-        for row in range(top, bottom + 1):
-            span = span_offset(row - top)
-            first, last = spans[span], spans[span + ROWS_AT_ONCE]
-            if last < first:
-                continue
-            for word in range(first >> WORD_SHIFT, (last >> WORD_SHIFT) + 1):
-                mask = open_words[row - first_row, word] & word_mask(word, first, last)
-                if mask == 0:
-                    continue
-                u_row, _, exponent_row = row_terms(records, j, row)
-                while mask != 0:
-                    column = (word << WORD_SHIFT) + lowest_bit(mask)
-                    mask &= mask - BIT
-                    offset = ((row - first_row) * columns + column) * (FORWARD_STATE_VECTORS * LANES)
-                    u = u_row + column_offset(records, j, column)
-                    _, opacity = alpha_at(exponent_row - u * u, log2_min_alpha, max_alpha)
-                    weight, behind, _ = attenuate(state_vector(state, offset, 0), opacity, min_transmittance)
-                    store(state, offset, behind)
-                    store(state, offset + LANES, state_vector(state, offset, 1) + weight * red)
-                    store(state, offset + 2 * LANES, state_vector(state, offset, 2) + weight * green)
-                    store(state, offset + 3 * LANES, state_vector(state, offset, 3) + weight * blue)
-                    store(state, offset + 4 * LANES, state_vector(state, offset, 4) + weight * z)
-                    store(state, offset + 5 * LANES, state_vector(state, offset, 5) + weight)
-                    if not any_lane(behind > ZERO):
-                        close_block(open_words, row - first_row, column)
-                        blocks_left -= 1
-        if blocks_left == 0:
-            break
-    write_images(first_row, end_row, columns, state, color, depth, alpha)
-
-
-@helper
-def begin_forward(first_row, end_row, columns, height, width, state):
-    for row in range(first_row, end_row):
-        for column in range(columns):
-            offset = ((row - first_row) * columns + column) * (FORWARD_STATE_VECTORS * LANES)
-            open_pixels(row, column, height, width, state, offset)
-            for vector in range(1, FORWARD_STATE_VECTORS):
-                store(state, offset + vector * LANES, splat(ZERO))
-
-
-@helper
-def write_images(first_row, end_row, columns, state, color, depth, alpha):
-    height, width = alpha.shape
-    for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
-        for x in range(width):
-            block = (y // BLOCK - first_row) * columns + x // BLOCK
-            pixel = block * (FORWARD_STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
-            for channel in range(3):
-                color[channel, y, x] = state[pixel + (1 + channel) * LANES]
-            depth[y, x] = state[pixel + 4 * LANES]
-            alpha[y, x] = state[pixel + 5 * LANES]
-
-
-@kernel
-def composite_backward(
-    records: Array, count: int, first_row: int, end_row: int,
-    max_alpha: float, log2_min_alpha: float, min_transmittance: float,
-    state: Array, open_words: Array, spans: Array,
-    color: Array, depth: Array, alpha: Array, grad_color: Array, grad_depth: Array, grad_alpha: Array,
-    gradients: Array,
-) -> None:  # fmt: skip
-    """Add up, for every visible Gaussian, its gradients over the block rows first_row..end_row - 1 of one view.
-
-    Args:
-        state: scratch [block * 6 * 16]; otherwise as for `composite`, with the images that it drew.
-        grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images.
-        gradients: [gaussian 16], see `layout`; rows of Gaussians that are not visible are not written.
-    """
-    height, width = alpha.shape
-    columns = (width + BLOCK - 1) // BLOCK
-    integers = records.view(np.int32)
-    flat_gradients = gradients.reshape(-1)
-    begin_backward(first_row, end_row, columns, height, width, state)
-    read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha)
+    begin(first_row, end_row, columns, height, width, state)
+    if gradients is not None:
+        flat_gradients = gradients.reshape(-1)
+        read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha)
     blocks_left = open_all_blocks(open_words, end_row - first_row, columns)
     for j in range(count):
         rows = integers[j, layout.ROWS]
         top, bottom = max(rows & 0xFFFF, first_row), min(rows >> 16, end_row - 1)
         index = np.int64(integers[j, layout.INDEX])
         if bottom < top or blocks_left == 0:
-            gradients[index, layout.REACHED] = ZERO
+            if gradients is not None:
+                gradients[index, layout.REACHED] = ZERO
             continue
         row_spans(records, j, log2_min_alpha, top, bottom, width, spans)
         red, green, blue = records[j, layout.RED], records[j, layout.GREEN], records[j, layout.BLUE]
@@ -174,48 +109,69 @@ def composite_backward(
                 while mask != 0:
                     column = (word << WORD_SHIFT) + lowest_bit(mask)
                     mask &= mask - BIT
-                    offset = ((row - first_row) * columns + column) * (BACKWARD_STATE_VECTORS * LANES)
+                    offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
                     u = u_row + column_offset(records, j, column)
                     value, opacity = alpha_at(exponent_row - u * u, log2_min_alpha, max_alpha)
                     transmittance = state_vector(state, offset, 0)
                     weight, behind, passes = attenuate(transmittance, opacity, min_transmittance)
                     store(state, offset, behind)
-
-                    grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
-                    grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
-                    own = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
-                    sum_behind = state_vector(state, offset, 1) - weight * own
-                    store(state, offset + LANES, sum_behind)
-                    grad_opacity = transmittance * own - sum_behind / (ONE - opacity)
-                    # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha lets nothing through.
-                    s = keep(passes & (value <= max_alpha), opacity * grad_opacity)
-
-                    sum_red = sum_red + weight * grad_red
-                    sum_green = sum_green + weight * grad_green
-                    sum_blue = sum_blue + weight * grad_blue
-                    sum_z = sum_z + weight * grad_z
-                    su, sv = s * u, s * v
-                    sum_s, sum_su, sum_sv = sum_s + s, sum_su + su, sum_sv + sv
-                    sum_suu, sum_suv, sum_svv = sum_suu + su * u, sum_suv + su * v, sum_svv + sv * v
+                    if gradients is None:
+                        store(state, offset + LANES, state_vector(state, offset, 1) + weight * red)
+                        store(state, offset + 2 * LANES, state_vector(state, offset, 2) + weight * green)
+                        store(state, offset + 3 * LANES, state_vector(state, offset, 3) + weight * blue)
+                        store(state, offset + 4 * LANES, state_vector(state, offset, 4) + weight * z)
+                        store(state, offset + 5 * LANES, state_vector(state, offset, 5) + weight)
+                    else:
+                        grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
+                        grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
+                        own = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
+                        sum_behind = state_vector(state, offset, 1) - weight * own
+                        store(state, offset + LANES, sum_behind)
+                        grad_opacity = transmittance * own - sum_behind / (ONE - opacity)
+                        # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha lets nothing through.
+                        s = keep(passes & (value <= max_alpha), opacity * grad_opacity)
+                        sum_red, sum_green = sum_red + weight * grad_red, sum_green + weight * grad_green
+                        sum_blue, sum_z = sum_blue + weight * grad_blue, sum_z + weight * grad_z
+                        su, sv = s * u, s * v
+                        sum_s, sum_su, sum_sv = sum_s + s, sum_su + su, sum_sv + sv
+                        sum_suu, sum_suv, sum_svv = sum_suu + su * u, sum_suv + su * v, sum_svv + sv * v
                     if not any_lane(behind > ZERO):
                         close_block(open_words, row - first_row, column)
                         blocks_left -= 1
-        if reached:
-            sums = lane_sums((sum_red, sum_green, sum_blue, sum_z, sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv))
-            store(flat_gradients, index * layout.GRADIENT_WIDTH, sums + reached_flag())
-        else:
-            gradients[index, layout.REACHED] = ZERO
+        if gradients is not None:
+            if reached:
+                moments = (sum_s, sum_su, sum_sv, sum_suu, sum_suv, sum_svv)
+                sums = lane_sums((sum_red, sum_green, sum_blue, sum_z) + moments)  # noqa: RUF005
+                store(flat_gradients, index * layout.GRADIENT_WIDTH, sums + reached_flag())
+            else:
+                gradients[index, layout.REACHED] = ZERO
+        elif blocks_left == 0:
+            break
+    if gradients is None:
+        write_images(first_row, end_row, columns, state, color, depth, alpha)
 
 
 @helper
-def begin_backward(first_row, end_row, columns, height, width, state):
+def begin(first_row, end_row, columns, height, width, state):
     for row in range(first_row, end_row):
         for column in range(columns):
-            offset = ((row - first_row) * columns + column) * (BACKWARD_STATE_VECTORS * LANES)
+            offset = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
             open_pixels(row, column, height, width, state, offset)
-            if (row + 1) * BLOCK > height or (column + 1) * BLOCK > width:
-                for vector in range(1, BACKWARD_STATE_VECTORS):
-                    store(state, offset + vector * LANES, splat(ZERO))
+            for vector in range(1, STATE_VECTORS):
+                store(state, offset + vector * LANES, splat(ZERO))
+
+
+@helper
+def write_images(first_row, end_row, columns, state, color, depth, alpha):
+    height, width = alpha.shape
+    for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
+        for x in range(width):
+            block = (y // BLOCK - first_row) * columns + x // BLOCK
+            pixel = block * (STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
+            for channel in range(3):
+                color[channel, y, x] = state[pixel + (1 + channel) * LANES]
+            depth[y, x] = state[pixel + 4 * LANES]
+            alpha[y, x] = state[pixel + 5 * LANES]
 
 
 @helper
@@ -225,9 +181,110 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
     for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
         for x in range(width):
             block = (y // BLOCK - first_row) * columns + x // BLOCK
-            pixel = block * (BACKWARD_STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
+            pixel = block * (STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
             red, green, blue = grad_color[0, y, x], grad_color[1, y, x], grad_color[2, y, x]
             state[pixel + 2 * LANES], state[pixel + 3 * LANES], state[pixel + 4 * LANES] = red, green, blue
             state[pixel + 5 * LANES] = grad_depth[y, x]
             total = red * color[0, y, x] + green * color[1, y, x] + blue * color[2, y, x]
             state[pixel + LANES] = total + grad_depth[y, x] * depth[y, x] - grad_alpha[y, x] * (ONE - alpha[y, x])
+
+
+@helper
+def open_all_blocks(open_words, rows, columns):
+    """Set the bits of all blocks; returns their number."""
+    for row in range(rows):
+        for word in range((columns + WORD_BITS - 1) >> WORD_SHIFT):
+            open_words[row, word] = word_mask(word, 0, columns - 1)
+    return rows * columns
+
+
+@helper
+def word_mask(word, first, last):
+    """Bits of the block columns first..last (both included) in a word."""
+    low = max(first - word * WORD_BITS, 0)
+    high = min(last - word * WORD_BITS, WORD_BITS - 1)
+    return ((TWO_BITS << np.uint64(high)) - BIT) & (ALL_BITS << np.uint64(low))
+
+
+@helper
+def close_block(open_words, row, column):
+    open_words[row, column >> WORD_SHIFT] &= ~(BIT << np.uint64(column & (WORD_BITS - 1)))
+
+
+@helper
+def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
+    """First and last block column that the ellipse of record j touches in each of the block rows top..bottom.
+
+    They go to spans[offset] and spans[offset + ROWS_AT_ONCE], where offset is `span_offset(row - top)`.
+
+    In a row at d_y the ellipse reaches from SHEAR d_y - h to SHEAR d_y + h with h^2 = (reach - (V d_y)^2) / U^2. Over
+    the rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest near minus
+    it. The left ends are in the first half of a vector's lanes, the right ends in the second.
+    """
+    center_y, extent = records[j, layout.CENTER_Y], records[j, layout.EXTENT_Y]
+    reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha + SLACK
+    # Truncation of the left end, which has one pixel too much, rounds up. The limits keep the integers small.
+    start = records[j, layout.CENTER_X] - side() * (np.float32(0.5) - MARGIN)
+    extreme_y, stretch = side() * records[j, layout.RIGHTMOST_Y], side() * records[j, layout.INVERSE_U]
+    lowest, highest = lowest_pixel(), is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
+    for row in range(top, bottom + 1, ROWS_AT_ONCE):
+        low = row_tops() + (np.float32(row * BLOCK) - center_y)
+        high = min(low + np.float32(BLOCK - 1), extent)
+        y = min(max(extreme_y, max(low, -extent)), high)
+        scaled = y * records[j, layout.V]
+        half_width = square_root(max(reach - scaled * scaled, ZERO))
+        end = y * records[j, layout.SHEAR] + half_width * stretch + start
+        store_blocks(spans, span_offset(row - top), min(max(end, lowest), highest))
+
+
+@helper
+def span_offset(row):
+    """Where the first block column of a row stands in `spans`, counted from the top row."""
+    return row + (row & ~(ROWS_AT_ONCE - 1))
+
+
+@helper
+def row_terms(records, j, row):
+    """(u at lane positions of block column 0 less U * centre, v, exponent without u) for block row `row`."""
+    y = lane_y() + (np.float32(row * BLOCK) - records[j, layout.CENTER_Y])
+    u = (lane_x() - y * records[j, layout.SHEAR]) * records[j, layout.U]
+    v = y * records[j, layout.V]
+    return u, v, records[j, layout.LOG2_OPACITY] - v * v
+
+
+@helper
+def column_offset(records, j, column):
+    """What is added to u in block column `column`."""
+    return (np.float32(column * BLOCK) - records[j, layout.CENTER_X]) * records[j, layout.U]
+
+
+@helper
+def alpha_at(exponent, log2_min_alpha, max_alpha):
+    """(2^exponent, alpha): the same clamped from above, and zero below the threshold."""
+    value = exp2(exponent)
+    return value, keep(exponent >= log2_min_alpha, min(value, max_alpha))
+
+
+@helper
+def attenuate(transmittance, alpha, min_transmittance):
+    """(weight, transmittance behind, mask of the pixels that took part); a pixel that stops is left with 0."""
+    weight = transmittance * alpha
+    behind = transmittance - weight
+    passes = behind > min_transmittance
+    return keep(passes, weight), keep(passes, behind), passes
+
+
+@helper
+def open_pixels(row, column, height, width, state, offset):
+    """Transmittances of a fresh block: 1, but 0 for the lanes outside the image, which must not keep it open."""
+    if (row + 1) * BLOCK <= height and (column + 1) * BLOCK <= width:
+        store(state, offset, splat(ONE))
+        return
+    for lane in range(LANES):
+        inside = row * BLOCK + lane // BLOCK < height and column * BLOCK + lane % BLOCK < width
+        state[offset + lane] = ONE if inside else ZERO
+
+
+@helper
+def state_vector(state, offset, channel):
+    return load(state, offset + channel * LANES)

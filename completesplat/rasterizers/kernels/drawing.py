@@ -11,18 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from completesplat.rasterizers.kernels import layout
-from completesplat.rasterizers.kernels.blocks import WORD_BITS
-from completesplat.rasterizers.kernels.composite import (
-    BACKWARD_STATE_VECTORS,
-    FORWARD_STATE_VECTORS,
-    composite,
-    composite_backward,
-)
+from completesplat.rasterizers import RenderingConstants
+from completesplat.rasterizers.kernels import array_layout as layout
+from completesplat.rasterizers.kernels.composite import STATE_VECTORS, WORD_BITS, composite
 from completesplat.rasterizers.kernels.project import prepare, project, project_backward
+from completesplat.rasterizers.kernels.projection import camera_backward
 from completesplat.rasterizers.kernels.simd import LANES
-from completesplat.rasterizers.kernels.splat_backward import camera_backward
-from completesplat.rasterizers.protocol import RenderingConstants
 
 ALIGNMENT = 64  # bytes, one cache line
 MOST_FREE_BYTES = 512 * 2**20
@@ -71,15 +65,15 @@ def _pool(size: int) -> ThreadPoolExecutor:
         return _pools[size]
 
 
-def _forget_pools() -> None:
-    """Threads do not survive a fork: the child would wait forever for those of its parent."""
-    global _pool_lock
+def _after_a_fork() -> None:
+    """Threads do not survive in the child, which would wait for them, or for the locks that they held, for ever."""
+    global _pool_lock, _buffers_lock
     _pools.clear()
-    _pool_lock = threading.Lock()
+    _pool_lock, _buffers_lock = threading.Lock(), threading.Lock()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_pools)
+    os.register_at_fork(after_in_child=_after_a_fork)
 
 
 class Buffers:
@@ -94,7 +88,8 @@ class Buffers:
         block = _take(size)
         self._blocks.append(block)
         start = -block.ctypes.data % ALIGNMENT
-        return block[start : start + size].view(dtype).reshape(shape)
+        array: np.ndarray = block[start : start + size].view(dtype).reshape(shape)
+        return array
 
     def __del__(self) -> None:
         # No lock: the garbage collector may come here while `_take` of the same thread holds it. extend is atomic.
@@ -117,16 +112,6 @@ def release() -> None:
     """Give the memory that is not in use back to the system."""
     with _buffers_lock:
         _free.clear()
-
-
-def _forget_lock() -> None:
-    """Another thread of the parent may have held the lock at the moment of a fork."""
-    global _buffers_lock
-    _buffers_lock = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_lock)
 
 
 class Parameters(NamedTuple):
@@ -155,21 +140,15 @@ class Drawing:
     """A batch of scenes in all its views: drawn once, and taken back through the chain rule if need be.
 
     Args:
-        parameters: of the Gaussians.
-        cameras: [batch view 20], see `layout`.
+        cameras: [batch view 20], see `array_layout`.
         image_size: height and width in pixels.
-        constants: of the rendering.
         keep: whether `backward` will be called.
     """
 
     def __init__(
-        self,
-        parameters: Parameters,
-        cameras: np.ndarray,
-        image_size: tuple[int, int],
-        constants: RenderingConstants,
-        keep: bool,
-    ) -> None:
+        self, parameters: Parameters, cameras: np.ndarray, image_size: tuple[int, int],
+        constants: RenderingConstants, keep: bool,
+    ) -> None:  # fmt: skip
         self.parameters, self.cameras, self.constants = parameters, cameras, constants
         self.height, self.width = image_size
         self.scenes, self.views = cameras.shape[:2]
@@ -187,13 +166,10 @@ class Drawing:
         self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
         self.visible = self.buffers.empty((self.held, self.count))
         self.visible_counts = np.zeros(self.held, np.int64)
-        self.bands = self._bands()
-
-    def _bands(self) -> list[tuple[int, int]]:
-        """First and end block row of each band of a view."""
         rows = -(-self.height // layout.BLOCK)
         count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
-        return [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
+        # First and end block row of each band of a view.
+        self.bands = [(i * rows // count, (i + 1) * rows // count) for i in range(count)]
 
     def draw(self) -> Images:
         """Project and composite every view."""
@@ -230,69 +206,46 @@ class Drawing:
     def _project(self, start: int, slot: int) -> None:
         buffers = Buffers()
         scene, camera = divmod(start + slot, self.views)
+        unsorted = buffers.empty((self.count, layout.RECORD_WIDTH))
+        keys, order = buffers.empty((2, self.count), np.int64), buffers.empty((2, self.count), np.int32)
         self.visible_counts[slot] = project(
-            self.parameters.means[scene],
-            self.parameters.colors[scene],
-            self.prepared[scene],
-            self.cameras[scene, camera],
-            self.height,
-            self.width,
-            float(self.constants.blur),
-            float(self.constants.near_plane),
-            buffers.empty((self.count, layout.RECORD_WIDTH)),
-            buffers.empty((2, self.count), np.int64),
-            buffers.empty((2, self.count), np.int32),
-            self.records[slot],
-            self.visible[slot],
-        )
+            self.parameters.means[scene], self.parameters.colors[scene], self.prepared[scene],
+            self.cameras[scene, camera], self.height, self.width,
+            float(self.constants.blur), float(self.constants.near_plane),
+            unsorted, keys, order, self.records[slot], self.visible[slot],
+        )  # fmt: skip
 
     def _composite(self, images: Images, start: int, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
-        self._run(composite, FORWARD_STATE_VECTORS, slot, band, images.view(*divmod(start + slot, self.views)))
+        self._run(slot, band, (*images.view(*divmod(start + slot, self.views)), None, None, None, None))
 
     def _composite_backward(self, images: Images, gradients: Images, sums: np.ndarray, task: int) -> None:
         slot, band = divmod(task, len(self.bands))
         scene, view = divmod(slot, self.views)
-        arrays = (*images.view(scene, view), *gradients.view(scene, view), sums[scene, view, band])
-        self._run(composite_backward, BACKWARD_STATE_VECTORS, slot, band, arrays)
+        self._run(slot, band, (*images.view(scene, view), *gradients.view(scene, view), sums[scene, view, band]))
 
-    def _run(self, kernel: Callable, state_vectors: int, slot: int, band: int, arrays: tuple[np.ndarray, ...]) -> None:
+    def _run(self, slot: int, band: int, arrays: tuple[np.ndarray | None, ...]) -> None:
         buffers = Buffers()
         first, end = self.bands[band]
         columns = -(-self.width // layout.BLOCK)
-        state = buffers.empty(((end - first) * columns * state_vectors * LANES,))
+        state = buffers.empty(((end - first) * columns * STATE_VECTORS * LANES,))
         open_words = buffers.empty((end - first, -(-columns // WORD_BITS)), np.uint64)
         spans = buffers.empty((2 * (end - first + LANES),), np.int32)
         count = self.visible_counts[slot]
-        kernel(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
+        composite(self.records[slot], count, first, end, *self.thresholds, state, open_words, spans, *arrays)
 
     def _project_backward(self, result: Parameters, sums: np.ndarray, task: int) -> None:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
-        views = slice(scene * self.views, (scene + 1) * self.views)
-        means, quaternions, scales, opacities, _ = (x[scene] for x in self.parameters)
+        visible = self.visible[scene * self.views : (scene + 1) * self.views]
         project_backward(
-            means,
-            quaternions,
-            scales,
-            opacities,
-            self.prepared[scene],
-            self.cameras[scene],
-            float(self.constants.blur),
-            self.visible[views],
-            sums[scene],
-            chunk * CHUNK,
-            min((chunk + 1) * CHUNK, self.count),
+            *(x[scene] for x in self.parameters[:4]), self.prepared[scene], self.cameras[scene],
+            float(self.constants.blur), visible, sums[scene], chunk * CHUNK, min((chunk + 1) * CHUNK, self.count),
             *(x[scene] for x in result),
-        )
+        )  # fmt: skip
 
     def _camera_backward(self, grad_cameras: np.ndarray, sums: np.ndarray, task: int) -> None:
         scene, view = divmod(task, self.views)
         camera_backward(
-            self.parameters.means[scene],
-            self.prepared[scene],
-            self.cameras[scene, view],
-            float(self.constants.blur),
-            self.visible[task],
-            sums[scene, view],
-            grad_cameras[scene, view],
-        )
+            self.parameters.means[scene], self.prepared[scene], self.cameras[scene, view],
+            float(self.constants.blur), self.visible[task], sums[scene, view], grad_cameras[scene, view],
+        )  # fmt: skip

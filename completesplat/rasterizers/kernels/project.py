@@ -4,37 +4,29 @@ import math
 
 import numpy as np
 
-from completesplat.rasterizers.kernels import layout
+from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.rasterizers.kernels.projection import (
     LN2,
     ONE,
     TWO,
+    ZERO,
+    Array,
     camera_point,
     covariance_2d,
     image_jacobian,
-    nine,
-    rotation_matrix,
-    row_times_matrix,
-    unit_quaternion,
-)
-from completesplat.rasterizers.kernels.simd import LANES, any_lane, load, splat, store
-from completesplat.rasterizers.kernels.splat_backward import (
-    ZERO,
-    add3,
-    add9,
-    keep3,
-    keep9,
-    lane_means,
-    lane_roots,
+    lane_gaussians,
     lane_sums_of_view,
+    nine,
     point_gradient,
+    rotation_matrix,
     row_gradients,
+    row_times_matrix,
     slopes,
-)
+    unit_quaternion,
+)  # fmt: skip
+from completesplat.rasterizers.kernels.simd import LANES, add_each, any_lane, keep_each, load, store, zeros
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
-
-Array = np.ndarray
 
 HALF = np.float64(0.5)
 LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
@@ -47,6 +39,7 @@ SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
 # What is summed over views, before the rest of the chain rule, which is each Gaussian's own.
 COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
+no_totals = zeros(TOTALS)
 
 
 @helper
@@ -187,7 +180,7 @@ def project_backward(
     Args:
         cameras: [view 20] float64.
         visible: [view gaussian] float32, 1 or 0.
-        gradients: [view band gaussian 16], written by `composite_backward` for the visible Gaussians.
+        gradients: [view band gaussian 16], written by `composite` for the visible Gaussians.
     """
     totals = np.empty((TOTALS, LANES), np.float32)
     for start in range(first, last, LANES):
@@ -209,11 +202,8 @@ def project_backward(
 
 @helper
 def sum_views(means, prepared, cameras, blur, visible, gradients, start, last, totals):
-    mean, root = lane_means(means, start, last), lane_roots(prepared, start, last)
-    zero = splat(ZERO)
-    red, green, blue, log_opacity, reached = zero, zero, zero, zero, zero
-    grad_mean = (zero, zero, zero)
-    grad_root = (zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    mean, root = lane_gaussians(means, prepared, start, last)
+    results = no_totals()
     for view in range(cameras.shape[0]):
         sums = lane_sums_of_view(visible[view], gradients[view], start, last)
         mask = sums[layout.REACHED] > ZERO
@@ -222,19 +212,16 @@ def sum_views(means, prepared, cameras, blur, visible, gradients, start, last, t
         camera = cameras[view]
         rotation = nine(camera, layout.ROTATION)
         slope_x, slope_y, inverse_z = slopes(mean, camera, rotation)
-        center_x, center_y, row_x, row_y, view_root = row_gradients(
+        center_x, center_y, row_x, row_y, grad_root = row_gradients(
             slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums
         )
         grad_point = point_gradient(
             camera, rotation, slope_x, slope_y, inverse_z, row_x, row_y, center_x, center_y, sums[layout.SUM_DEPTH]
         )
+        grad_mean = row_times_matrix(grad_point, rotation)
+        parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
         # Of lanes that are not reached, anything may have come out, NaN included.
-        grad_mean = add3(grad_mean, keep3(mask, row_times_matrix(grad_point, rotation)))
-        grad_root = add9(grad_root, keep9(mask, view_root))
-        red, green, blue = red + sums[0], green + sums[1], blue + sums[2]
-        log_opacity = log_opacity + sums[layout.SUM_S]
-        reached = max(reached, sums[layout.REACHED])
-    results = (red, green, blue, log_opacity) + grad_mean + grad_root + (reached,)  # noqa: RUF005
+        results = add_each(results, keep_each(mask, parts))
     for k in range(TOTALS):
         store(totals, k * LANES, results[k])
 

@@ -3,12 +3,15 @@
 import inspect
 import operator
 from collections.abc import Callable
+from itertools import product
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+
+from completesplat.rasterizers.kernels.array_layout import BLOCK_SHIFT
 
 LANES = 16
 FLAGS = ("contract", "nsz", "arcp", "reassoc", "afn")  # as in `compilation.OPTIONS`
@@ -23,33 +26,21 @@ _EXP2_POLYNOMIAL = (
 )
 
 
-class VectorType(types.Type):
-    """16 float32 lanes."""
+class LanesType(types.Type):
+    """16 numbers (float32) or booleans."""
 
-    def __init__(self) -> None:
-        super().__init__(name=f"Float32x{LANES}")
-
-
-class MaskType(types.Type):
-    """16 booleans."""
-
-    def __init__(self) -> None:
-        super().__init__(name=f"Mask{LANES}")
+    def __init__(self, name: str, element: Any) -> None:
+        super().__init__(name=f"{name}x{LANES}")
+        self.llvm = ir.VectorType(element, LANES)
 
 
-VECTOR, MASK = VectorType(), MaskType()
+VECTOR, MASK = LanesType("Float32", F32), LanesType("Mask", ir.IntType(1))
 
 
-@register_model(VectorType)
-class _VectorModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, type_: types.Type) -> None:
-        super().__init__(manager, type_, VECTOR_IR)
-
-
-@register_model(MaskType)
-class _MaskModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, type_: types.Type) -> None:
-        super().__init__(manager, type_, ir.VectorType(ir.IntType(1), LANES))
+@register_model(LanesType)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, type_: Any) -> None:
+        super().__init__(manager, type_, type_.llvm)  # type: ignore[no-untyped-call]
 
 
 def constant(values: Any) -> ir.Constant:
@@ -62,18 +53,17 @@ def uniform(value: float) -> ir.Constant:
     return constant([value] * LANES)
 
 
-def vector_function(result: types.Type) -> Callable[[Callable], Any]:
-    """Turn `emit(builder, *operands)`, which writes LLVM code for vectors and masks, into a function for kernels.
+def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Turn `emit(builder, *operands)`, which writes LLVM code, into a function for kernels with this type of result.
 
-    Scalars that a kernel passes to it are broadcast.
+    What a kernel passes to it arrives so: an array as the address of its first element, an integer as one of 64 bits,
+    any other scalar in every lane. A list of what it returns becomes a tuple. `result` may be a function of the
+    operands' types that returns the signature.
     """
 
-    def decorate(emit: Callable) -> Any:
+    def decorate(emit: Callable[..., Any]) -> Any:
         def function(typing_context: Any, *operands: Any) -> Any:
-            def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-                return emit(builder, *_broadcast_scalars(context, builder, signature, values))
-
-            return result(*operands), generate
+            return result(*operands), _generator(emit)
 
         function.__name__ = emit.__name__
         function.__signature__ = inspect.signature(emit)  # type: ignore[attr-defined]  # numba needs fixed operands
@@ -82,32 +72,42 @@ def vector_function(result: types.Type) -> Callable[[Callable], Any]:
     return decorate
 
 
-def _broadcast_scalars(context: Any, builder: Any, signature: Any, values: Any) -> list:
-    pairs = zip(values, signature.args, strict=True)
-    return [_broadcast(context, builder, v, t) if isinstance(t, types.Float) else v for v, t in pairs]
+def _generator(emit: Callable[..., Any]) -> Callable[..., Any]:
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        pairs = zip(values, signature.args, strict=True)
+        found = emit(builder, *(_operand(context, builder, value, type_) for value, type_ in pairs))
+        if isinstance(found, list):
+            return context.make_tuple(builder, signature.return_type, found)
+        return context.get_dummy_value() if signature.return_type == types.void else found
+
+    return generate
 
 
-def _broadcast(context: Any, builder: Any, value: Any, type_: types.Type) -> Any:
+def _operand(context: Any, builder: Any, value: Any, type_: Any) -> Any:
+    if isinstance(type_, types.Array):
+        return context.make_array(type_)(context, builder, value).data
+    if isinstance(type_, types.Integer):
+        return context.cast(builder, value, type_, types.intp)
+    if not isinstance(type_, types.Float):
+        return value
     undefined = ir.Constant(VECTOR_IR, ir.Undefined)
     scalar = context.cast(builder, value, type_, types.float32)
     first = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS_IR, [0] * LANES))
 
 
-def _define_operator(function: Callable, result: types.Type, emit: Callable) -> None:
-    @type_callable(function)
-    def typing(context: Any) -> Any:
-        def typer(a: Any, b: Any) -> Any:
-            valid = VECTOR in (a, b) and all(t == VECTOR or isinstance(t, types.Float) for t in (a, b))
-            return result if valid else None
+def _define_operator(function: Any, result: Any, emit: Callable[..., Any], kind: Any = VECTOR, count: int = 2) -> None:
+    """Give a Python operator of this number of operands its meaning for vectors, with scalars beside them, or masks."""
 
-        return typer
+    def type_of(*operands: Any) -> Any:
+        return result if kind in operands and all(t == kind or isinstance(t, types.Float) for t in operands) else None
 
-    def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return emit(builder, *_broadcast_scalars(context, builder, signature, values))
-
-    for kinds in ((VectorType, VectorType), (VectorType, types.Float), (types.Float, VectorType)):
-        lower_builtin(function, *kinds)(lower)
+    # numba needs fixed operands.
+    typer = (lambda a: type_of(a)) if count == 1 else (lambda a, b: type_of(a, b))
+    type_callable(function)(lambda context: typer)  # type: ignore[no-untyped-call]
+    for kinds in product((kind, types.Float), repeat=count):
+        if kind in kinds:
+            lower_builtin(function, *kinds)(_generator(emit))
 
 
 _define_operator(operator.add, VECTOR, lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
@@ -117,40 +117,26 @@ _define_operator(operator.truediv, VECTOR, lambda builder, a, b: builder.fdiv(a,
 _define_operator(operator.gt, MASK, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
 _define_operator(operator.ge, MASK, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
 _define_operator(operator.le, MASK, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
+_define_operator(operator.neg, VECTOR, lambda builder, a: builder.fneg(a), count=1)
+_define_operator(operator.and_, MASK, lambda builder, a, b: builder.and_(a, b), MASK)
 # Of two numbers of which one is NaN, these give the second, as the processors' own instructions do.
 _define_operator(max, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 _define_operator(min, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
-@type_callable(operator.neg)
-def _type_neg(context: Any) -> Any:
-    return lambda a: VECTOR if a == VECTOR else None
-
-
-@lower_builtin(operator.neg, VectorType)
-def _lower_neg(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    return builder.fneg(values[0])
-
-
-@type_callable(operator.and_)
-def _type_and(context: Any) -> Any:
-    return lambda a, b: MASK if a == MASK and b == MASK else None
-
-
-@lower_builtin(operator.and_, MaskType, MaskType)
-def _lower_and(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    return builder.and_(*values)
+def _vectors(count: int) -> Any:
+    return types.UniTuple(VECTOR, count)  # type: ignore[no-untyped-call]
 
 
 def lane_constant(values: Any) -> Any:
     """A function without arguments that returns these 16 lanes."""
     vector = constant(values)
+    return vector_function(VECTOR)(lambda builder: vector)
 
-    @vector_function(VECTOR)
-    def lanes(builder: Any) -> Any:
-        return vector
 
-    return lanes
+def zeros(count: int) -> Any:
+    """A function without arguments that returns a tuple of so many vectors of zeros."""
+    return vector_function(_vectors(count))(lambda builder: [uniform(0)] * count)
 
 
 @vector_function(VECTOR)
@@ -163,6 +149,18 @@ def splat(builder: Any, scalar: Any) -> Any:
 def keep(builder: Any, mask: Any, vector: Any) -> Any:
     """The vector where the mask is set, zero elsewhere."""
     return builder.select(mask, vector, uniform(0))
+
+
+@vector_function(lambda mask, vectors: vectors(mask, vectors))
+def keep_each(builder: Any, mask: Any, vectors: Any) -> Any:
+    """`keep` for every vector of a tuple."""
+    return [builder.select(mask, one, uniform(0)) for one in _unpack(builder, vectors)]
+
+
+@vector_function(lambda a, b: a(a, b))
+def add_each(builder: Any, a: Any, b: Any) -> Any:
+    """The sums of two tuples of vectors."""
+    return [builder.fadd(x, y, flags=FLAGS) for x, y in zip(_unpack(builder, a), _unpack(builder, b), strict=True)]
 
 
 @vector_function(types.boolean)
@@ -198,7 +196,7 @@ def exp2(builder: Any, x: Any) -> Any:
 @vector_function(VECTOR)
 def lane_sums(builder: Any, vectors: Any) -> Any:
     """From a tuple of up to 16 vectors, the vector whose lane i is the sum over all lanes of vector i; rest zero."""
-    rows = cgutils.unpack_tuple(builder, vectors)
+    rows = _unpack(builder, vectors)
     rows += [uniform(0)] * (LANES - len(rows))
     step = 1
     while len(rows) > 1:  # each round adds two lanes of every row and interleaves neighbouring rows
@@ -222,84 +220,78 @@ def lowest_bit(builder: Any, bits: Any) -> Any:
 
 def _call(builder: Any, name: str, result: ir.Type, *arguments: Any) -> Any:
     kind = ir.FunctionType(result, [a.type for a in arguments])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+    function = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
+    return builder.call(function, arguments)
 
 
-def _load(typing_context: Any, array: Any, offset: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return builder.load(_address(context, builder, signature, values), align=4)
-
-    return VECTOR(array, offset), emit
+def _unpack(builder: Any, values: Any) -> list[Any]:
+    return list(cgutils.unpack_tuple(builder, values))  # type: ignore[no-untyped-call]
 
 
-def _store(typing_context: Any, array: Any, offset: Any, vector: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.store(values[2], _address(context, builder, signature, values), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, offset, VECTOR), emit
+# None of the following checks bounds.
 
 
-def _address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    array = context.make_array(signature.args[0])(context, builder, values[0])
-    offset = context.cast(builder, values[1], signature.args[1], types.intp)
-    return builder.bitcast(builder.gep(array.data, [offset], inbounds=True), VECTOR_IR.as_pointer())
+@vector_function(VECTOR)
+def load(builder: Any, array: Any, offset: Any) -> Any:
+    """16 floats of a flat float32 array, from element `offset` on."""
+    return builder.load(_at(builder, array, offset, VECTOR_IR), align=4)
 
 
-def _store_shifted(typing_context: Any, array: Any, offset: Any, vector: Any, shift: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        whole = builder.fptosi(values[2], INTEGERS_IR)
-        places = ir.Constant(INTEGERS_IR, [shift.literal_value] * LANES)
-        address = _address(context, builder, signature, values)
-        builder.store(builder.ashr(whole, places), builder.bitcast(address, INTEGERS_IR.as_pointer()), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, offset, VECTOR, shift), emit
+@vector_function(types.void)
+def store(builder: Any, array: Any, offset: Any, vector: Any) -> None:
+    """The reverse of `load`."""
+    builder.store(vector, _at(builder, array, offset, VECTOR_IR), align=4)
 
 
-def _gather(typing_context: Any, array: Any, stride: Any, column: Any, start: Any, last: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        data = context.make_array(signature.args[0])(context, builder, values[0]).data
-        integers = [
-            context.cast(builder, v, t, types.intp) for v, t in zip(values[1:], signature.args[1:], strict=True)
-        ]
-        width, first_column, begin, end = integers
-        final = builder.sub(end, ir.Constant(end.type, 1))
-        vector = ir.Constant(VECTOR_IR, ir.Undefined)
-        for lane in range(LANES):
-            i = builder.add(begin, ir.Constant(begin.type, lane))
-            i = builder.select(builder.icmp_signed("<", i, final), i, final)
-            address = builder.gep(data, [builder.add(builder.mul(i, width), first_column)], inbounds=True)
-            vector = builder.insert_element(vector, builder.load(address), ir.Constant(I32, lane))
-        return vector
-
-    return VECTOR(array, stride, column, start, last), emit
+@vector_function(types.void)
+def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
+    """Pixels, truncated to integers, as the numbers of their blocks, to a flat int32 array."""
+    places = ir.Constant(INTEGERS_IR, [BLOCK_SHIFT] * LANES)
+    blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
+    builder.store(blocks, _at(builder, array, offset, INTEGERS_IR), align=4)
 
 
-def _transpose(typing_context: Any, rows: Any) -> Any:
-    def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        matrix = cgutils.unpack_tuple(builder, values[0])
-        for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
-            for i in (i for i in range(LANES) if not i & step):
-                a, b = matrix[i], matrix[i + step]
-                upper = [LANES + lane - step if lane & step else lane for lane in range(LANES)]
-                lower = [LANES + lane if lane & step else lane + step for lane in range(LANES)]
-                matrix[i] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, upper))
-                matrix[i + step] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, lower))
-        return context.make_tuple(builder, signature.return_type, matrix)
-
-    return types.UniTuple(VECTOR, LANES)(rows), emit
+def _at(builder: Any, array: Any, offset: Any, kind: Any) -> Any:
+    return builder.bitcast(builder.gep(array, [offset], inbounds=True), kind.as_pointer())
 
 
-# load(array, offset): 16 floats of a flat float32 array, from element `offset` on.
-# store(array, offset, vector): the reverse.
-# store_shifted(array, offset, vector, shift): the lanes, truncated to integers and shifted down, to a flat int32 array.
-# gather(array, stride, column, start, last): array[i * stride + column] of a flat array for i = start, ..., start + 15;
-# for i = last - 1 in the lanes beyond that.
-# None of them checks bounds.
-# transpose(rows): from a tuple of 16 vectors, the tuple whose vector i has lane i of each.
-load: Any = intrinsic(_load)
-store: Any = intrinsic(_store)
-store_shifted: Any = intrinsic(prefer_literal=True)(_store_shifted)
-gather: Any = intrinsic(_gather)
-transpose: Any = intrinsic(_transpose)
+def gather(count: int) -> Any:
+    """A function (array, stride, column, start, last) that returns so many neighbouring columns of a flat array.
+
+    The first is array[i * stride + column] for i = start, ..., start + 15, with last - 1 for any i beyond that.
+    """
+
+    @vector_function(_vectors(count))
+    def gather(builder: Any, array: Any, stride: Any, column: Any, start: Any, last: Any) -> Any:
+        vectors = [ir.Constant(VECTOR_IR, ir.Undefined)] * count
+        firsts = _rows(builder, stride, start, last)
+        for k, (lane, first) in product(range(count), enumerate(firsts)):
+            place = builder.add(builder.add(first, column), ir.Constant(first.type, k))
+            value = builder.load(builder.gep(array, [place], inbounds=True))
+            vectors[k] = builder.insert_element(vectors[k], value, ir.Constant(I32, lane))
+        return vectors
+
+    return gather
+
+
+@vector_function(_vectors(LANES))
+def transposed_rows(builder: Any, array: Any, stride: Any, start: Any, last: Any) -> Any:
+    """As `gather(16)` from column 0 on, by loads of whole rows."""
+    matrix = [
+        builder.load(_at(builder, array, first, VECTOR_IR), align=4) for first in _rows(builder, stride, start, last)
+    ]
+    for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
+        for i in (i for i in range(LANES) if not i & step):
+            a, b = matrix[i], matrix[i + step]
+            upper = [LANES + lane - step if lane & step else lane for lane in range(LANES)]
+            lower = [LANES + lane if lane & step else lane + step for lane in range(LANES)]
+            matrix[i] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, upper))
+            matrix[i + step] = builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, lower))
+    return matrix
+
+
+def _rows(builder: Any, stride: Any, start: Any, last: Any) -> list[Any]:
+    """Where the rows start, ..., start + 15 of a flat array begin; row last - 1 instead of those beyond it."""
+    final = builder.sub(last, ir.Constant(last.type, 1))
+    numbers = [builder.add(start, ir.Constant(start.type, lane)) for lane in range(LANES)]
+    return [builder.mul(builder.select(builder.icmp_signed("<", i, final), i, final), stride) for i in numbers]

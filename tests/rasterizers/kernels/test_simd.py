@@ -5,14 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from completesplat.rasterizers.kernels import blocks, simd
+from completesplat.rasterizers.kernels import composite, simd
 from completesplat.rasterizers.kernels.compilation import kernel
 from completesplat.rasterizers.kernels.simd import LANES
 
 exp2, keep, lane_sums, load, store = simd.exp2, simd.keep, simd.lane_sums, simd.load, simd.store
-any_lane, lowest_bit, gather, transpose = simd.any_lane, simd.lowest_bit, simd.gather, simd.transpose
-store_shifted = simd.store_shifted
-word_mask = blocks.word_mask
+any_lane, lowest_bit, store_blocks = simd.any_lane, simd.lowest_bit, simd.store_blocks
+gather, transposed_rows, word_mask = simd.gather(2), simd.transposed_rows, composite.word_mask
 LIMIT = np.float32(0.25)
 
 
@@ -34,30 +33,22 @@ def run_selects(values: np.ndarray, out: np.ndarray) -> bool:
     store(out, 0, min(a, LIMIT))
     store(out, LANES, max(a, LIMIT))
     store(out, 2 * LANES, keep((a > LIMIT) & (a <= np.float32(2)), a))
+    store(out, 3 * LANES, -a)
     return any_lane(a > np.float32(100))
 
 
 @kernel
-def run_negative(values: np.ndarray, out: np.ndarray) -> None:
-    store(out, 0, -load(values, 0))
-
-
-@kernel
 def run_gather(values: np.ndarray, start: int, last: int, out: np.ndarray) -> None:
-    store(out, 0, gather(values, 3, 2, start, last))
-
-
-@kernel
-def run_store_shifted(values: np.ndarray, out: np.ndarray) -> None:
-    store_shifted(out, 1, load(values, 0), 2)
-
-
-@kernel
-def run_transpose(values: np.ndarray, out: np.ndarray) -> None:
-    a, b, c = load(values, 0), load(values, LANES), load(values, 2 * LANES)
-    columns = transpose((a, b, c, a, b, c, a, b, c, a, b, c, a, b, c, a))
+    columns, rows = gather(values, 3, 1, start, last), transposed_rows(values, 16, start, last)
+    store(out, 0, columns[0])
+    store(out, LANES, columns[1])
     for i in range(LANES):
-        store(out, i * LANES, columns[i])
+        store(out, (2 + i) * LANES, rows[i])
+
+
+@kernel
+def run_store_blocks(values: np.ndarray, out: np.ndarray) -> None:
+    store_blocks(out, 1, load(values, 0))
 
 
 @kernel
@@ -93,13 +84,14 @@ def test_lane_sums(values: np.ndarray) -> None:
 def test_selects_and_the_treatment_of_nan(values: np.ndarray) -> None:
     a = values[:LANES].copy()
     a[3], a[5], a[6] = np.nan, np.inf, -np.inf
-    out = apply(run_selects, a, 3 * LANES).reshape(3, LANES)
+    out = apply(run_selects, a, 4 * LANES).reshape(4, LANES)
     with np.errstate(invalid="ignore"):
         assert np.array_equal(out[0], np.where(a < LIMIT, a, LIMIT))
         assert np.array_equal(out[1], np.where(a > LIMIT, a, LIMIT))
         assert np.array_equal(out[2], np.where((a > LIMIT) & (a <= 2), a, 0))
-    assert run_selects(a, np.empty(3 * LANES, np.float32))
-    assert not run_selects(np.full(LANES, 100, np.float32), np.empty(3 * LANES, np.float32))
+        assert np.array_equal(out[3], -a, equal_nan=True)
+    assert run_selects(a, np.empty(4 * LANES, np.float32))
+    assert not run_selects(np.full(LANES, 100, np.float32), np.empty(4 * LANES, np.float32))
 
 
 @pytest.mark.parametrize(("first", "last"), [(0, 0), (0, 63), (5, 9), (60, 70), (64, 127), (63, 128), (130, 140)])
@@ -111,25 +103,18 @@ def test_word_masks_hold_the_bits_of_their_columns(first: int, last: int) -> Non
         assert lowest == columns[0] - 64 * word
 
 
-def test_negative(values: np.ndarray) -> None:
-    assert np.array_equal(apply(run_negative, values, LANES), -values[:LANES])
-
-
 @pytest.mark.parametrize(("start", "last"), [(0, 16), (2, 16), (3, 4), (0, 30)])
-def test_gathered_columns_repeat_the_last_row(start: int, last: int) -> None:
-    table = np.arange(90, dtype=np.float32)
-    out = np.empty(LANES, np.float32)
-    run_gather(table, start, last, out)
-    assert out.tolist() == [3 * min(start + lane, last - 1) + 2 for lane in range(LANES)]
+def test_gathered_columns_and_rows_repeat_the_last_row(start: int, last: int) -> None:
+    table = np.arange(30 * 16, dtype=np.float32)
+    out = np.empty((2 + LANES, LANES), np.float32)
+    run_gather(table, start, last, out.reshape(-1))
+    rows = np.minimum(start + np.arange(LANES), last - 1)
+    assert np.array_equal(out[:2], table[: 3 * 160].reshape(-1, 3)[rows, 1:].T)
+    assert np.array_equal(out[2:], table.reshape(-1, 16)[rows].T)
 
 
-def test_shifted_lanes_are_whole_numbers() -> None:
+def test_pixels_become_the_numbers_of_their_blocks() -> None:
     values = np.linspace(-9.7, 40.2, LANES).astype(np.float32)
     out = np.full(LANES + 2, 77, np.int32)
-    run_store_shifted(values, out)
+    run_store_blocks(values, out)
     assert out.tolist() == [77, *(int(value) >> 2 for value in values), 77]
-
-
-def test_transpose(values: np.ndarray) -> None:
-    rows = values.reshape(3, LANES)[[i % 3 for i in range(LANES)]]
-    assert np.array_equal(apply(run_transpose, values, LANES * LANES).reshape(LANES, LANES), rows.T)
