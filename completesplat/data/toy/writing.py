@@ -31,7 +31,8 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
     """
     least = {"scenes": fewest, "frames": 2, "size": 8}
     if any(numbers[name] < number for name, number in least.items()):
-        raise DataError(f"{folder.name} need at least {least}, not {numbers}")
+        needed = ", ".join(f"{name} >= {number}" for name, number in least.items())
+        raise DataError(f"{folder.name} need {needed}, not {', '.join(str(numbers[name]) for name in least)}")
     parameters = {"format": FORMAT_VERSION, **numbers}
     if folder.exists():
         try:
