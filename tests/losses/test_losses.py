@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
@@ -10,7 +12,6 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.kl import KullbackLeibler
 from completesplat.losses.mse import MeanSquaredError
@@ -22,9 +23,8 @@ SHAPE = (2, 3, 3, 24, 24)
 
 
 def views(images: torch.Tensor) -> Views:
-    axes, size = images.shape[:2], images.shape[-1]
-    cameras = Cameras(torch.eye(4).expand(*axes, 4, 4), torch.eye(3).expand(*axes, 3, 3), (size, size))
-    return Views(images, cameras, torch.ones(*axes, 1, size, size))
+    batch, count, _, size, _ = images.shape
+    return replace(scene_batch(batch, count - 1, size=size).all_views(), images=images)
 
 
 def prediction(images: torch.Tensor, posterior: Posterior | None = None, **gaussians: float) -> Prediction:

@@ -1,16 +1,17 @@
 import copy
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from hydra.utils import instantiate
+from scenes_for_training import scene_batch
 from support import compose_config, some_gaussians
 from torch import nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 from vgg_weights import CONVOLUTIONS, digest
 
-from completesplat.geometry.cameras import Cameras
 from completesplat.losses import Prediction
 from completesplat.losses.lpips import URL, LearnedPerceptualSimilarity
 from completesplat.scene import Views
@@ -37,9 +38,8 @@ def prediction(images: torch.Tensor) -> Prediction:
 
 
 def views(images: torch.Tensor) -> Views:
-    batch = images.shape[:2]
-    cameras = Cameras(torch.eye(4).expand(*batch, 4, 4), torch.eye(3).expand(*batch, 3, 3), (32, 32))
-    return Views(images, cameras, torch.ones(*batch, 1, 32, 32))
+    batch, count, _, size, _ = images.shape
+    return replace(scene_batch(batch, count - 1, size=size).all_views(), images=images)
 
 
 def flat(pair: tuple[torch.Tensor, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
