@@ -16,15 +16,11 @@ def test_kl_agrees_with_torch_distributions():
     torch.testing.assert_close(posterior.kl(), kl_divergence(ours, prior))
 
 
-def test_samples_have_the_posteriors_moments():
+def test_samples_have_the_posteriors_moments_and_are_reparameterized():
     posterior = random_posterior()
     draws = torch.stack([posterior.sample(torch.Generator().manual_seed(i)) for i in range(4000)])
     torch.testing.assert_close(draws.mean(0), posterior.mean, atol=0.2, rtol=0)
     torch.testing.assert_close(draws.std(0) / posterior.std, torch.ones(3, 4, 2, 2), atol=0.06, rtol=0)
-
-
-def test_sampling_is_reparameterized():
-    posterior = random_posterior()
     mean = posterior.mean.clone().requires_grad_()
     Posterior(mean, posterior.log_variance).sample().sum().backward()
     torch.testing.assert_close(mean.grad, torch.ones_like(mean))

@@ -31,7 +31,7 @@ def assert_loaded(model, vae):
     assert all(torch.equal(loaded[name], expected[name]) for name in expected)
 
 
-def features_before_the_last_convolution(network, run):
+def before_the_last_convolution(network, run):
     seen = []
     hook = network.conv_out.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
     run()
@@ -40,42 +40,31 @@ def features_before_the_last_convolution(network, run):
 
 
 @torch.no_grad()
-def test_latents_and_decoder_features_are_the_vaes(vae, folder):
-    model = build(str(folder))
+def test_latents_and_decoder_features_are_the_vaes_and_all_but_head_and_skips_bit_for_bit(vae, folder):
+    model, random = build(str(folder)), build()
+    assert_loaded(model, vae)
     images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(2))
     posterior, features = model.encoder(images)
     expected = vae.encode(images * 2 - 1).latent_dist
     torch.testing.assert_close(posterior.mean, expected.mean)
     torch.testing.assert_close(posterior.log_variance, expected.logvar)
-    latent = expected.mean
-    ours = features_before_the_last_convolution(
-        model.reconstructor.network, lambda: model.reconstructor(latent, features)
-    )
-    theirs = features_before_the_last_convolution(vae.decoder, lambda: vae.decode(latent))
+    latent, reconstructor = expected.mean, model.reconstructor
+    ours = before_the_last_convolution(reconstructor.network, lambda: reconstructor(latent, features))
+    theirs = before_the_last_convolution(vae.decoder, lambda: vae.decode(latent))
     torch.testing.assert_close(ours, theirs)
+    head, untouched = reconstructor.network.conv_out, random.reconstructor.network.conv_out
+    assert torch.equal(head.weight, untouched.weight)
+    assert torch.equal(head.bias, untouched.bias)
+    assert not any(parameter.any() for parameter in reconstructor.skips.parameters())
 
 
-def test_head_and_skips_stay_as_initialised(folder):
-    loaded, random = build(str(folder)), build()
-    heads = [model.reconstructor.network.conv_out for model in (loaded, random)]
-    assert torch.equal(heads[0].weight, heads[1].weight)
-    assert torch.equal(heads[0].bias, heads[1].bias)
-    assert all(not parameter.any() for parameter in loaded.reconstructor.skips.parameters())
-
-
-def test_all_else_is_the_vaes_bit_for_bit(vae, folder):
+def test_a_pipelines_vae_and_a_bin_file_are_loaded(vae, folder):
+    (folder / "model_index.json").write_text("{}")
+    vae.save_pretrained(folder / "vae")
+    (folder / "config.json").rename(folder / "elsewhere.json")
     assert_loaded(build(str(folder)), vae)
-
-
-def test_a_pipelines_vae_is_found(vae, tmp_path):
-    (tmp_path / "model_index.json").write_text("{}")
-    vae.save_pretrained(tmp_path / "vae")
-    assert_loaded(build(str(tmp_path)), vae)
-
-
-def test_a_bin_file_is_loaded(vae, folder):
-    torch.save(vae.state_dict(), folder / BIN)
-    (folder / SAFETENSORS).unlink()
+    torch.save(vae.state_dict(), folder / "vae" / BIN)
+    (folder / "vae" / SAFETENSORS).unlink()
     assert_loaded(build(str(folder)), vae)
 
 

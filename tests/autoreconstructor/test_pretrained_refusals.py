@@ -26,11 +26,7 @@ def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "difference", "setting"),
     [
-        (
-            {"channels": (16, 16, 16, 16)},
-            "encoder.conv_in.weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here",
-            "channels=[8,8,16,16]",
-        ),
+        ({"channels": (16, 16, 16, 16)}, "weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here", "channels=[8,8,16,16]"),
         ({"layers_per_block": 2}, "resnets.1.norm1.weight is missing there", "layers_per_block=1"),
         ({"norm_groups": 8}, "4 groups and 8 here", "norm_groups=4"),  # every shape fits
     ],
@@ -48,15 +44,12 @@ def test_tensors_missing_or_too_many_are_named(folder):
     assert "decoder.mid_block.resnets.1.conv2.bias is missing there" in refusal(folder)
 
 
-@pytest.mark.parametrize("kept", [0, -1])
-def test_a_truncated_file_is_damaged(folder, kept):
+def test_a_truncated_file_is_damaged_and_a_bin_file_that_is_no_mapping_of_tensors_refused(vae, folder):
     path = folder / SAFETENSORS
-    path.write_bytes(path.read_bytes()[:kept])
-    assert f"{path}: damaged" in refusal(folder)
-
-
-def test_a_bin_file_that_is_no_mapping_of_tensors_is_refused(vae, folder):
-    (folder / SAFETENSORS).unlink()
+    for kept in (-1, 0):
+        path.write_bytes(path.read_bytes()[:kept])
+        assert f"{path}: damaged" in refusal(folder)
+    path.unlink()
     torch.save({"state_dict": vae.state_dict()}, folder / BIN)
     assert "not a mapping of names to tensors" in refusal(folder)
 
@@ -67,10 +60,7 @@ def test_a_folder_without_its_files_says_which_are_needed(folder, name):
     message = refusal(folder)
     assert message.startswith(f"{folder}: no config.json and {SAFETENSORS}")
     assert "hf download" in message
-
-
-def test_a_folder_that_is_not_there_is_no_hub_id(tmp_path):
-    assert f"{tmp_path / 'absent'}: no such folder" in refusal(tmp_path / "absent")
+    assert f"{folder / 'absent'}: no such folder" in refusal(folder / "absent")  # no id of the hub
 
 
 @pytest.mark.parametrize(

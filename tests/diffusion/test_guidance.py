@@ -24,18 +24,14 @@ def predicted(features):
     return Counting()(LATENT, STEP, features)
 
 
-@pytest.mark.parametrize(("weight", "features"), [(0.0, FEATURES), (1.0, torch.zeros_like(FEATURES))])
-def test_at_either_end_it_is_one_prediction_in_one_call(weight, features):
-    denoise = Counting()
-    torch.testing.assert_close(guided_noise(denoise, LATENT, STEP, FEATURES, weight), predicted(features))
-    assert (denoise.calls, denoise.samples) == (1, 2)
-
-
-@pytest.mark.parametrize("weight", [0.2, 0.5])
-def test_between_it_is_linear_and_the_customary_scale_is_one_minus_the_weight(weight):
-    guided = guided_noise(Counting(), LATENT, STEP, FEATURES, weight)
-    customary = torch.lerp(predicted(torch.zeros_like(FEATURES)), predicted(FEATURES), 1 - weight)
-    torch.testing.assert_close(guided, customary)
+def test_at_either_end_it_is_one_prediction_in_one_call_and_linear_between():
+    conditioned, free = predicted(FEATURES), predicted(torch.zeros_like(FEATURES))
+    for weight, expected in ((0.0, conditioned), (1.0, free)):
+        denoise = Counting()
+        torch.testing.assert_close(guided_noise(denoise, LATENT, STEP, FEATURES, weight), expected)
+        assert (denoise.calls, denoise.samples) == (1, 2)
+    guided = guided_noise(Counting(), LATENT, STEP, FEATURES, 0.2)
+    torch.testing.assert_close(guided, torch.lerp(free, conditioned, 0.8))  # one minus the weight: the customary scale
 
 
 @pytest.mark.parametrize("weight", [-0.1, 7.5, float("nan")])

@@ -15,7 +15,6 @@ from completesplat.errors import CompleteSplatError
 NOISE = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 DDIM = NOISE | {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "trailing"}
 NAMES = sorted(path.stem for path in (conf_folder() / "sampler").glob("[!_]*.yaml"))
-KINDS = ["ddim20", "dpm20", "unipc10"]
 MEAN, STD = 0.7, 0.5
 
 
@@ -47,30 +46,23 @@ def gaussian_noise(count: int) -> torch.Tensor:
     return torch.randn(count, 1, 4, 4, generator=torch.Generator().manual_seed(0))
 
 
-def exact_prediction(kind: str, at_solver: bool = False):
+def exact_prediction(kind: str, sampler: Sampler, at_solver: bool = False):
     """The best prediction for latents N(MEAN, STD^2), in closed form: of E[h | h_t], E[eps | h_t] or both.
 
     `at_solver`: for the solver's own noise level, which it rounds to a timestep before it asks.
     """
+    scheduler = sampler.scheduler
 
-    def of(sampler: Sampler):
-        scheduler = sampler.scheduler
+    def denoise(latent, timestep, conditioning):
+        bar = alpha_bar()[timestep].to(latent).view(-1, 1, 1, 1)
+        if at_solver:
+            bar = 1 / (1 + scheduler.sigmas[scheduler.step_index or 0].to(latent) ** 2)
+        surplus = (latent - bar.sqrt() * MEAN) / (bar * STD**2 + 1 - bar)
+        noise, clean = (1 - bar).sqrt() * surplus, MEAN + bar.sqrt() * STD**2 * surplus
+        velocity = bar.sqrt() * noise - (1 - bar).sqrt() * clean
+        return {"epsilon": noise, "sample": clean, "v_prediction": velocity}[kind]
 
-        def denoise(latent, timestep, conditioning):
-            bar = alpha_bar()[timestep].to(latent).view(-1, 1, 1, 1)
-            if at_solver:
-                bar = 1 / (1 + scheduler.sigmas[scheduler.step_index or 0].to(latent) ** 2)
-            surplus = (latent - bar.sqrt() * MEAN) / (bar * STD**2 + 1 - bar)
-            noise, clean = (1 - bar).sqrt() * surplus, MEAN + bar.sqrt() * STD**2 * surplus
-            velocity = bar.sqrt() * noise - (1 - bar).sqrt() * clean
-            return {"epsilon": noise, "sample": clean, "v_prediction": velocity}[kind]
-
-        return denoise
-
-    return of
-
-
-EPSILON = exact_prediction("epsilon")
+    return denoise
 
 
 def exact_result(noise: torch.Tensor) -> torch.Tensor:
@@ -88,29 +80,23 @@ def exact_result_of_solvers(noise: torch.Tensor) -> torch.Tensor:
 
 def error(sampler: Sampler, steps: int, exact=exact_result, at_solver: bool = False) -> float:
     noise = torch.linspace(-1.5, 1.5, 16, dtype=torch.float64).view(1, 1, 4, 4)
-    denoise = exact_prediction("epsilon", at_solver)(sampler)
-    drawn = sampler(denoise, noise, nothing(1).double(), steps=steps)
+    drawn = sampler(exact_prediction("epsilon", sampler, at_solver), noise, nothing(1).double(), steps=steps)
     return (drawn - exact(noise)).abs().max().item()
 
 
-def test_forward_noising_is_equation_two_and_diffusers(sampler):
+@pytest.mark.parametrize("name", NAMES)
+def test_forward_noising_is_equation_two_and_diffusers_with_every_sampler(name):
+    own = made(name)
+    assert own.training_timesteps == 1000
     torch.manual_seed(0)
     latent, noise = torch.randn(3, 4, 2, 2), torch.randn(3, 4, 2, 2)
     step = torch.tensor([0, 500, 999])
-    noisy = sampler.add_noise(latent, noise, step)
+    noisy = own.add_noise(latent, noise, step)
     bar = alpha_bar()[step].view(-1, 1, 1, 1).float()
     torch.testing.assert_close(noisy, bar.sqrt() * latent + (1 - bar).sqrt() * noise, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(noisy, DDPMScheduler(**NOISE).add_noise(latent, noise, step))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_training_is_the_same_with_every_sampler(name):
-    own = made(name)
-    assert own.training_timesteps == 1000
-    torch.testing.assert_close(own.scheduler.alphas_cumprod.double(), alpha_bar(), atol=1e-6, rtol=1e-5)
     assert torch.equal(own.scheduler.alphas_cumprod, made("ddim50").scheduler.alphas_cumprod)
-    latent, noise, step = torch.ones(2, 1, 1, 1), torch.full((2, 1, 1, 1), 2.0), torch.tensor([0, 999])
-    assert torch.equal(own.add_noise(latent, noise, step), made("ddim50").add_noise(latent, noise, step))
+    assert torch.equal(noisy, made("ddim50").add_noise(latent, noise, step))
 
 
 def test_one_step_is_ddims_equation(sampler):
@@ -126,7 +112,7 @@ def test_one_step_is_ddims_equation(sampler):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_exact_denoiser_gives_the_data_distribution(name, kind):
     own = made(name, f"sampler.scheduler.prediction_type={kind}")
-    drawn = own(exact_prediction(kind)(own), gaussian_noise(2000), nothing(2000))
+    drawn = own(exact_prediction(kind, own), gaussian_noise(2000), nothing(2000))
     # Pure noise stands for h_T, of which a little is signal: the mean comes out 0.03 too low even by the exact flow.
     assert abs(drawn.mean() - MEAN) < 0.04
     assert abs(drawn.mean() - exact_result(gaussian_noise(2000)).mean()) < 0.01
@@ -134,14 +120,14 @@ def test_an_exact_denoiser_gives_the_data_distribution(name, kind):
     assert abs(drawn.std() - STD) < {"ddim20": 0.08, "ddim50": 0.04}.get(name, 0.02)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["ddim20", "dpm20", "unipc10"])
 def test_more_steps_come_closer_to_the_exact_result(name):
     errors = [error(made(name), steps) for steps in (10, 20, 40)]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < errors[0] / 2
 
 
-@pytest.mark.parametrize("steps", [25, 50, 100])
+@pytest.mark.parametrize("steps", [25, 50])
 def test_ddim_is_of_first_order_and_dpm_solver_2m_of_second(steps):
     assert error(made("ddim50"), steps) / error(made("ddim50"), 2 * steps) == pytest.approx(2, rel=0.15)
     coarse, fine = (error(made("dpm20"), n, exact_result_of_solvers, at_solver=True) for n in (steps, 2 * steps))
@@ -149,7 +135,7 @@ def test_ddim_is_of_first_order_and_dpm_solver_2m_of_second(steps):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("steps", [1, 2, 5, None, 1000])
+@pytest.mark.parametrize("steps", [1, 2, None, 1000])
 def test_a_step_costs_one_call_of_the_whole_batch(name, steps):
     own, calls = made(name), []
     noise = gaussian_noise(3)
@@ -175,35 +161,28 @@ def test_steps_that_ddim_cannot_make_are_refused(sampler, steps):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_batch_gives_what_its_samples_give_alone(name):
-    own, noise = made(name), gaussian_noise(4)
-    together = own(EPSILON(own), noise, nothing(4))
-    alone = [own(EPSILON(own), noise[i : i + 1], nothing(1)) for i in range(4)]
-    torch.testing.assert_close(together, torch.cat(alone), atol=1e-6, rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
-def test_estimates_are_shown_at_every_step_and_the_last_is_the_result(name, kind):
+def test_estimates_are_shown_at_every_step_and_samples_do_not_depend_on_their_batch(name, kind):
     own, shown = made(name, f"sampler.scheduler.prediction_type={kind}"), []
-    noise = gaussian_noise(2)
-    drawn = own(exact_prediction(kind)(own), noise, nothing(2), on_step=lambda *step: shown.append(step))
+    noise, exact = gaussian_noise(2), exact_prediction(kind, own)
+    drawn = own(exact, noise, nothing(2), on_step=lambda *step: shown.append(step))
+    alone = [own(exact, noise[i : i + 1], nothing(1)) for i in range(2)]
+    torch.testing.assert_close(drawn, torch.cat(alone), atol=1e-6, rtol=1e-5)
     assert [step for step, _, _ in shown] == list(range(own.steps))
     assert shown[0][1] in (998, 999)  # UniPC rounds down
-    # DPM-Solver and UniPC place their levels between the timesteps.
+    # The last is the result; DPM-Solver and UniPC place their levels between the timesteps.
     tolerance = 1e-5 if name.startswith("ddim") else 5e-3
     torch.testing.assert_close(shown[-1][2], drawn, atol=tolerance, rtol=0)
     # The first is E[h | h_T], nearly the mean whatever the noise.
     assert (shown[0][2] - MEAN).abs().max() < 0.1
 
 
-@pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
+@pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
 def test_another_sampler_keeps_what_training_was_done_with(kind):
     trained = config("ddim50", f"sampler.scheduler.prediction_type={kind}", "sampler.scheduler.beta_end=0.02")
     merged = with_forward_process(config("dpm20"), trained)
     assert merged["scheduler"]["_target_"] == "diffusers.DPMSolverMultistepScheduler"
     assert merged["scheduler"]["use_lu_lambdas"]
     own = instantiate(merged, _convert_="all")
-    assert own.steps == 20
-    assert own.scheduler.config.prediction_type == kind
+    assert (own.steps, own.scheduler.config.prediction_type) == (20, kind)
     assert torch.equal(own.scheduler.alphas_cumprod, instantiate(trained).scheduler.alphas_cumprod)

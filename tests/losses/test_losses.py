@@ -1,14 +1,21 @@
+from dataclasses import replace
+
 import pytest
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
-from support import some_gaussians
+from hydra.utils import instantiate
+from lightning import Trainer
+from scenes_for_training import scene_batch
+from support import NETWORKS, compose_config, some_gaussians
+from torch.utils.data import DataLoader
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.geometry.cameras import Cameras
+from completesplat.errors import CompleteSplatError
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.kl import KullbackLeibler
 from completesplat.losses.mse import MeanSquaredError
+from completesplat.losses.regularizers import MeanOpacity, MeanScale
 from completesplat.losses.ssim import StructuralDissimilarity
 from completesplat.scene import Views
 
@@ -16,13 +23,12 @@ SHAPE = (2, 3, 3, 24, 24)
 
 
 def views(images: torch.Tensor) -> Views:
-    cameras = Cameras(torch.eye(4).expand(2, 3, 4, 4), torch.eye(3).expand(2, 3, 3, 3), (24, 24))
-    return Views(images, cameras, torch.ones(2, 3, 1, 24, 24))
+    batch, count, _, size, _ = images.shape
+    return replace(scene_batch(batch, count - 1, size=size).all_views(), images=images)
 
 
-def prediction(images: torch.Tensor, with_posterior: bool = True) -> Prediction:
-    posterior = Posterior(torch.ones(2, 4, 1, 1), torch.zeros(2, 4, 1, 1)) if with_posterior else None
-    return Prediction(images, some_gaussians(len(images)), posterior)
+def prediction(images: torch.Tensor, posterior: Posterior | None = None, **gaussians: float) -> Prediction:
+    return Prediction(images, some_gaussians(len(images), **gaussians), posterior)
 
 
 @pytest.fixture(scope="module")
@@ -31,40 +37,82 @@ def pair():
     return torch.rand(SHAPE, generator=generator), torch.rand(SHAPE, generator=generator)
 
 
-def test_ssim_of_equal_images_costs_nothing(pair):
-    assert StructuralDissimilarity()(prediction(pair[0]), views(pair[0])).item() == pytest.approx(0, abs=1e-5)
-
-
 def test_ssim_is_one_minus_torchmetrics_value(pair):
     """The two libraries differ at the border only: compare smooth images, on which the border has its mean value."""
     smooth = [torch.nn.functional.avg_pool2d(x.flatten(0, 1), 5, 1, 2, count_include_pad=False) for x in pair]
     ours = StructuralDissimilarity()(prediction(smooth[0].view(SHAPE)), views(smooth[1].view(SHAPE)))
     theirs = structural_similarity_index_measure(smooth[0], smooth[1], data_range=1.0)
     assert ours.item() == pytest.approx(1 - theirs.item(), abs=0.05)
-
-
-def test_kl_is_summed_over_the_latent_and_divided_by_the_values_of_a_picture(pair):
-    # N(1, 1) against N(0, 1) is 1/2 per element, of which there are four; a picture has 3 * 24 * 24 values.
-    value = KullbackLeibler()(prediction(pair[0]), views(pair[1])).item()
-    assert value == pytest.approx(2.0 / (3 * 24 * 24))
-    assert KullbackLeibler()(prediction(pair[0], with_posterior=False), views(pair[1])).item() == 0
+    assert StructuralDissimilarity()(prediction(pair[0]), views(pair[0])).item() == pytest.approx(0, abs=1e-5)
 
 
 @pytest.mark.parametrize("size", [16, 64])
 def test_kl_weighs_as_in_stable_diffusion_at_every_image_size(size):
     """There, sum of errors + 1e-6 * KL; divided by the 3 * H * W values of a picture, mean error + our term."""
-    shape = (1, 2, 3, size, size)
-    first, second = torch.rand(shape), torch.rand(shape)
-    mean, log_variance = torch.randn(1, 4, size // 8, size // 8), torch.randn(1, 4, size // 8, size // 8)
-    cameras = Cameras(torch.eye(4).expand(1, 2, 4, 4), torch.eye(3).expand(1, 2, 3, 3), (size, size))
-    truth = Views(second, cameras, torch.ones(1, 2, 1, size, size))
+    first, second = torch.rand(2, 1, 2, 3, size, size)
+    mean, log_variance = torch.randn(2, 1, 4, size // 8, size // 8)
     terms = {
         "mse": {"weight": 1.0, "term": MeanSquaredError()},
         "ssim": None,  # as good as not there
         "kl": {"weight": 1e-6, "term": KullbackLeibler()},
     }
-    total, values = WeightedSum(terms)(Prediction(first, some_gaussians(1), Posterior(mean, log_variance)), truth)
+    total, values = WeightedSum(terms)(prediction(first, Posterior(mean, log_variance)), views(second))
     theirs = DiagonalGaussianDistribution(torch.cat([mean, log_variance], dim=1)).kl().sum()
     assert set(values) == {"mse", "kl"}
     errors = (first - second).square().sum() / 2  # of one picture
     assert total.item() == pytest.approx(((errors + 1e-6 * theirs) / (3 * size * size)).item(), rel=1e-5)
+    assert KullbackLeibler()(prediction(first), views(second)).item() == 0  # without a posterior
+
+
+def test_regularizers_are_means_over_all_gaussians(pair):
+    predicted = prediction(pair[0], scale=0.3, opacity=0.7)
+    assert MeanScale()(predicted, views(pair[1])).item() == pytest.approx(0.3)
+    assert MeanOpacity()(predicted, views(pair[1])).item() == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize("name", ["scale", "opacity"])
+def test_a_regularizer_is_on_when_it_has_a_weight(name):
+    off = instantiate(compose_config("fit").loss, _convert_="all")
+    on = instantiate(compose_config("fit", f"loss.terms.{name}.weight=0.01").loss, _convert_="all")
+    assert set(on.terms) - set(off.terms) == {name}
+    assert on.terms[name].weight == 0.01
+
+
+class Constant:
+    """A term that counts how often it is computed."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+        self.calls = 0
+
+    def __call__(self, prediction: Prediction, truth: Views) -> torch.Tensor:
+        self.calls += 1
+        return torch.tensor(self.value)
+
+
+@pytest.mark.parametrize(("step", "total", "names"), [(0, 0.5, {"a"}), (9, 0.5, {"a"}), (10, 6.5, {"a", "b"})])
+def test_a_term_takes_part_from_its_start_step(pair, step, total, names):
+    late = Constant(3.0)
+    terms = {"a": {"weight": 0.5, "term": Constant(1.0)}, "b": {"weight": 2.0, "term": late, "start_step": 10}}
+    found, values = WeightedSum(terms)(prediction(pair[0]), views(pair[1]), step)
+    assert found.item() == pytest.approx(total)
+    assert set(values) == names
+    assert late.calls == ("b" in names)
+
+
+@pytest.mark.parametrize("term", [None, {"weight": 0.0}, {"weight": 1.0, "start_step": 1}])
+def test_a_sum_with_nothing_at_step_zero_is_refused(term):
+    with pytest.raises(CompleteSplatError, match="start_step=0"):
+        WeightedSum({"a": term and {"term": Constant(1.0), **term}})
+
+
+def test_training_counts_the_steps_of_the_optimizer():
+    late = Constant(0.0)
+    terms = {"mse": {"weight": 1.0, "term": MeanSquaredError()}, "late": {"weight": 1.0, "term": late, "start_step": 2}}
+    config = compose_config("fit", "model=var", "rasterizer=reference", *NETWORKS)
+    module = instantiate(config.model, _convert_="all")
+    module.loss = WeightedSum(terms)
+    quiet = {"accelerator": "cpu", "enable_progress_bar": False, "enable_model_summary": False}
+    trainer = Trainer(max_steps=3, accumulate_grad_batches=2, logger=False, enable_checkpointing=False, **quiet)
+    trainer.fit(module, DataLoader([scene_batch()] * 8, batch_size=None, collate_fn=lambda batch: batch))
+    assert (trainer.global_step, late.calls) == (3, 2)  # the batches of the third step

@@ -28,6 +28,13 @@ def scenes(batch: int, targets: int, first: int = 0) -> SceneBatch:
     return SceneBatch(views(batch), views(batch, targets), depth_range, visible, frames, names)
 
 
+def evaluated(images: torch.Tensor, **settings) -> dict:
+    """Results of one scene's views, [view 3 height width], of which the first is the reference."""
+    evaluation = Evaluation(**settings)
+    evaluation.update("model", images[None], scenes(1, len(images) - 1))
+    return evaluation.results()["model"]
+
+
 def test_views_are_averaged_within_scenes_before_scenes_are():
     evaluation = Evaluation()
     for targets, error in ((1, 0.1), (3, 0.01)):
@@ -38,42 +45,29 @@ def test_views_are_averaged_within_scenes_before_scenes_are():
     assert (results["scenes"], results["views"]) == (2, 4)
 
 
-def test_reference_and_novel_views_are_apart():
-    images = torch.full((1, 3, 3, 16, 16), 0.5)
-    images[:, 0] += 0.1
-    evaluation = Evaluation()
-    evaluation.update("model", images, scenes(1, 2))
-    results = evaluation.results()["model"]["full"]
-    assert results["reference"]["psnr"] == pytest.approx(20, abs=1e-3)
+def test_reference_and_novel_views_are_apart_and_values_out_of_range_are_clipped():
+    images = torch.full((3, 3, 16, 16), 0.5)
+    images[0] = 7.0
+    results = evaluated(images)["full"]
+    assert results["reference"]["psnr"] == pytest.approx(-10 * math.log10(0.25), abs=1e-3)
     assert results["novel"]["psnr"] == 100
 
 
 def test_object_scores_ignore_the_background():
-    images = torch.full((1, 2, 3, 16, 16), 0.6)
+    images = torch.full((2, 3, 16, 16), 0.6)
     images[..., 8:, :] = 0.0
-    evaluation = Evaluation()
-    evaluation.update("model", images, scenes(1, 1))
-    results = evaluation.results()["model"]
+    results = evaluated(images)
     # An error of 0.1 on the object's half of the image, both backgrounds black.
     assert results["object"]["novel"]["psnr"] == pytest.approx(-10 * math.log10(0.01 / 2), abs=1e-3)
     assert results["full"]["novel"]["psnr"] == pytest.approx(-10 * math.log10((0.01 + 0.25) / 2), abs=1e-3)
 
 
-def test_values_out_of_range_are_clipped():
-    images = torch.full((1, 2, 3, 16, 16), 7.0)
-    evaluation = Evaluation()
-    evaluation.update("model", images, scenes(1, 1))
-    assert evaluation.results()["model"]["full"]["novel"]["psnr"] == pytest.approx(-10 * math.log10(0.25), abs=1e-3)
-
-
 def test_the_precision_of_networks_is_not_that_of_metrics():
-    generator = torch.Generator().manual_seed(0)
     batch = scenes(1, 1)
-    images = 0.5 + 0.02 * torch.rand(1, 2, 3, 16, 16, generator=generator)
-    seen = SceneBatch(**{**vars(batch), "targets": Views(images[:, 1:], batch.targets.cameras, batch.targets.masks)})
+    images = 0.5 + 0.02 * torch.rand(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
     evaluation = Evaluation()
     with torch.autocast("cpu", torch.bfloat16):
-        evaluation.update("model", images, seen)
+        evaluation.update("model", images, replace(batch, targets=replace(batch.targets, images=images[:, 1:])))
     assert evaluation.results()["model"]["full"]["novel"]["ssim"] == pytest.approx(1, abs=1e-4)
 
 
@@ -95,11 +89,9 @@ def test_of_several_samples_the_first_the_best_and_the_mean_are_told():
 
 
 def test_the_best_is_chosen_by_the_criterion():
-    generator = torch.Generator().manual_seed(0)
-    batch = scenes(1, 1)
-    texture = 0.2 * torch.rand(1, 2, 3, 16, 16, generator=generator)
-    truth = batch.all_views()[0]
-    object.__setattr__(truth, "images", truth.images + texture[0])
+    truth = scenes(1, 1).all_views()[0]
+    texture = 0.2 * torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    truth = replace(truth, images=truth.images + texture)
     flat, brighter = torch.full((2, 3, 16, 16), 0.6), truth.images + 0.15
     chosen = {}
     for criterion in ("psnr", "ssim"):
@@ -110,44 +102,15 @@ def test_the_best_is_chosen_by_the_criterion():
     assert chosen == {"psnr": True, "ssim": False}
 
 
-@pytest.mark.parametrize("count", [1, 2, 5])
-def test_scenes_that_two_processes_scored_count_once_and_as_in_one(monkeypatch, count):
-    def scored(names: list[int]) -> Evaluation:
-        evaluation = Evaluation(samples=2, sets={"swd": Patches(patches=2)})
-        for index in names:
-            images = torch.rand(2, 3, 3, 16, 16, generator=torch.Generator().manual_seed(index))
-            evaluation.update_samples(f"scene {index}", images, scenes(1, 2).all_views()[0])
-        return evaluation
-
-    alone, first, second = (
-        scored(list(range(count))),
-        scored(list(range(0, count, 2))),
-        scored(list(range(1, count, 2))),
-    )
-    second.skipped = 1
-    second.update_samples("scene 0", torch.rand(2, 3, 3, 16, 16), scenes(1, 2).all_views()[0])  # padding, as it were
-    states = [(e.scores, e.views, e.drawn, e.sets.kept, e.skipped) for e in (second, first)]
-    monkeypatch.setattr("completesplat.metrics.scoring.gathered", lambda own: states)
-    first.gather()
-    assert first.results() == alone.results()
-    assert first.results()["model"]["scenes"] == count
-    assert first.skipped == 1
-
-
 def test_the_same_pictures_have_the_same_scores_whatever_the_seed():
-    images = torch.rand(1, 3, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    found = []
-    for seed in (0, 1):
-        evaluation = Evaluation(seed=seed, sets={"swd": Patches(patches=2)})
-        evaluation.update("copy_reference", images, scenes(1, 2))
-        found.append(evaluation.results())
-    assert found[0] == found[1]
+    images = torch.rand(3, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    first, second = (evaluated(images, seed=seed, sets={"swd": Patches(patches=2)}) for seed in (0, 1))
+    assert first == second
 
 
 def test_what_is_missing_is_named_and_has_no_figure():
-    evaluation = Evaluation(
-        perceptual=Missing("no weights", ("lpips",)), sets={"inception": Missing("none here", ("fid", "kid"))}
-    )
+    absent = {"inception": Missing("none here", ("fid", "kid"))}
+    evaluation = Evaluation(perceptual=Missing("no weights", ("lpips",)), sets=absent)
     evaluation.update("model", torch.full((1, 2, 3, 16, 16), 0.5), scenes(1, 1))
     assert evaluation.missing == {"lpips": "missing: no weights"} | dict.fromkeys(("fid", "kid"), "missing: none here")
     assert set(evaluation.results()["model"]["full"]["novel"]) == {"psnr", "ssim"}
@@ -158,10 +121,7 @@ def test_what_is_missing_is_named_and_has_no_figure():
     [
         ({"samples": 0}, "samples=0: must be at least 1"),
         ({"criterion": "beauty"}, "criterion=beauty: choose one of psnr, ssim"),
-        (
-            {"criterion": "lpips", "perceptual": Missing("no weights", ("lpips",))},
-            "criterion=lpips: missing: no weights",
-        ),
+        ({"criterion": "lpips", "perceptual": Missing("no weights", ("lpips",))}, "criterion=lpips: missing"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(settings, said):
@@ -171,20 +131,17 @@ def test_settings_without_a_meaning_are_refused(settings, said):
 
 def test_depth_is_scored_where_the_truth_is_known():
     evaluation = Evaluation()
-    true = torch.full((3, 1, 16, 16), 2.0)
+    true, masks, predicted = torch.full((3, 1, 16, 16), 2.0), torch.zeros(3, 1, 16, 16), torch.full((3, 1, 16, 16), 2.2)
     true[1, :, :, 8:] = 0  # unknown
     true[2] = 0
-    masks = torch.zeros(3, 1, 16, 16)
     masks[..., :8, :] = 1
-    predicted = torch.full((3, 1, 16, 16), 2.2)
     predicted[:, :, 8:] = 4.0
     predicted[1, :, :, 8:] = 99.0
     evaluation.update("model", torch.full((1, 3, 3, 16, 16), 0.5), scenes(1, 2))
     evaluation.update_depth("scene 0", predicted, replace(scenes(1, 2).all_views()[0], depths=true, masks=masks))
     full, of_object = (evaluation.results()["model"][region]["novel"] for region in ("full", "object"))
-    assert full["depth_abs_rel"] == pytest.approx((0.1 + 1) / 2)
-    assert of_object["depth_abs_rel"] == pytest.approx(0.1)
-    assert (full["depth_delta1"], of_object["depth_delta1"]) == (pytest.approx(0.5), pytest.approx(1))
+    assert (full["depth_abs_rel"], of_object["depth_abs_rel"]) == pytest.approx(((0.1 + 1) / 2, 0.1))
+    assert (full["depth_delta1"], of_object["depth_delta1"]) == pytest.approx((0.5, 1))
     assert evaluation.results()["model"]["object"]["reference"]["depth_rmse"] == pytest.approx(0.2)
 
 
@@ -193,10 +150,8 @@ SCORES = [21.5, 19.0, 24.25, 19.0, 22.75, -3.0]
 
 @pytest.mark.parametrize(("higher_is_better", "chosen"), [(True, max), (False, min)])
 def test_the_curve_is_the_mean_best_of_all_choices(higher_is_better, chosen):
-    expected = []
-    for j in range(1, len(SCORES) + 1):
-        among = [chosen(choice) for choice in combinations(SCORES, j)]
-        expected.append(sum(among) / len(among))
+    among = [[chosen(choice) for choice in combinations(SCORES, j)] for j in range(1, len(SCORES) + 1)]
+    expected = [sum(best) / len(best) for best in among]
     assert expected_best_curve(SCORES, higher_is_better) == pytest.approx(expected, rel=1e-12)
 
 
@@ -217,32 +172,33 @@ def test_without_numbers_nothing_is_best(function, scores):
 def test_diversity_is_the_mean_difference_of_all_pairs():
     images = torch.tensor([0.1, 0.2, 0.5]).view(3, 1, 1, 1, 1).expand(3, 2, 3, 4, 4)
     assert diversity(images) == pytest.approx((0.1 + 0.4 + 0.3) / 3)
-    assert diversity(images[:1].expand(3, 2, 3, 4, 4)) == 0
-
-
-def test_one_sample_has_no_diversity():
     with pytest.raises(ValueError, match="two samples"):
-        diversity(torch.zeros(1, 2, 3, 4, 4))
+        diversity(images[:1])
 
 
 def images(*rows: list[float]) -> torch.Tensor:
     return torch.tensor(rows)[:, None, None]
 
 
-def test_errors_are_those_of_a_worked_example():
+def everywhere(depth: torch.Tensor) -> torch.Tensor:
+    return torch.ones_like(depth, dtype=torch.bool)
+
+
+def test_errors_are_those_of_a_worked_example_and_a_pixel_without_prediction_is_wrong():
     true, predicted = images([1.0, 2.0, 4.0, 5.0]), images([1.5, 2.0, 3.0, 6.0])
-    (errors,) = depth_errors(predicted, true, torch.ones(1, 1, 1, 4, dtype=torch.bool))
+    (errors,) = depth_errors(predicted, true, everywhere(true))
     assert errors["abs_rel"] == pytest.approx((0.5 + 0 + 0.25 + 0.2) / 4)
     assert errors["rmse"] == pytest.approx(math.sqrt((0.25 + 0 + 1 + 1) / 4))
-    # Ratios 1.5, 1, 1.33 and 1.2.
-    assert errors["delta1"] == 0.5
+    assert errors["delta1"] == 0.5  # ratios 1.5, 1, 1.33 and 1.2
+    for nothing in (0.0, -1.0):
+        (errors,) = depth_errors(images([nothing]), images([1.0]), everywhere(images([1.0])))
+        assert errors == {"abs_rel": 1 - nothing, "rmse": 1 - nothing, "delta1": 0}
 
 
 def test_a_common_scale_is_an_error_of_that_scale():
     true = 1 + torch.rand(2, 1, 8, 8, generator=torch.Generator().manual_seed(0))
-    everywhere = torch.ones_like(true, dtype=torch.bool)
     for scale, within in ((1.2, 1.0), (1 / 1.2, 1.0), (1.44, 0.0), (1 / 1.44, 0.0)):
-        for errors, depth in zip(depth_errors(scale * true, true, everywhere), true, strict=True):
+        for errors, depth in zip(depth_errors(scale * true, true, everywhere(true)), true, strict=True):
             assert errors["abs_rel"] == pytest.approx(abs(scale - 1), rel=1e-5)
             assert errors["rmse"] == pytest.approx(abs(scale - 1) * depth.square().mean().sqrt().item(), rel=1e-5)
             assert errors["delta1"] == within
@@ -253,19 +209,8 @@ def test_pixels_that_do_not_count_may_hold_anything():
     true = images([1.0, 2.0, nan, 0.0, inf, 3.0])
     predicted = images([2.0, 2.0, 1.0, 1.0, 1.0, nan])
     valid = torch.tensor([True, True, True, True, True, False])[None, None, None]
-    assert depth_errors(predicted, true, valid) == depth_errors(
-        predicted[..., :2], true[..., :2], torch.ones(1, 1, 1, 2, dtype=torch.bool)
-    )
-
-
-def test_an_image_without_valid_pixels_has_no_errors():
-    depth = torch.ones(3, 1, 2, 2)
-    valid = torch.zeros(3, 1, 2, 2, dtype=torch.bool)
-    valid[1] = True
-    assert depth_errors(depth, depth, valid) == [None, {"abs_rel": 0, "rmse": 0, "delta1": 1}, None]
-
-
-def test_a_pixel_without_prediction_is_wrong():
-    for nothing in (0.0, -1.0):
-        (errors,) = depth_errors(images([nothing]), images([1.0]), torch.ones(1, 1, 1, 1, dtype=torch.bool))
-        assert errors == {"abs_rel": 1 - nothing, "rmse": 1 - nothing, "delta1": 0}
+    counted = true[..., :2]
+    assert depth_errors(predicted, true, valid) == depth_errors(predicted[..., :2], counted, everywhere(counted))
+    depth = torch.ones(2, 1, 2, 2)
+    valid = torch.stack([torch.zeros(1, 2, 2), torch.ones(1, 2, 2)]).bool()
+    assert depth_errors(depth, depth, valid) == [None, {"abs_rel": 0, "rmse": 0, "delta1": 1}]

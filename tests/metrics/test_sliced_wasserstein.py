@@ -55,14 +55,16 @@ def test_the_filter_is_burt_and_adelsons():
     np.testing.assert_allclose(laplacian_pyramid(image)[1][0].numpy(), blurred[:, ::2, ::2], atol=1e-12)
 
 
-def test_descriptors_are_patches_of_the_levels(images):
+def test_descriptors_are_patches_of_the_levels_however_a_set_is_split(images):
     described = descriptors(images[:2], SEEDS[:2], patches=5)
-    for level, patches in zip(laplacian_pyramid(images[:2]), described, strict=True):
+    parts = zip(*(descriptors(images[i : i + 1], SEEDS[i : i + 1], patches=5) for i in range(2)), strict=True)
+    for level, patches, pieces in zip(laplacian_pyramid(images[:2]), described, parts, strict=True):
         assert patches.shape == (10, 147)
         for i, patch in enumerate(patches.view(2, 5, 3, 7, 7).flatten(0, 1)):
             windows = level[i // 5].unfold(1, 7, 1).unfold(2, 7, 1).movedim(0, 2)
             assert (windows == patch).all((2, 3, 4)).sum() >= 1
         assert len(patches.unique(dim=0)) == 10
+        torch.testing.assert_close(patches, torch.cat(pieces))
 
 
 def test_patches_lie_anywhere_with_equal_chance():
@@ -72,24 +74,16 @@ def test_patches_lie_anywhere_with_equal_chance():
         places = (16 * patches.view(4000, 3, 7, 7)[:, 0, 3, 3]).round().int() - 3
         counts = torch.bincount(places, minlength=10)
         assert len(counts) == 10
-        # Binomial deviation 19.
-        assert (counts - 400).abs().max() < 95
-
-
-def test_descriptors_do_not_depend_on_how_a_set_is_split(images):
-    whole = descriptors(images, SEEDS, patches=16)
-    parts = [descriptors(images[part], SEEDS[part], patches=16) for part in (slice(0, 3), slice(3, 8))]
-    for level, pieces in zip(whole, zip(*parts, strict=True), strict=True):
-        torch.testing.assert_close(level, torch.cat(pieces))
+        assert (counts - 400).abs().max() < 95  # binomial deviation 19
 
 
 def test_equal_sets_have_no_distance_in_any_order(images):
-    true = descriptors(images, SEEDS, patches=16)
     order = torch.randperm(8, generator=generator()).tolist()
+    noisy = images + 0.1 * torch.rand(images.shape, generator=generator())
+    true, noisy = (descriptors(x, SEEDS, patches=16) for x in (images, noisy))
     shuffled = descriptors(images[order], [SEEDS[i] for i in order], patches=16)
     assert sliced_wasserstein(true, true) == 0
     assert sliced_wasserstein(true, shuffled) == pytest.approx(0, abs=1e-3)
-    noisy = descriptors(images + 0.1 * torch.rand(images.shape, generator=generator()), SEEDS, patches=16)
     distance = sliced_wasserstein(true, noisy)
     assert sliced_wasserstein(shuffled, noisy) == pytest.approx(distance, rel=1e-4)
     assert sliced_wasserstein(noisy, true) == pytest.approx(distance, rel=1e-6)
@@ -109,9 +103,7 @@ def test_brightness_and_contrast_of_a_whole_sets_channel_do_not_count(images):
     factor, offset = torch.tensor([0.5, 0.9, 0.7]).view(3, 1, 1), torch.tensor([0.2, 0.0, 0.1]).view(3, 1, 1)
     true, changed = (descriptors(x, SEEDS, patches=16) for x in (images, factor * images + offset))
     assert sliced_wasserstein(true, changed) == pytest.approx(0, abs=0.05)
-
-
-def test_rounding_is_not_taken_for_a_pattern(images):
+    # Nor is rounding taken for a pattern.
     one, other = (descriptors(torch.full((2, 3, 64, 64), grey), [1, 2], patches=8) for grey in (0.3, 0.7))
     assert 0 <= sliced_wasserstein(one, other) < 10
     assert math.isfinite(sliced_wasserstein(one, descriptors(images[:2], [1, 2], patches=8)))

@@ -21,18 +21,16 @@ PROTOCOL = {
     "views": 80,
     "samples": 1,
     "sampler": None,
-    "checkpoint": {"path": "somewhere/last.ckpt", "sha256": "c0ffee" * 10, "step": 900},
     "data_fingerprint": "f00d" * 8,
-    "commit": "badcafe",
     "missing": {"lpips": "missing: no weights of VGG"},
 }
 
 
-def entry(psnr: float, **others: Any) -> dict[str, Any]:
+def entry(psnr: float) -> dict[str, Any]:
     """A predictor's scores, PSNR of novel views given."""
     full = {"novel": {"psnr": psnr, "ssim": 0.5}, "reference": {"psnr": psnr + 5, "ssim": 0.75}}
     same = {"novel": {"psnr": psnr + 1, "ssim": 0.625}, "reference": {"psnr": psnr + 6, "ssim": 0.875}}
-    return {"scenes": 20, "views": 80, "full": full, "object": same} | others
+    return {"scenes": 20, "views": 80, "full": full, "object": same}
 
 
 Write = Callable[..., Path]
@@ -47,14 +45,14 @@ def runs(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(runs: Path) -> Write:
-    """Writes the results of one test; the model's PSNR, entries of other predictors, and changes to the protocol."""
+    """Writes the results of one test: PSNR of the model and of other predictors, and changes to the protocol."""
 
-    def write(folder: str, psnr: float, others: dict[str, Any] | None = None, /, **protocol: Any) -> Path:
-        seconds = {"inference": 0.0157, "rendering": 246.0}
-        results = {"protocol": PROTOCOL | protocol, "model": entry(psnr, seconds=seconds), **(others or {})}
+    def write(folder: str, psnr: float, others: dict[str, float] | None = None, /, **protocol: Any) -> Path:
+        model = entry(psnr) | {"seconds": {"inference": 0.0157, "rendering": 246.0}}
+        predictors = {name: entry(value) for name, value in (others or {}).items()}
         path = runs / folder / "metrics.json"
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(results))
+        path.write_text(json.dumps({"protocol": PROTOCOL | protocol, "model": model, **predictors}))
         return path
 
     return write
@@ -62,7 +60,6 @@ def run(runs: Path) -> Write:
 
 COMMAND = ["completesplat fit", "-m", "experiment=small", "ablation=full,no_skips", "data.root=/home/someone/data/set"]
 CONFIG = {"seed": 0, "batch": 1, "out": "", "data": {"root": ""}, "model": {}, "trainer": {"max_steps": 9}}
-NAIVE = {"mean_image": 15.0, "copy_reference": 12.0}
 
 
 def predictor(full_novel_psnr: float, scenes: int = 40, **others: float) -> dict[str, Any]:
@@ -87,13 +84,8 @@ class Sweep:
         job.mkdir(parents=True)
         self.count += 1
         OmegaConf.save(OmegaConf.create(CONFIG), job / "config.yaml")
-        given = [
-            "experiment=small",
-            *overrides,
-            "data.root=/home/someone/data/set",
-            f"out={self.folder}",
-            "ckpt_path=last",
-        ]
+        own = ["data.root=/home/someone/data/set", f"out={self.folder}", "ckpt_path=last"]
+        given = ["experiment=small", *overrides, *own]
         record = {"command": COMMAND, "commit": commit, "overrides": given}
         (job / "run.json").write_text(json.dumps(record))
         if test is not None:
@@ -103,7 +95,7 @@ class Sweep:
 
     def scored(self, *overrides: str, psnr: float, scenes: int = 40, steps: int = 9, **others: float) -> Path:
         """A finished job, with both naive predictors."""
-        naive = {name: predictor(value, scenes) for name, value in NAIVE.items()}
+        naive = {"mean_image": predictor(15.0, scenes), "copy_reference": predictor(12.0, scenes)}
         return self.add(*overrides, test={"model": predictor(psnr, scenes, **others)} | naive, steps=steps)
 
     def plan(self, overrides: Sequence[str]) -> None:

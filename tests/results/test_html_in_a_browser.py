@@ -65,45 +65,35 @@ def level(shown, index: int = 0) -> float:
     return pixels[height // 4 : -height // 4, width // 4 : -width // 4].mean().item()
 
 
-def test_nothing_is_wider_than_the_page(opened):
+def test_nothing_is_wider_than_the_page_and_all_pictures_are_drawn(opened):
     width, window = opened.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert width <= window
     scrolled = "[...document.querySelectorAll('.scroll')].some(box => box.scrollWidth > box.clientWidth)"
     assert opened.evaluate(scrolled)  # so there was something too wide
-
-
-def test_all_pictures_are_drawn(opened):
     assert opened.evaluate("Promise.all([...document.images].map(image => image.decode())).then(() => true)")
 
 
-@pytest.mark.parametrize("frame", [0, 5, FRAMES - 1])
-def test_the_mouse_turns_all_samples_of_a_scene(opened, frame):
-    box = opened.locator(".turntable").nth(1)
+def place(shown, index: int, frame: int) -> tuple[float, float]:
+    """Where a sample is touched to show a frame."""
+    box = shown.locator(".turntable").nth(index)
     box.scroll_into_view_if_needed()
     size = box.bounding_box()
-    opened.mouse.move(size["x"] + size["width"] * (frame + 0.5) / FRAMES, size["y"] + size["height"] / 2)
-    for sample in range(3):
-        assert level(opened, sample) == pytest.approx(255 * grey(sample, frame), abs=8)
+    return size["x"] + size["width"] * (frame + 0.5) / FRAMES, size["y"] + size["height"] / 2
 
 
-def test_a_finger_turns_them_too(opened):
-    box = opened.locator(".turntable").first
-    box.scroll_into_view_if_needed()
-    size = box.bounding_box()
-    opened.touchscreen.tap(size["x"] + size["width"] * 7.5 / FRAMES, size["y"] + size["height"] / 2)
-    assert box.get_attribute("aria-valuenow") == "7"
+def test_mouse_and_finger_turn_all_samples_of_a_scene(opened):
+    for frame in (0, 5, FRAMES - 1):
+        opened.mouse.move(*place(opened, 1, frame))
+        for sample in range(3):
+            assert level(opened, sample) == pytest.approx(255 * grey(sample, frame), abs=8)
+    opened.touchscreen.tap(*place(opened, 0, 7))
+    assert opened.locator(".turntable").first.get_attribute("aria-valuenow") == "7"
 
 
 def test_the_keyboard_turns_them_too(opened):
-    box = opened.locator(".turntable").first
+    box, last = opened.locator(".turntable").first, FRAMES - 1
     box.focus()
-    for key, expected in [
-        ("ArrowRight", 1),
-        ("ArrowLeft", 0),
-        ("ArrowLeft", FRAMES - 1),
-        ("Home", 0),
-        ("End", FRAMES - 1),
-    ]:
+    for key, expected in {"ArrowRight": 1, "Home": 0, "ArrowLeft": last, "End": last}.items():
         box.press(key)
         assert box.get_attribute("aria-valuenow") == str(expected)
-    assert level(opened) == pytest.approx(255 * grey(0, FRAMES - 1), abs=8)
+    assert level(opened) == pytest.approx(255 * grey(0, last), abs=8)

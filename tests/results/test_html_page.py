@@ -24,13 +24,8 @@ def test_text_and_attributes_come_back_as_they_were(text):
 
 
 def test_elements_nest_and_only_they_are_not_escaped():
-    inner = element("b", "x")
+    inner = element("b", "x", class_="a", aria_label="b", open=True, hidden=False)
+    start = ("b", {"class": "a", "aria-label": "b", "open": None})
     assert isinstance(inner, Html)
-    assert parsed(element("p", inner, str.__str__("<b>"))) == [("p", {}), ("b", {}), "x", "/b", "<b>", "/p"]
-    assert joined(inner, "<") == "<b>x</b>&lt;"
-
-
-def test_attributes_of_words_that_python_keeps_and_without_values():
-    assert parsed(element("img", class_="a", aria_label="b", open=True, hidden=False)) == [
-        ("img", {"class": "a", "aria-label": "b", "open": None})
-    ]
+    assert parsed(element("p", inner, str.__str__("<b>"))) == [("p", {}), start, "x", "/b", "<b>", "/p"]
+    assert joined(element("b"), "<") == "<b></b>&lt;"

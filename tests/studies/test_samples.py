@@ -9,6 +9,7 @@ import pytest
 import torch
 from support import tiny_generator
 
+from completesplat.data.pictures.photograph import Photograph
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.studies.controls import PAPER, grid, plot_controls
@@ -21,19 +22,14 @@ from completesplat.studies.samples import near, object_psnr
 def test_object_pixels_alone_count():
     true, masks = torch.rand(2, 3, 4, 4), torch.zeros(2, 1, 4, 4)
     masks[0, :, :2] = 1
-    images = true.clone()
-    images[0, :, :2] += 0.1
-    images[0, :, 2:] += 0.7
-    images[1] += 0.7
+    images = true + 0.7
+    images[0, :, :2] = true[0, :, :2] + 0.1
     assert object_psnr(images[None], true, masks) == pytest.approx(20, abs=1e-4)
     assert object_psnr(true[None], true, masks) == PSNR_LIMIT
     assert object_psnr(images[None], true, torch.zeros_like(masks)) is None
-
-
-def test_of_an_object_that_fills_the_picture_it_is_the_plain_metric():
-    true, image = torch.rand(2, 1, 3, 16, 16).unbind(0)
-    expected = psnr(image, true).item()
-    assert object_psnr(image[None], true, torch.ones(1, 1, 16, 16)) == pytest.approx(expected, abs=1e-4)
+    # Of an object that fills the picture it is the plain metric.
+    image, whole = torch.rand(1, 3, 4, 4), torch.ones(1, 1, 4, 4)
+    assert object_psnr(image[None], true[:1], whole) == pytest.approx(psnr(image, true[:1]).item(), abs=1e-4)
 
 
 def test_near_is_an_angle_between_optical_axes():
@@ -46,9 +42,6 @@ def test_near_is_an_angle_between_optical_axes():
 
     targets = turned(10, 54, 56, 100, 190, 340, -30)
     assert near(turned(10)[0], targets, 45).tolist() == [True, True, False, False, False, True, True]
-
-
-CRIMSON = (220, 20, 60)
 
 
 def read(path) -> np.ndarray:
@@ -66,8 +59,7 @@ def plain(*color: int, count: int = 1) -> torch.Tensor:
 def test_strips_stand_in_their_rows_and_columns(tmp_path):
     red, green, blue = (250, 10, 10), (10, 250, 10), (10, 10, 250)
     rows = [[Strip(plain(*red), "a"), None], [Strip(plain(*green, count=2), "b"), Strip(plain(*blue), "c")]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         draw_strips(rows, ["first", "second"], tmp_path / "strips.png", "title")
     image = read(tmp_path / "strips.png")
     places = {color: np.argwhere((image == color).all(-1)) for color in (red, green, blue)}
@@ -78,15 +70,13 @@ def test_strips_stand_in_their_rows_and_columns(tmp_path):
     assert len(places[green]) > 1.9 * len(places[red])
 
 
-def controls(paper: bool) -> list[dict]:
+def test_the_papers_settings_are_always_in_the_grid_and_marked(tmp_path):
+    assert grid([], []) == sorted(PAPER)
+    assert set(grid([0, 1], [0.2])) == {(0.0, 0.2), (1.0, 0.2), (0.5, 0.5), (0.0, 0.5)}
     row = {"skip_weight": 0.5, "guidance_weight": 0.5, "diversity": 0.1, "reference_psnr": 20.0}
-    return [row | {"paper": paper, "near_object_psnr": None}]
-
-
-def test_the_papers_settings_are_marked(tmp_path):
     for paper in (True, False):
-        plot_controls(controls(paper), tmp_path / "controls.png", "title")
-        assert shows(read(tmp_path / "controls.png"), CRIMSON) == paper
+        plot_controls([row | {"paper": paper, "near_object_psnr": None}], tmp_path / "controls.png", "title")
+        assert shows(read(tmp_path / "controls.png"), (220, 20, 60)) == paper
 
 
 def test_each_sampler_has_its_line(tmp_path):
@@ -119,24 +109,12 @@ def test_the_fewest_calls_within_a_tenth_of_a_decibel_are_named():
 def test_calls_are_those_of_the_denoiser():
     model = tiny_generator()
     watch = Watch(model)
-    photograph = torch.rand(3, 32, 32)
+    photograph = Photograph(torch.rand(3, 32, 32), 50.0, "given")
+    given = (photograph.image[None], model.camera(photograph)[None], model.depth_range[None])
     for steps in (1, 5):
         with watch:
-            model.generate(
-                photograph[None], camera(model), model.depth_range[None], samples=2, steps=steps, guidance_weight=0.5
-            )
+            model.generate(*given, samples=2, steps=steps, guidance_weight=0.5)
         assert watch.calls == steps
         assert watch.seconds > 0
-    model.generate(photograph[None], camera(model), model.depth_range[None])
+    model.generate(*given)
     assert watch.calls == 5
-
-
-def camera(model):
-    from completesplat.data.pictures.photograph import Photograph
-
-    return model.camera(Photograph(torch.zeros(3, 32, 32), 50.0, "given"))[None]
-
-
-def test_the_papers_settings_are_always_in_the_grid():
-    assert grid([], []) == sorted(PAPER)
-    assert set(grid([0, 1], [0.2])) == {(0.0, 0.2), (1.0, 0.2), (0.5, 0.5), (0.0, 0.5)}
