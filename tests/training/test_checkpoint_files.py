@@ -3,12 +3,14 @@
 import io
 import itertools
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from hydra.utils import instantiate
-from lightning import LightningModule, Trainer
+from lightning import Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
 from support import compose_config
 
 from completesplat.errors import CompleteSplatError
@@ -36,20 +38,6 @@ def test_a_file_is_written_whole_or_not_at_all_and_not_into_memory_first(tmp_pat
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
 
 
-class Line(LightningModule):
-    """Two numbers, trained on one."""
-
-    def __init__(self):
-        super().__init__()
-        self.layer = torch.nn.Linear(1, 1)
-
-    def training_step(self, batch, index):
-        return self.layer(batch).square().mean()
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), lr=0.1)
-
-
 def train(folder, steps, accumulated=1, **settings) -> None:
     """So many optimizer steps, with the configuration's callback."""
     config = compose_config("fit", f"out={folder}").callbacks.checkpoint
@@ -58,7 +46,7 @@ def train(folder, steps, accumulated=1, **settings) -> None:
         max_steps=steps, accelerator="cpu", logger=False, plugins=[CheckpointFiles()], callbacks=[callback],
         accumulate_grad_batches=accumulated, enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
-    trainer.fit(Line(), torch.utils.data.DataLoader(torch.ones(100, 1)))
+    trainer.fit(BoringModel(), torch.utils.data.DataLoader(torch.ones(100, 32)))
 
 
 def step_of(path) -> int:
@@ -113,29 +101,25 @@ def test_only_whole_optimizer_steps_are_written(tmp_path, monkeypatch):
     assert all(batch in (3 * n, 3 * n - 1) for n, batch in enumerate(batches, start=1))
 
 
+class Killed(BaseException): ...
+
+
 @pytest.mark.parametrize("survived", range(8))
 def test_a_run_killed_between_any_two_changes_of_files_has_a_whole_last_checkpoint(tmp_path, monkeypatch, survived):
     """Killed before the file system's change number `survived`; nothing tidies up behind a killed process."""
     train(tmp_path, steps=1)
     changes = itertools.count()
 
-    def counted(change):
-        def checked(*arguments):
-            if next(changes) >= survived:
-                raise Killed
-            return change(*arguments)
-
-        return checked
+    def counted(change, *arguments):
+        if next(changes) >= survived:
+            raise Killed
+        return change(*arguments)
 
     for place, name in ((torch, "save"), (os, "link"), (os, "replace")):
-        monkeypatch.setattr(place, name, counted(getattr(place, name)))
+        monkeypatch.setattr(place, name, partial(counted, getattr(place, name)))
     with pytest.raises(Killed):
         train(tmp_path, steps=9, every_n_train_steps=1, keep_every=2)
     assert step_of(tmp_path / "checkpoints/last.ckpt") in range(1, 9)
-
-
-class Killed(BaseException):
-    """The end of a process."""
 
 
 def test_intervals_that_mean_nothing_are_refused(tmp_path):

@@ -13,12 +13,8 @@ from completesplat.training.checkpoints import load_part
 
 pytestmark = pytest.mark.slow
 SCENES = ["data.scenes=24", "data.frames=12", "data.image_size=32", "data.depth_before=1.0"]
-SHORT = [
-    "trainer.accelerator=cpu",
-    "trainer.limit_val_batches=0",
-    "callbacks.progress=null",
-    "schedule.warmup_steps=20",
-]
+SHORT = ["trainer.accelerator=cpu", "trainer.limit_val_batches=0", "callbacks.progress=null"]
+SHORT += ["schedule.warmup_steps=20"]
 
 
 def scores(command, run, out, *changes: str) -> dict:
