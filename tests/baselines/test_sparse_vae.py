@@ -95,7 +95,7 @@ def test_one_sparse_splatter_image_can_be_learned_by_heart():
     vae.measure([image])
     optimizer = torch.optim.Adam(vae.parameters(), lr=6e-3)
     losses = []
-    for _ in range(70):
+    for _ in range(130):
         losses.append(torch.stack(list(vae.errors(vae(image).splatter_image, image).values())).mean())
         optimizer.zero_grad()
         losses[-1].backward()

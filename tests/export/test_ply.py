@@ -16,7 +16,6 @@ from completesplat.gaussians import Gaussians, concatenate
 C0 = 0.5 / np.sqrt(np.pi)
 NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
 NAMES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-NAMES += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
 def random_gaussians(count=500, dtype=torch.float32):

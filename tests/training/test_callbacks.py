@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -16,21 +17,6 @@ from completesplat.training.throughput import Throughput
 NAP = 0.03
 QUIET = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
 QUIET["accelerator"] = "cpu"
-
-
-class Memory(Logger):
-    """Keeps the rows."""
-
-    name, version = "memory", "0"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rows: list[dict[str, float]] = []
-
-    def log_hyperparams(self, *_, **__) -> None: ...
-
-    def log_metrics(self, metrics, step=None) -> None:
-        self.rows.append(metrics | {"step": step})
 
 
 class Sleeper(BoringModel):
@@ -58,15 +44,14 @@ class SleepingLoader(list):
 
 
 def speeds(module: Sleeper, loader: SleepingLoader, **options) -> list[dict[str, float]]:
-    memory = Memory()
-    trainer = Trainer(
-        max_epochs=1, logger=memory, log_every_n_steps=2, callbacks=[Throughput()], num_sanity_val_steps=0,
-        **QUIET, **options,
-    )  # fmt: skip
+    memory = MagicMock(spec=Logger)
+    surroundings = {"logger": memory, "callbacks": [Throughput()], "log_every_n_steps": 2, "num_sanity_val_steps": 0}
+    trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **options)
     profiler = trainer.profiler
     trainer.fit(module, loader, SleepingLoader() if "val_check_interval" in options else None)
     assert trainer.profiler is profiler
-    return [row for row in memory.rows if "speed/data_wait" in row]
+    rows = [call.kwargs["metrics"] | {"step": call.kwargs["step"]} for call in memory.log_metrics.call_args_list]
+    return [row for row in rows if "speed/data_wait" in row]
 
 
 def test_who_is_waited_for():

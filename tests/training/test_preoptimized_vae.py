@@ -1,11 +1,12 @@
 """Gaussians fitted once to whole sequences, and the VAE that is trained on their Splatter Images."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 from hydra.utils import instantiate
-from support import SMALL, compose_config, strict_json
+from support import SMALL, compose_config, some_gaussians, strict_json
 
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
@@ -83,12 +84,7 @@ def store(toy_root):
 
 
 MEANS = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.2, 2.5]])
-
-
-def known_gaussians() -> Gaussians:
-    """Of one scene, in the frame of its reference."""
-    quaternions = torch.tensor([1.0, 0, 0, 0]).repeat(1, 2, 1)
-    return Gaussians(MEANS[None], quaternions, torch.full((1, 2, 3), 0.1), torch.ones(1, 2), torch.zeros(1, 2, 3))
+KNOWN = replace(some_gaussians(1), means=MEANS[None])  # of one scene, in the frame of its reference
 
 
 def test_a_scene_is_fitted_once_to_all_its_pictures_and_seen_from_any_of_its_cameras(store, tmp_path):
@@ -96,24 +92,22 @@ def test_a_scene_is_fitted_once_to_all_its_pictures_and_seen_from_any_of_its_cam
 
     def fit(scenes: SceneBatch) -> Gaussians:
         calls.append((scenes.names, len(scenes.targets.images[0]), int(scenes.reference_frame)))
-        return known_gaussians()
+        return KNOWN
 
     name = store.names[0]
     cameras = store.source.read(name).cameras.to(torch.float32)
     kept = FittedScenes(tmp_path / "fitted", [store], fit, "settings")
-    seen = [kept.seen_from(name, frame) for frame in range(4)]
-    assert calls == [((name,), 3, 0)]
     world = transform_points(cameras[0].camera_to_world, MEANS)
-    for frame, gaussians in enumerate(seen):
-        torch.testing.assert_close(
-            gaussians.means, transform_points(cameras[frame].world_to_camera, world), atol=1e-5, rtol=1e-5
-        )
+    for frame in range(4):
+        expected = transform_points(cameras[frame].world_to_camera, world)
+        torch.testing.assert_close(kept.seen_from(name, frame).means, expected, atol=1e-5, rtol=1e-5)
+    assert calls == [((name,), 3, 0)]
 
 
 def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tmp_path):
     calls = []
     for settings in ("one", "one", "other"):
-        fit = lambda scenes: calls.append(scenes.names[0]) or known_gaussians()  # noqa: E731
+        fit = lambda scenes: calls.append(scenes.names[0]) or KNOWN  # noqa: E731
         FittedScenes(tmp_path, [store], fit, settings).complete(store.names, progress=False)
     assert calls == [*store.names, *store.names]
     assert len(list(tmp_path.iterdir())) == len(calls)
