@@ -1,5 +1,3 @@
-"""One code for each picture, for good."""
-
 import io
 
 import pytest

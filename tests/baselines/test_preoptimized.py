@@ -16,8 +16,7 @@ DEPTH_RANGE = torch.tensor([[1.0, 3.0], [0.5, 6.0]])
 # The world is elsewhere: only the intrinsics matter.
 ELSEWHERE = torch.tensor([[0.0, 1, 0, 5], [-1, 0, 0, 1], [0, 0, 1, -9], [0, 0, 0, 1]])
 CAMERAS = Cameras(ELSEWHERE.expand(BATCH, 4, 4), pinhole(60.0, WIDTH).expand(BATCH, 3, 3), (HEIGHT, WIDTH))
-ONE = CAMERAS[:1]
-RANGE = DEPTH_RANGE[:1]
+ONE, RANGE = CAMERAS[:1], DEPTH_RANGE[:1]
 
 
 def at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:

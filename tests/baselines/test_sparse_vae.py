@@ -39,14 +39,16 @@ def tiny_vae() -> SparseVAE:
 @pytest.fixture
 def measured() -> SparseVAE:
     vae = tiny_vae()
-    vae.measure([sparse_image(0, batch=2), sparse_image(1, batch=3)])
+    vae.measure(IMAGES)
     return vae
 
 
+IMAGES = [sparse_image(0, batch=2), sparse_image(1, batch=3)]
+
+
 def test_values_of_occupied_places_have_mean_0_and_deviation_1(measured):
-    images = [sparse_image(0, batch=2), sparse_image(1, batch=3)]
     for layer in range(2):
-        values = torch.cat([measured.normalize(i.raw)[:, layer].movedim(1, -1)[occupied(i)[:, layer]] for i in images])
+        values = torch.cat([measured.normalize(i.raw)[:, layer].movedim(1, -1)[occupied(i)[:, layer]] for i in IMAGES])
         assert 0 < len(values) < 5 * SIZE * SIZE / 2
         torch.testing.assert_close(values.mean(0), torch.zeros(CHANNELS), atol=1e-4, rtol=0)
         expected = torch.ones(CHANNELS)

@@ -1,5 +1,3 @@
-"""Tensors as pictures: bytes, grids, sheets, and the colours of depth and normals."""
-
 import numpy as np
 import pytest
 import torch

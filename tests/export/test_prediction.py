@@ -14,7 +14,7 @@ from completesplat.export.prediction import SampleViews, contact_sheet, write_ma
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
-GREY = 128
+GREY, KINDS = 128, ("depth", "normals", "opacity")
 
 
 def test_every_image_stands_upright_in_its_row_and_column_below_the_title(tmp_path):
@@ -39,10 +39,6 @@ def scene_at(depth: float, opacity: float):
     return dataclasses.replace(scene, means=torch.tensor([0.0, 0, depth]).expand(2, 3))
 
 
-def read(folder, name: str) -> np.ndarray:
-    return np.asarray(Image.open(folder / f"{name}.png"))
-
-
 def test_depth_is_the_surfaces_where_it_is_opaque_and_nothing_elsewhere():
     rendering, faint = (ReferenceRasterizer()(scene_at(2, a)[None], CAMERA[None][None]) for a in (0.9, 0.2))
     depth, opaque = surface_depth(rendering), rendering.alpha > 0.5
@@ -56,9 +52,9 @@ def test_maps_share_one_scale_of_depth_and_agree_on_what_is_there(tmp_path):
     files, (near, far) = write_maps(tmp_path, [scene_at(1, 0.9), scene_at(4, 0.9)], CAMERA, ReferenceRasterizer())
     assert (round(near, 3), round(far, 3)) == (1, 4)
     assert sorted(files.values()) == sorted(path.name for path in tmp_path.iterdir())
-    assert set(files) == {f"{kind}_{index:02}" for kind in ("depth", "normals", "opacity") for index in (0, 1)}
+    assert set(files) == {f"{kind}_{index:02}" for kind in KINDS for index in (0, 1)}
     for index in (0, 1):
-        depth, normals, opacity = (read(tmp_path, f"{kind}_{index:02}") for kind in ("depth", "normals", "opacity"))
+        depth, normals, opacity = (np.asarray(Image.open(tmp_path / f"{kind}_{index:02}.png")) for kind in KINDS)
         assert depth[8, 8].max() < 60 if index else depth[8, 8].min() > 150  # the darkest and the brightest colour
         there = opacity[..., 0] > 127
         assert (opacity == opacity[..., :1]).all()

@@ -1,5 +1,3 @@
-"""How the converter is found and run, with stand-ins for it."""
-
 import shutil
 
 import pytest

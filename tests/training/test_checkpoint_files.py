@@ -1,5 +1,3 @@
-"""A checkpoint is there as a whole or not at all."""
-
 import itertools
 import os
 from functools import partial

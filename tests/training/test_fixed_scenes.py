@@ -1,5 +1,3 @@
-"""What is drawn and measured while a model trains."""
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,9 +28,7 @@ def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor
 
 
 def two_layers(scenes: SceneBatch) -> Gaussians:
-    colors = torch.zeros_like(scenes.reference.images)
-    red, blue = colors.clone(), colors.clone()
-    red[:, 0], blue[:, 2] = 1, 1
+    red, blue = (torch.eye(3)[channel, :, None, None].expand_as(scenes.reference.images) for channel in (0, 2))
     return concatenate([layer(scenes, 1.0, 0.9, red), layer(scenes, 3.0, 0.9, blue)])
 
 

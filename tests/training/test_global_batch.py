@@ -61,9 +61,9 @@ def test_accumulated_batches_share_it_and_what_a_process_gets_is_recorded(comman
 def test_processes_of_a_launcher_need_one_directory(command, monkeypatch, variables):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    refused = command("fit", "experiment=toy_var")
-    assert refused.status == 2
-    assert "give them one out=DIR" in refused.err.splitlines()[-1]
+    finished = command("fit", "experiment=toy_var")
+    assert finished.status == 2
+    assert "give them one out=DIR" in finished.err.splitlines()[-1]
     assert not os.path.exists("outputs")
 
 

@@ -1,5 +1,3 @@
-"""`metrics.csv` over interruptions."""
-
 import csv
 from pathlib import Path
 

@@ -28,11 +28,10 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     assert "fitted Gaussians to 2 of 2 scenes" in first.out + first.err
     files = {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()}
     assert len(files) == 3  # two sequences of training, one of validation
-    state = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
+    checkpoint = run / "checkpoints/last.ckpt"
+    state = read_checkpoint(checkpoint)["state_dict"]
     assert state["vae.std"].shape == (2, 15, 1, 1)
     assert not torch.equal(state["vae.std"], torch.ones(2, 15, 1, 1))
-
-    checkpoint = run / "checkpoints/last.ckpt"
     again = command("fit", *settings, f"ckpt_path={checkpoint}", *MORE, f"out={tmp_path / 'more'}")
     assert again.status == 0
     assert strict_json(tmp_path / "more/metrics.json")["steps"] == 3
@@ -63,7 +62,6 @@ def test_ablations_change_the_layers_and_bring_no_skips(ablation, layers):
 
 
 def test_the_decoder_is_all_that_the_test_sees(toy_root):
-    """The Gaussians are those of the VAE's output, as many as there are places."""
     config = compose_config("fit", *SETTINGS, f"data.root={toy_root}")
     torch.manual_seed(0)
     module = instantiate(config.model, _convert_="all").eval()

@@ -1,5 +1,3 @@
-"""Stage 1's module: what it starts from."""
-
 import pytest
 import torch
 from hydra.utils import instantiate
@@ -26,7 +24,6 @@ def test_a_second_part_starts_from_the_weights_of_the_first(pipeline):
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
-    """Boxes reach the model only where it is told so, and never what it is compared with."""
     scenes = scene_batch()
     scenes.visible[..., 4:12, 2:9] = 0
     trained = module(f"model.masked={str(masked).lower()}")

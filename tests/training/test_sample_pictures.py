@@ -1,5 +1,3 @@
-"""What is drawn of a latent diffusion while it trains."""
-
 from dataclasses import replace
 
 import numpy as np

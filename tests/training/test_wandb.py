@@ -41,7 +41,7 @@ FEW_MODES = ["evaluation=hidden_modes", "evaluation.samples=2", "evaluation.view
 def fit_settings(pipeline, stage: str) -> list[str]:
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
     own = ["experiment=toy_diffusion", stage1, "sampler.steps=2"] if stage == STAGE2 else ["experiment=toy_var"]
-    return ["fit", *own, f"data.root={pipeline.toy}", *SMALL, "trainer.log_every_n_steps=1"]
+    return [*own, f"data.root={pipeline.toy}", *SMALL, "trainer.log_every_n_steps=1"]
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def run(pipeline, tmp_path_factory):
             monkeypatch.delenv("WANDB_MODE", raising=False)
             monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
             monkeypatch.chdir(out.parent)
-            given = tests[kind] if kind in tests else fit_settings(pipeline, kind)
+            given = tests[kind] if kind in tests else ["fit", *fit_settings(pipeline, kind)]
             assert call(monkeypatch, *given, "logger=wandb", f"out={out}") == 0
         return (*offline_runs(out), out)
 
@@ -136,17 +136,17 @@ def test_jobs_of_a_sweep_are_a_group_and_a_continued_job_is_the_same_run(command
 
     monkeypatch.setattr(ReconstructionModule, "training_step", failing)
     monkeypatch.delenv("WANDB_MODE", raising=False)
-    sweep = [*fit_settings(pipeline, STAGE1), "logger=wandb", "-m", "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
+    sweep = ["-m", *fit_settings(pipeline, STAGE1), "logger=wandb", "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
     sweep += ["test=false", "callbacks.checkpoint.every_n_train_steps=1", "callbacks.pictures=null"]
     with pytest.raises(RuntimeError, match="the first job"):
-        command(*sweep)
-    assert command(*sweep).status == 0
+        command("fit", *sweep)
+    assert command("fit", *sweep).status == 0
     first, second = (offline_runs(tmp_path / "some_sweep" / f"seed-{seed}") for seed in (0, 1))
     assert [[one.only("exit").exit_code for one in job] for job in (first, second)] == [[1, 0], [0]]
-    told = [[(one.only("run").run_group, one.only("run").display_name) for one in job] for job in (first, second)]
-    assert told == [[("some_sweep", "seed-0")] * 2, [("some_sweep", "seed-1")]]
-    ids = [[one.only("run").run_id for one in job] for job in (first, second)]
-    assert ids[0][0] == ids[0][1] != ids[1][0]
+    started, continued, other = (one.only("run") for one in (*first, *second))
+    told = [(one.run_group, one.display_name) for one in (started, continued, other)]
+    assert told == [("some_sweep", "seed-0"), ("some_sweep", "seed-0"), ("some_sweep", "seed-1")]
+    assert started.run_id == continued.run_id != other.run_id
     steps = [[row["trainer/global_step"] for row in one.history if "train/mse" in row] for one in first]
     assert steps[0] == [0]
     assert set(steps[1]) == {1, 2}  # and behind the end the last figures again

@@ -1,5 +1,3 @@
-"""Pictures that are loaded on the page, and the numbers of denoising steps that can be chosen."""
-
 import io
 from contextlib import nullcontext
 
@@ -40,17 +38,13 @@ def test_a_picture_is_read_at_the_models_size(model):
         ("notes.txt", png(50, 40)[:60], "^notes.txt: "),
         ("../../\n\x1betc/passwd", b"nothing", r"^\.\./\.\./\?\?etc/passwd: not an image"),  # no path, no markup
         ("bomb.png", png(8000, 8000, "1"), "64,000,000|8000 x 8000"),  # some kilobytes
+        ("big.png", png(50, 40) + bytes(2**21), r"^big\.png: 2 MiB; at most 1 MiB"),
     ],
 )
-def test_what_is_no_picture_is_refused_by_its_name(model, name, content, said):
+def test_what_is_no_picture_or_too_large_is_refused_by_its_name(model, monkeypatch, name, content, said):
+    monkeypatch.setattr(completion, "MOST_BYTES", 2**20)
     with pytest.raises(ImageError, match=said):
         read_upload(model, name, content)
-
-
-def test_too_many_bytes_are_refused_before_they_are_read(model, monkeypatch):
-    monkeypatch.setattr(completion, "MOST_BYTES", 2**20)
-    with pytest.raises(ImageError, match=r"^big\.png: 2 MiB; at most 1 MiB"):
-        read_upload(model, "big.png", png(50, 40) + bytes(2**21))
 
 
 @pytest.mark.parametrize("scheduler", [DDIMScheduler(num_train_timesteps=30), DPMSolverMultistepScheduler()])
