@@ -1,7 +1,5 @@
 """Fitting finds what was rendered: scenes of known Gaussians, on a few pixels."""
 
-from dataclasses import fields
-
 import pytest
 import torch
 
@@ -14,9 +12,9 @@ from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
 from completesplat.scene import Views
 
-SIZE, VIEWS = 24, 6
+SIZE, VIEWS = 16, 6
 DEPTH_RANGE = torch.tensor([[1.5, 2.5], [1.0, 3.0]])
-FEW = FittingSettings(count=150, steps=120, views=3, position_rate=30.0, other_rates=5.0)
+FEW = FittingSettings(count=100, steps=60, views=2, position_rate=30.0, other_rates=10.0)
 MSE = WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}})
 
 
@@ -51,24 +49,19 @@ def quality(gaussians: Gaussians, views: Views) -> float:
 
 
 def test_a_known_scene_is_found_again(views):
-    start = quality(fit(views, 0, FittingSettings(count=150, steps=0)), views)
+    start = quality(fit(views, 0, FittingSettings(count=100, steps=0)), views)
     assert start < 20
     assert quality(fit(views, 0), views) > start + 10
 
 
-def test_the_seed_decides_everything(views):
+def test_the_seed_decides_everything_where_autograd_is_off_too(views):
     settings = FittingSettings(count=50, steps=5)
     one, again, other = (fit(views, seed, settings) for seed in (0, 0, 1))
-    for field in fields(Gaussians):
-        assert torch.equal(getattr(one, field.name), getattr(again, field.name))
+    torch.testing.assert_close(vars(one), vars(again), atol=0, rtol=0)
     assert not torch.equal(one.means, other.means)
-
-
-def test_fitting_works_where_autograd_is_off(views):
-    expected = fit(views, 0, FittingSettings(count=50, steps=5))
     with torch.inference_mode():
-        found = fit(views.map(torch.clone), 0, FittingSettings(count=50, steps=5))
-    assert torch.equal(found.means, expected.means)
+        found = fit(views.map(torch.clone), 0, settings)
+    assert torch.equal(found.means, one.means)
     assert not found.means.requires_grad
 
 

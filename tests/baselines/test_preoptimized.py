@@ -1,6 +1,6 @@
 """Splatter Images made of Gaussians give these Gaussians back."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +8,7 @@ import torch
 from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.splatter_image import CHANNELS, Parameterization, SplatterImage
 
 HEIGHT, WIDTH, BATCH = 4, 4, 2
@@ -15,29 +16,20 @@ DEPTH_RANGE = torch.tensor([[1.0, 3.0], [0.5, 6.0]])
 # The world is elsewhere: only the intrinsics matter.
 ELSEWHERE = torch.tensor([[0.0, 1, 0, 5], [-1, 0, 0, 1], [0, 0, 1, -9], [0, 0, 0, 1]])
 CAMERAS = Cameras(ELSEWHERE.expand(BATCH, 4, 4), pinhole(60.0, WIDTH).expand(BATCH, 3, 3), (HEIGHT, WIDTH))
-ONE = CAMERAS[:1]
-RANGE = DEPTH_RANGE[:1]
+ONE, RANGE = CAMERAS[:1], DEPTH_RANGE[:1]
 
 
 def at(points: list[tuple[float, float, float]], opacities: list[float]) -> Gaussians:
     """Gaussians of one scene, at (column, row, depth), with different looks."""
-    generator = torch.Generator().manual_seed(0)
-    pixels = torch.tensor(points)
-    focal = ONE.intrinsics[0, 0, 0]
-    means = torch.cat([(pixels[:, :2] - WIDTH / 2) / focal * pixels[:, 2:], pixels[:, 2:]], dim=1)
-    count = len(points)
-    return Gaussians(
-        means=means[None],
-        quaternions=torch.nn.functional.normalize(torch.randn(1, count, 4, generator=generator), dim=-1),
-        scales=0.01 + torch.rand(1, count, 3, generator=generator),
-        opacities=torch.tensor([opacities]),
-        colors=torch.rand(1, count, 3, generator=generator),
-    )
+    pixels, focal = torch.tensor([points]), ONE.intrinsics[0, 0, 0]
+    means = torch.cat([(pixels[..., :2] - WIDTH / 2) / focal * pixels[..., 2:], pixels[..., 2:]], dim=-1)
+    draws = torch.Generator().manual_seed(0)
+    rotations, scales, colors = (torch.rand(1, len(points), n, generator=draws) for n in (4, 3, 3))
+    return Gaussians(means, normalize_quaternion(rotations * 2 - 1), 0.01 + scales, torch.tensor([opacities]), colors)
 
 
 def assert_equal(found: Gaussians, expected: Gaussians) -> None:
-    for field in fields(Gaussians):
-        torch.testing.assert_close(getattr(found, field.name), getattr(expected, field.name), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(vars(found), vars(expected), atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("layer_depths", ["independent", "incremental"])
@@ -55,7 +47,7 @@ def test_a_splatter_image_comes_back(layer_depths):
 
 
 @pytest.mark.parametrize("layer_depths", ["independent", "incremental"])
-@pytest.mark.parametrize("layers", [1, 2, 3])
+@pytest.mark.parametrize("layers", [1, 3])
 def test_of_several_in_a_pixel_the_most_opaque_stay(layers, layer_depths):
     # The most opaque lies behind, the last beyond the depth range: the offset makes up for both.
     gaussians = at([(1.2, 2.9, 1.1), (1.5, 2.5, 2.0), (1.7, 2.1, 2.5), (1.5, 2.2, 9.0)], [0.2, 0.3, 0.9, 0.6])
@@ -80,16 +72,11 @@ def test_what_the_camera_does_not_see_fills_no_pixel():
 
 
 def test_scenes_of_a_batch_stay_apart():
-    one, other = at([(0.5, 0.5, 2.0)], [0.9]), at([(2.5, 1.5, 1.5)], [0.4])
-    both = Gaussians(*(torch.cat([getattr(one, f.name), getattr(other, f.name)]) for f in fields(Gaussians)))
+    one, other = at([(0.5, 0.5, 2.0)], [1.0]), at([(2.5, 1.5, 1.5)], [0.4])
+    both = Gaussians(*(torch.cat(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
     image, empty = project_to_splatter_image(both, CAMERAS, DEPTH_RANGE, Parameterization(layers=1))
+    assert image.raw.isfinite().all()  # for full opacity too
     found = image.gaussians(CAMERAS, DEPTH_RANGE)
     assert_equal(found[:1, :1], one)
     assert_equal(found[1:, [WIDTH + 2]], other)
     assert empty.sum(dim=(1, 2)).tolist() == [HEIGHT * WIDTH - 1] * 2
-
-
-def test_full_opacity_stays_finite():
-    image, _ = project_to_splatter_image(at([(0.5, 0.5, 2.0)], [1.0]), ONE, RANGE, Parameterization(layers=1))
-    assert image.raw.isfinite().all()
-    assert image.gaussians(ONE, RANGE).opacities[0, 0] > 0.99999

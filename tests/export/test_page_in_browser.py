@@ -9,15 +9,9 @@ import torch
 from PIL import Image
 
 from completesplat.errors import CompleteSplatError
+from completesplat.export import splat_transform
 from completesplat.export.pictures import to_bytes
-from completesplat.export.splat_transform import (
-    LARGEST_FOV,
-    PageView,
-    find_splat_transform,
-    upright,
-    viewer_settings,
-    write_page,
-)
+from completesplat.export.splat_transform import LARGEST_FOV, PageView, upright, viewer_settings, write_page
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -25,11 +19,8 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 playwright = pytest.importorskip("playwright.sync_api", reason="no playwright")
 CHROMIUM = shutil.which("chromium")
 NODE = shutil.which("npx") or shutil.which("splat-transform")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium"),
-    pytest.mark.skipif(NODE is None, reason="no Node.js"),
-]
+missing = CHROMIUM is None or NODE is None
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(missing, reason="no Chromium or no Node.js")]
 WIDTH, HEIGHT = 320, 180
 UP = torch.tensor([0.05, -0.92, -0.38])
 PIVOT = torch.tensor([0.1, 0.1, 3.0])
@@ -74,7 +65,7 @@ def screenshot(path, requests: list[str]) -> torch.Tensor:
 
 def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
     try:
-        converter = find_splat_transform()
+        converter = splat_transform.find_splat_transform()
     except CompleteSplatError as error:
         pytest.skip(str(error))
     view = PageView(REFERENCE, PIVOT, UP, 0.25)

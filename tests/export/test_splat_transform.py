@@ -1,5 +1,3 @@
-"""How the converter is found and run, with stand-ins for it."""
-
 import shutil
 
 import pytest
@@ -26,20 +24,16 @@ def test_without_node_it_is_said_what_to_install_and_what_needs_nothing(bin_fold
         find_splat_transform()
 
 
-def test_the_program_on_path_comes_first(bin_folder):
-    program = install(bin_folder, "splat-transform")
-    npx = install(bin_folder, "npx")
-    assert find_splat_transform() == SplatTransform(str(program))
-    assert calls(program) == ["--version"]
-    assert calls(npx) == []
-
-
-def test_else_npx_provides_the_pinned_package(bin_folder, tmp_path):
-    program = install(tmp_path / "npm", "splat-transform")
-    npx = install(bin_folder, "npx", f'echo "$@" >> "$0.log"\necho {program}')
-    assert find_splat_transform() == SplatTransform(str(program))
+def test_the_program_on_path_comes_first_else_npx_provides_the_pinned_package(bin_folder, tmp_path):
+    elsewhere = install(tmp_path / "npm", "splat-transform")
+    npx = install(bin_folder, "npx", f'echo "$@" >> "$0.log"\necho {elsewhere}')
+    assert find_splat_transform() == SplatTransform(str(elsewhere))
     assert calls(npx) == [f"--yes --package={PACKAGE} -c command -v splat-transform"]
     assert PACKAGE.endswith("@2.7.1")
+    program = install(bin_folder, "splat-transform")
+    assert find_splat_transform() == SplatTransform(str(program))
+    assert calls(program) == ["--version"]
+    assert len(calls(npx)) == 1
 
 
 @pytest.mark.parametrize(

@@ -28,31 +28,25 @@ def test_frames_come_back_in_order_and_upright(tmp_path):
     write_video(tmp_path / "a.mp4", frames, fps=10)
     images, meta = read(tmp_path / "a.mp4")
     assert images.shape == (3, 256, 256, 3)
-    assert meta["fps"] == 10
-    assert meta["codec"] == "h264"
-    assert "yuv420p" in meta["pix_fmt"]
+    assert (meta["fps"], meta["codec"], meta["pix_fmt"][:7]) == (10, "h264", "yuv420p")
     expected = frames.repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1).numpy() * 255
     inner = np.s_[:, 8:120, 8:120], np.s_[:, 8:120, 136:248], np.s_[:, 136:248, 8:120], np.s_[:, 136:248, 136:248]
     for quadrant in inner:
         assert np.abs(images[quadrant] - expected[quadrant]).max() < 12
 
 
-@pytest.mark.parametrize(
-    ("height", "width", "stored"), [(300, 301, (300, 302)), (33, 57, (264, 456)), (257, 259, (258, 260))]
-)
+@pytest.mark.parametrize(("height", "width", "stored"), [(300, 301, (300, 302)), (33, 57, (264, 456))])
 def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog, height, width, stored):
     write_video(tmp_path / "a.mp4", torch.rand(5, 3, height, width))
     assert read(tmp_path / "a.mp4")[0].shape == (5, *stored, 3)
     assert "resizing" not in caplog.text  # what imageio says when it scales the frames instead
 
 
-@pytest.mark.parametrize(
-    ("name", "frames", "value", "said"),
-    [("a.mp4", 0, 0.0, "video needs"), ("a.txt", 1, 0.0, "video needs"), ("a.mp4", 2, torch.nan, "not finite")],
-)
-def test_nothing_to_show_or_another_format_is_refused(tmp_path, name, frames, value, said):
-    with pytest.raises(ValueError, match=said):
-        write_video(tmp_path / name, torch.full((frames, 3, 64, 64), value))
+def test_nothing_to_show_or_another_format_is_refused(tmp_path):
+    black, broken = torch.zeros(1, 3, 64, 64), torch.full((2, 3, 64, 64), torch.nan)
+    for name, frames, said in (("a.mp4", black[:0], "needs"), ("a.txt", black, "needs"), ("a.mp4", broken, "finite")):
+        with pytest.raises(ValueError, match=said):
+            write_video(tmp_path / name, frames)
     assert list(tmp_path.iterdir()) == []
 
 

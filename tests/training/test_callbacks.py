@@ -2,147 +2,107 @@
 
 import itertools
 import time
+from unittest.mock import MagicMock
 
 import pytest
 import torch
-from lightning import LightningModule, Trainer
+from lightning import Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
 from lightning.pytorch.loggers.logger import Logger
 from scenes_for_training import scene_batch
+from torch.utils.data import DataLoader
 
 from completesplat.training.callbacks import StepSeeds, step_seed
 from completesplat.training.throughput import Throughput
 
 NAP = 0.03
-QUIET = {
-    "accelerator": "cpu",
-    "enable_checkpointing": False,
-    "enable_progress_bar": False,
-    "enable_model_summary": False,
-}
+QUIET = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+QUIET["accelerator"] = "cpu"
 
 
-class Memory(Logger):
-    """Keeps the rows."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.rows: list[tuple[int, dict[str, float]]] = []
-
-    name, version = "memory", "0"
-
-    def log_hyperparams(self, *_, **__) -> None: ...
-
-    def log_metrics(self, metrics, step=None) -> None:
-        self.rows.append((step, metrics))
-
-
-class OneNumber(LightningModule):
-    """A model of one weight."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-
-    def training_step(self, batch, index):
-        return self.weight**2
-
-    def configure_optimizers(self):
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-class Sleeper(OneNumber):
+class Sleeper(BoringModel):
     def __init__(self, training: float = 0, validation: float = 0) -> None:
         super().__init__()
         self.naps = training, validation
 
     def training_step(self, batch, index):
         time.sleep(self.naps[0])
-        return super().training_step(batch, index)
+        return super().training_step(torch.ones(1, 32), index)
 
     def validation_step(self, batch, index):
         time.sleep(self.naps[1])
 
 
-class SleepingLoader(list):
-    def __init__(self, nap: float = 0) -> None:
-        super().__init__([scene_batch()] * 8)
-        self.nap = nap
-
-    def __iter__(self):
-        for batch in super().__iter__():
-            time.sleep(self.nap)
-            yield batch
+def loader(nap: float = 0) -> DataLoader:
+    return DataLoader(range(8), collate_fn=lambda _: time.sleep(nap) or scene_batch())
 
 
-def speeds(module: Sleeper, loader: SleepingLoader, **options) -> list[dict[str, float]]:
-    memory = Memory()
-    trainer = Trainer(
-        max_epochs=1, logger=memory, log_every_n_steps=2, callbacks=[Throughput()], num_sanity_val_steps=0,
-        **QUIET, **options,
-    )  # fmt: skip
+def speeds(module: Sleeper, batches: DataLoader, **options) -> list[dict[str, float]]:
+    memory = MagicMock(spec=Logger)
+    surroundings = {"logger": memory, "callbacks": [Throughput()], "log_every_n_steps": 2, "num_sanity_val_steps": 0}
+    trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **options)
     profiler = trainer.profiler
-    trainer.fit(module, loader, SleepingLoader() if "val_check_interval" in options else None)
+    trainer.fit(module, batches, loader() if "val_check_interval" in options else None)
     assert trainer.profiler is profiler
-    return [row | {"step": step} for step, row in memory.rows if "speed/data_wait" in row]
+    rows = [call.kwargs["metrics"] | {"step": call.kwargs["step"]} for call in memory.log_metrics.call_args_list]
+    return [row for row in rows if "speed/data_wait" in row]
 
 
 def test_who_is_waited_for():
-    slow_data, slow_model = speeds(Sleeper(), SleepingLoader(NAP)), speeds(Sleeper(NAP), SleepingLoader())
+    slow_data, slow_model = speeds(Sleeper(), loader(NAP)), speeds(Sleeper(NAP), loader())
     assert [row["step"] for row in slow_data] == [1, 3, 5, 7]
     for data, model in zip(slow_data[1:], slow_model[1:], strict=True):
         assert 0 < model["speed/data_wait"] < data["speed/data_wait"] < 1
-        # A batch has two scenes, and cannot take less than the nap.
-        assert 0 < data["speed/scenes_per_second"] < 2 / NAP
-        assert 0 < model["speed/scenes_per_second"] < 2 / NAP
+        for row in (data, model):  # A batch has two scenes, and cannot take less than the nap.
+            assert 0 < row["speed/scenes_per_second"] < 2 / NAP
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("interval", [1, 2])
 def test_validation_is_not_counted(interval):
     """Five times as long as training, and in the midst of an interval as well as between two."""
-    validated = speeds(Sleeper(NAP, validation=5 * NAP), SleepingLoader(), val_check_interval=interval)
+    validated = speeds(Sleeper(NAP, validation=5 * NAP), loader(), val_check_interval=interval)
     for row in validated[1:]:
         assert row["speed/scenes_per_second"] > 2 / (5 * NAP)
 
 
 def test_accumulated_batches_are_counted_and_logged_once():
-    rows = speeds(Sleeper(NAP), SleepingLoader(), accumulate_grad_batches=2)
+    rows = speeds(Sleeper(NAP), loader(), accumulate_grad_batches=2)
     assert [row["step"] for row in rows] == [1, 3]
     for row in rows:  # Eight scenes take at least four naps.
         assert row["speed/scenes_per_second"] < 2 / NAP
 
 
 def test_memory_is_that_of_a_process_with_torch():
-    before = speeds(Sleeper(), SleepingLoader())[-1]["memory/process_gb"]
-    assert 0.05 < before < 100
+    before = speeds(Sleeper(), loader())[-1]
+    assert 0.05 < before["memory/process_gb"] < 100
+    assert "memory/gpu_gb" not in before
     ballast = torch.ones(2**27)  # half a GiB
-    after = speeds(Sleeper(), SleepingLoader())[-1]["memory/process_gb"]
-    assert after - before == pytest.approx(0.5, abs=0.2)
-    assert "memory/gpu_gb" not in speeds(Sleeper(), SleepingLoader())[-1]
+    after = speeds(Sleeper(), loader())[-1]["memory/process_gb"]
+    assert after - before["memory/process_gb"] == pytest.approx(0.5, abs=0.2)
     del ballast
 
 
-class Drawer(OneNumber):
+class Drawer(BoringModel):
     """Draws a number in every step, and before it as many others as it is told."""
 
     def __init__(self, others: int = 0) -> None:
         super().__init__()
-        self.others = others
-        self.drawn: list[float] = []
+        self.others, self.drawn = others, []
 
     def on_train_batch_end(self, *_) -> None:
         torch.rand(self.others)
 
     def training_step(self, batch, index):
         self.drawn.append(torch.rand(()).item())
-        return super().training_step(batch, index)
+        return super().training_step(torch.ones(1, 32), index)
 
 
 def drawn(seed: int, others: int = 0) -> list[float]:
     """Of three epochs of four batches, of which two share an optimizer step."""
     module = Drawer(others)
     trainer = Trainer(max_epochs=3, accumulate_grad_batches=2, logger=False, callbacks=[StepSeeds(seed)], **QUIET)
-    trainer.fit(module, torch.utils.data.DataLoader(range(4), generator=torch.Generator()))
+    trainer.fit(module, DataLoader(range(4), generator=torch.Generator()))
     return module.drawn
 
 

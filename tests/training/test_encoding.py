@@ -5,6 +5,7 @@ import json
 import logging
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -49,12 +50,8 @@ class Means(nn.Module):
         return nn.functional.avg_pool2d(images, 8) * self.weight
 
 
-@pytest.mark.parametrize("batch_size", [7, 64])
-def test_every_frame_has_the_encoders_posterior(root, tmp_path, batch_size, caplog):
-    with caplog.at_level(logging.INFO):
-        store = encode(root, tmp_path / "cache", batch_size=batch_size)
-    size = sum(array.nbytes for array in store.arrays.values())
-    assert f"about {size / 1000:.1f} kB for 20 frames" in caplog.text
+def test_every_frame_has_the_encoders_posterior(root, tmp_path):
+    store = encode(root, tmp_path / "cache", batch_size=7)
     encoder, source = small_autoreconstructor().encoder, rooms(root).source("train")
     assert list(store.sequences) == source.names
     for name, frame in itertools.product(source.names, range(FRAMES)):
@@ -74,7 +71,6 @@ def test_half_precision_needs_half_the_space_and_rounds_as_it_says(root, cache, 
         assert 2 * rounded.nbytes == exact.nbytes
         assert (np.abs(rounded.astype(np.float64) - exact) <= 2.0**-11 * np.abs(exact) + 1e-7).all()
     assert half.scale == pytest.approx(cache.scale, rel=1e-3)
-    assert half.scene("c1" if "c1" in half.sequences else "c2", 0).mean.dtype == torch.float32
 
 
 @pytest.mark.parametrize(("magnitude", "variance", "shift"), [(0.0, 4.0, 0.0), (3.0, 1e-3, 0.0), (0.5, 0.25, 7.0)])
@@ -147,45 +143,23 @@ def test_a_finished_store_is_kept_and_not_written_over(root, cache, tmp_path, ca
     changes = [{"frames": 2}, {"precision": "float16"}, {"conditioning": Means()}]
     for changed in (*changes, {"model": small_autoreconstructor(1)}, {"root": other}):
         with pytest.raises(DataError, match="already holds another store"):
-            encode(**{"root": root, "out": cache.folder, **changed})
+            encode(**{"root": root, "out": cache.folder} | changed)
     assert {path: path.stat().st_mtime_ns for path in cache.folder.iterdir()} == before
 
 
-def test_damaged_data_are_refused_and_nothing_is_left(root, tmp_path):
-    store = Path(shutil.copytree(root, tmp_path / "store"))
-    (shard,) = store.glob("train-*.arrow")
-    content = bytearray(shard.read_bytes())
-    content[content.index(b"BM", len(content) // 2) + 100] ^= 1
-    shard.write_bytes(content)
-    with pytest.raises(DataError, match="is no longer what was written") as caught:
-        encode(store, tmp_path / "cache", batch_size=2)
-    assert caught.value.file == str(shard)
-    assert list((tmp_path / "cache").iterdir()) == []
-
-
-def test_too_little_space_is_noticed_before_anything_is_written(root, tmp_path, monkeypatch):
-    usage = type("usage", (), {"free": 1000})
-    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: usage)
+def test_settings_without_a_meaning_and_a_full_disk_are_refused(root, tmp_path, monkeypatch):
+    for options, said in (
+        ({"precision": "float64"}, "needs precision=float32 or float16"),
+        ({"conditioning": Means(frozen=False)}, "needs pictures"),
+        ({"root": root.with_name("raw")}, "run `completesplat data prepare` first"),
+    ):
+        with pytest.raises(CompleteSplatError, match=said):
+            encode(**{"root": root, "out": tmp_path / "cache"} | options)
+    assert not (tmp_path / "cache").exists()
+    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: SimpleNamespace(free=1000))
     with pytest.raises(DataError, match=r"not enough space: about .* for 20 frames of 4 sequences"):
         encode(root, tmp_path / "cache")
     assert list((tmp_path / "cache").iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        ({"precision": "float64"}, "needs precision=float32 or float16"),
-        ({"frames": 0}, "needs precision"),
-        ({"batch_size": 0}, "needs precision"),
-        ({"conditioning": Means(frozen=False)}, "needs pictures"),
-        ({"root": "raw"}, "run `completesplat data prepare` first"),
-    ],
-)
-def test_settings_without_a_meaning_are_refused(root, tmp_path, options, said):
-    given = {"root": root, "out": tmp_path / "cache"} | options
-    with pytest.raises(CompleteSplatError, match=said):
-        encode(**given | ({"root": root.with_name("raw")} if given["root"] == "raw" else {}))
-    assert not (tmp_path / "cache").exists()
 
 
 def test_the_fingerprint_tells_names_types_shapes_and_values():
@@ -198,31 +172,28 @@ def test_the_fingerprint_tells_names_types_shapes_and_values():
     assert digests[0] == fingerprint(nn.ParameterDict({"a": weights.T.contiguous().T}))  # of any memory layout
 
 
-def test_the_cache_of_this_autoreconstructor_and_these_data_is_accepted_and_stale_ones_are_refused(
-    root, cache, tmp_path
-):
+def test_the_cache_of_this_model_and_these_data_is_accepted_and_stale_ones_are_refused(root, cache, tmp_path):
     source, own, other = rooms(root).source("train"), small_autoreconstructor(), small_autoreconstructor(1)
     features = encode(root, tmp_path / "features", conditioning=Means())
     nn.init.ones_(own.reconstructor.network.conv_out.weight)  # only the encoder makes latents
     check_cache(cache, own, source)
     check_cache(cache, own, source, Means(frozen=False))
     check_cache(features, own, source, Means())
-    with pytest.raises(WeightsError, match="made with another autoreconstructor"):
-        check_cache(cache, other, source)
-    with pytest.raises(DataError, match="made from other data"):
-        check_cache(cache, own, rooms(sound_rooms(tmp_path / "other", clips=4)).source("train"))
-    with pytest.raises(WeightsError, match="holds pictures"):
-        check_cache(cache, own, source, Means())
-    with pytest.raises(WeightsError, match="features of another conditioning"):
-        check_cache(features, own, source, Means(2.0))
+    others = rooms(sound_rooms(tmp_path / "other", clips=4)).source("train")
+    for given, error, said in (
+        ((cache, other, source), WeightsError, "made with another autoreconstructor"),
+        ((cache, own, others), DataError, "made from other data"),
+        ((cache, own, source, Means()), WeightsError, "holds pictures"),
+        ((features, own, source, Means(2.0)), WeightsError, "features of another conditioning"),
+    ):
+        with pytest.raises(error, match=said):
+            check_cache(*given)
 
 
-@pytest.mark.parametrize("change", ["channels", "size"])
-def test_latents_of_another_shape_are_refused(root, cache, tmp_path, change):
+def test_latents_of_another_shape_are_refused(root, cache, tmp_path):
     copy = Path(shutil.copytree(cache.folder, tmp_path / "copy"))
     content = json.loads((copy / "manifest.json").read_text())
-    model = small_autoreconstructor(latent_channels=3 if change == "channels" else 4)
-    content["origin"] |= {"encoder": fingerprint(model.encoder)} if change == "channels" else {"image_size": 32}
+    content["origin"]["image_size"] = 32
     (copy / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match=r"latents of \(4, 2, 2\)"):
-        check_cache(LatentCache(copy), model, rooms(root).source("train"))
+        check_cache(LatentCache(copy), small_autoreconstructor(), rooms(root).source("train"))

@@ -6,35 +6,26 @@ import pandas
 import pytest
 import torch
 from support import SMALL, call
+from torch import Tensor
 
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 
 STEPS = 6
-# Four batches an epoch; validation and checkpoints fall into their midst and on their ends.
-SETTINGS = [
-    *SMALL,
-    f"trainer.max_steps={STEPS}",
-    "trainer.log_every_n_steps=1",
-    "data.references_per_sequence=4",
-    "callbacks.pictures.every_n_steps=2",
-    "test=false",
-]
+SETTINGS = [*SMALL, f"trainer.max_steps={STEPS}", "trainer.log_every_n_steps=1", "data.references_per_sequence=4"]
+SETTINGS += ["callbacks.pictures.every_n_steps=2", "test=false", "data.batch_size=2"]
 PLACES_OF_WEIGHTS = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers")
 
 
 @pytest.fixture(scope="module")
 def settings(pipeline, latent_cache):
     """Arguments of `completesplat`, by stage; "latent_cache" is stage 2 from the latent cache."""
-    shared = [f"data.root={pipeline.toy}", *SETTINGS, "data.batch_size=2"]
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
-    own = ["sampler.steps=2", "callbacks.samples.every_n_steps=2"]
-    stage2 = ["fit", "experiment=toy_diffusion", *shared, stage1, *own]
-    return {
-        "var": ["fit", "experiment=toy_var", *shared],
-        "diffusion": stage2,
-        "latent_cache": [*stage2, f"data.latent_cache={latent_cache}"],
-    }
+    shared = [f"data.root={pipeline.toy}", *SETTINGS]
+    own = [stage1, "sampler.steps=2", "callbacks.samples.every_n_steps=2"]
+    stage2 = ["fit", "experiment=toy_diffusion", *shared, *own]
+    cached = [*stage2, f"data.latent_cache={latent_cache}"]
+    return {"var": ["fit", "experiment=toy_var", *shared], "diffusion": stage2, "latent_cache": cached}
 
 
 @pytest.fixture(scope="module")
@@ -99,12 +90,8 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
     expected, found = weights(whole(stage)), weights(tmp_path / "run")
     assert expected.keys() == found.keys()
     assert any("current_model_state" in name for name in expected) == (stage != "var")
-    different = [
-        name
-        for name, value in expected.items()
-        if not (torch.equal(value, found[name]) if isinstance(value, torch.Tensor) else value == found[name])
-    ]
-    assert different == []
+    same = {name: value == found[name] for name, value in expected.items()}
+    assert [name for name, equal in same.items() if not (equal.all() if isinstance(equal, Tensor) else equal)] == []
     pandas.testing.assert_frame_equal(rows(whole(stage)), rows(tmp_path / "run"), check_exact=True)
 
 
@@ -116,7 +103,7 @@ def test_drawing_pictures_and_samples_does_not_change_training(settings, whole, 
         off = [f"callbacks.{name}=null" for name in drawn]
         assert call(monkeypatch, *kept, *off, f"out={tmp_path / stage}") == 0
         expected, found = (weights(run) for run in (whole(stage), tmp_path / stage))
-        assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, torch.Tensor))
+        assert all(torch.equal(v, found[k]) for k, v in expected.items() if isinstance(v, Tensor))
         for name in drawn:
             assert not (tmp_path / stage / name).exists()
             pictures = sorted(path.name for path in (whole(stage) / name).glob("step_*"))

@@ -1,5 +1,3 @@
-"""What is drawn and measured while a model trains."""
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace
@@ -30,9 +28,7 @@ def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor
 
 
 def two_layers(scenes: SceneBatch) -> Gaussians:
-    colors = torch.zeros_like(scenes.reference.images)
-    red, blue = colors.clone(), colors.clone()
-    red[:, 0], blue[:, 2] = 1, 1
+    red, blue = (torch.eye(3)[channel, :, None, None].expand_as(scenes.reference.images) for channel in (0, 2))
     return concatenate([layer(scenes, 1.0, 0.9, red), layer(scenes, 3.0, 0.9, blue)])
 
 
@@ -40,19 +36,7 @@ def panels(gaussians: Gaussians, scenes: SceneBatch, background: float = 0.5) ->
     return scene_panels(ReferenceRasterizer(), gaussians, scenes, background)
 
 
-def test_the_error_of_a_perfect_render_is_zero_and_of_another_the_difference():
-    scenes = scene_batch()
-    gaussians = two_layers(scenes)
-    rendered = panels(gaussians, scenes)["render"]
-    assert rendered.std() > 0
-    targets = replace(scenes.targets, images=torch.stack([rendered, rendered], 1))
-    assert (panels(gaussians, replace(scenes, targets=targets))["error x4"] == 0).all()
-    targets = replace(targets, images=targets.images - 0.1)
-    error = panels(gaussians, replace(scenes, targets=targets))["error x4"]
-    torch.testing.assert_close(error, torch.full_like(error, 0.4))
-
-
-def test_panels_are_input_target_and_layers():
+def test_panels_are_input_target_error_and_layers():
     scenes = scene_batch()
     gaussians = two_layers(scenes)
     drawn = panels(gaussians, scenes, background=0.0)
@@ -64,16 +48,20 @@ def test_panels_are_input_target_and_layers():
         assert ((drawn[layer] == 0).all((0, 2, 3)) == (torch.arange(3) != channel)).all()
     rendering = ReferenceRasterizer()(gaussians, scenes.targets.cameras[:, :1])[:, 0]
     assert torch.equal(drawn["opacity"], rendering.alpha.clamp(0, 1).expand(-1, 3, -1, -1))
+    rendered = panels(gaussians, scenes)["render"]
+    assert rendered.std() > 0
+    for difference in (0.0, 0.1):
+        targets = replace(scenes.targets, images=torch.stack([rendered, rendered], 1) - difference)
+        error = panels(gaussians, replace(scenes, targets=targets))["error x4"]
+        torch.testing.assert_close(error, torch.full_like(error, 4 * difference))
 
 
 def test_what_is_near_is_bright_on_each_scenes_own_scale_and_what_is_not_seen_is_grey():
     scenes = scene_batch(batch=2)
-    gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
     rows = torch.arange(SIZE).repeat_interleave(SIZE)
     depths = torch.where(rows < 5, 3.0, 1.0) * torch.tensor([[1.0], [7.0]])
-    gaussians = replace(
-        gaussians, means=gaussians.means * depths[..., None], opacities=gaussians.opacities * (rows < 10)
-    )
+    flat = layer(scenes, 1.0, 0.9, scenes.reference.images)
+    gaussians = replace(flat, means=flat.means * depths[..., None], opacities=flat.opacities * (rows < 10))
     depth = panels(gaussians, scenes)["depth"]
     assert (depth[..., 12:, :] == 0.5).all()
     lightness = depth.mean(1)
@@ -115,7 +103,7 @@ def test_scenes_are_the_first_of_validation():
     assert len(fixed_scenes(data, 10)) == 5
 
 
-@pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (2, [0, 3]), (3, [0, 2, 4]), (6, range(6)), (9, range(6))])
+@pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (3, [0, 2, 4]), (9, range(6))])
 def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
     (whole,) = batch = [scene_batch(1, targets=6)]
     (scene,) = fixed_scenes(SimpleNamespace(val_dataloader=lambda: batch), 1, views)

@@ -31,8 +31,8 @@ def module_of(monkeypatch, generator=None, **settings) -> tuple[LatentDiffusion,
     logged: dict[str, float] = {}
 
     def log_loss(errors, timestep):
-        logged["train/loss"] = errors.mean().item()
-        logged.update(losses_by_timestep(errors, timestep, module.completesplat.sampler.training_timesteps))
+        values = losses_by_timestep(errors, timestep, module.completesplat.sampler.training_timesteps)
+        logged.update(values | {"train/loss": errors.mean().item()})
 
     monkeypatch.setattr(module, "log_loss", log_loss)
     return module, logged
@@ -42,9 +42,8 @@ def gradients(module: LatentDiffusion) -> dict[str, torch.Tensor]:
     return {name: p.grad for name, p in module.named_parameters() if p.grad is not None}
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_the_conditioning_sees_the_visible_part_and_the_encoder_everything(share: float, monkeypatch) -> None:
-    batch, seen = scenes(share), {}
+def test_the_conditioning_sees_the_visible_part_and_the_encoder_everything(monkeypatch) -> None:
+    batch, seen = scenes(0.5), {}
     module, _ = module_of(monkeypatch)
     parts = module.completesplat
     for name, part in (("conditioning", parts.conditioning), ("encoder", parts.autoreconstructor.encoder)):
@@ -83,11 +82,9 @@ def recording(monkeypatch, **settings) -> tuple[LatentDiffusion, dict[str, float
     return module_of(monkeypatch, generator, **settings)
 
 
-@pytest.mark.parametrize("probability", [0.0, 0.2, 1.0])
-def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(probability, monkeypatch):
-    count = 4000
-    batch, steps = encoded(count), []
-    for rate in (0.0, probability):
+def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(monkeypatch):
+    batch, steps = encoded(4000), []
+    for rate in (0.0, 0.2):
         module, _ = recording(monkeypatch, unconditional_probability=rate)
         torch.manual_seed(0)
         module.training_step(batch, 0)
@@ -96,8 +93,7 @@ def test_the_conditioning_alone_is_zeroed_at_the_stated_rate(probability, monkey
     assert torch.equal(never.conditioning, batch.condition)
     dropped = (sometimes.conditioning == 0).all((1, 2, 3))
     assert torch.equal(sometimes.conditioning[~dropped], batch.condition[~dropped])
-    # Five standard deviations of the binomial distribution.
-    assert abs(dropped.sum() - count * probability) <= 5 * math.sqrt(count * probability * (1 - probability))
+    assert abs(dropped.sum() - 800) <= 5 * math.sqrt(4000 * 0.2 * 0.8)  # standard deviations of the binomial
     assert torch.equal(sometimes.noisy_latent, never.noisy_latent)
     assert torch.equal(sometimes.timestep, never.timestep)
 
@@ -129,10 +125,8 @@ def test_the_buckets_losses_average_to_the_total(monkeypatch):
     assert values == {"train/loss_t0": 1.0, "train/loss_t1": 4.0}
 
 
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_what_was_encoded_beforehand_trains_the_same(share, monkeypatch):
-    batch = scenes(share)
-    found = []
+def test_what_was_encoded_beforehand_trains_the_same(monkeypatch):
+    batch, found = scenes(0.5), []
     for cached in (False, True):
         module, logged = module_of(monkeypatch)
         parts = module.completesplat
@@ -149,8 +143,7 @@ def test_what_was_encoded_beforehand_trains_the_same(share, monkeypatch):
     (first, first_gradients), (second, second_gradients) = found
     assert first == second
     assert any(name.startswith("completesplat.conditioning") for name in first_gradients)
-    assert first_gradients.keys() == second_gradients.keys()
-    assert all(torch.equal(value, second_gradients[name]) for name, value in first_gradients.items())
+    torch.testing.assert_close(first_gradients, second_gradients, atol=0, rtol=0)
 
 
 def test_channels_last_is_the_same_training(monkeypatch):
@@ -168,11 +161,7 @@ def test_channels_last_is_the_same_training(monkeypatch):
 
 def test_a_compiled_denoiser_keeps_its_keys_and_runs_what_the_compiler_returns(monkeypatch):
     compiled = []
-
-    def compiler(call, **options):
-        return lambda *inputs: compiled.append(1) or call(*inputs)
-
-    monkeypatch.setattr(torch, "compile", compiler)
+    monkeypatch.setattr(torch, "compile", lambda call, **_: lambda *inputs: compiled.append(1) or call(*inputs))
     module, _ = module_of(monkeypatch, compile=True)
     assert module.state_dict().keys() == module_of(monkeypatch)[0].state_dict().keys()
     module.training_step(scenes(), 0)

@@ -1,11 +1,10 @@
 """Training teaches something: minutes, so run by `make test-slow`."""
 
-import pandas
 import pytest
 import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
-from support import SMALL, call, strict_json
+from support import strict_json
 
 from completesplat.metrics.images import psnr
 from completesplat.tensors import stack
@@ -13,12 +12,8 @@ from completesplat.training.checkpoints import load_part
 
 pytestmark = pytest.mark.slow
 SCENES = ["data.scenes=24", "data.frames=12", "data.image_size=32", "data.depth_before=1.0"]
-SHORT = [
-    "trainer.accelerator=cpu",
-    "trainer.limit_val_batches=0",
-    "callbacks.progress=null",
-    "schedule.warmup_steps=20",
-]
+SHORT = ["trainer.accelerator=cpu", "trainer.limit_val_batches=0", "callbacks.progress=null"]
+SHORT += ["schedule.warmup_steps=20"]
 
 
 def scores(command, run, out, *changes: str) -> dict:
@@ -71,24 +66,3 @@ def test_one_scene_is_learned_by_heart(command, tmp_path):
     values = psnr_of_training_views(tmp_path / "run")
     assert len(values) == 8
     assert values.mean() > 28
-
-
-STEPS = 20
-# With larger steps, or bfloat16, rounding grows: at a learning rate of 3e-3, gradients changed by 1e-7 change the loss
-# of these steps by percents, whatever the backend.
-GENTLE = ["optimizer.lr=5e-5", "trainer.precision=32-true"]
-
-
-def test_tiled_and_reference_give_the_same_loss_curve(toy_root, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    fit = ["fit", "experiment=toy_var", f"data.root={toy_root}", *SMALL, *GENTLE]
-    fit += [f"trainer.max_steps={STEPS}", f"trainer.val_check_interval={STEPS}", "trainer.log_every_n_steps=1"]
-    curves = []
-    for backend in ("tiled", "reference"):
-        assert call(monkeypatch, *fit, f"rasterizer={backend}", f"out={tmp_path / backend}") == 0
-        losses = pandas.read_csv(tmp_path / backend / "metrics.csv")["train/loss"].dropna()[:STEPS]
-        assert len(losses) == STEPS
-        curves.append(losses.to_numpy())
-    tiled, reference = curves
-    assert (abs(tiled / reference - 1) <= 1e-3).all()
-    assert reference[-1] != reference[0]

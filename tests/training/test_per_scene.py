@@ -10,18 +10,16 @@ FEW = ["model.fitting.count=300", "model.fitting.steps=60", "data.evaluation_tar
 
 def scored(model: str, root, *settings: str):
     config = compose_config("fit", "experiment=toy_var", f"model={model}", f"data.root={root}", *SMALL, *FEW, *settings)
-    module = instantiate(config.model, _convert_="all")
-    data = instantiate(config.data, _convert_="all")
+    module, data = (instantiate(part, _convert_="all") for part in (config.model, config.data))
     trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
     trainer.test(module, datamodule=data, verbose=False)
-    return module, trainer
+    return module
 
 
 def test_fitting_the_test_scenes_beats_not_fitting_them(toy_root):
-    module, _ = scored("per_scene", toy_root)
-    start, _ = scored("per_scene", toy_root, "model.fitting.steps=0")
-    assert not list(module.parameters())
-    fitted, unfitted = (m.evaluation.results()["model"]["full"]["novel"]["psnr"] for m in (module, start))
+    both = scored("per_scene", toy_root), scored("per_scene", toy_root, "model.fitting.steps=0")
+    assert not list(both[0].parameters())
+    fitted, unfitted = (m.evaluation.results()["model"]["full"]["novel"]["psnr"] for m in both)
     assert fitted > unfitted + 3
 
 
@@ -29,7 +27,7 @@ def test_fitting_the_test_scenes_beats_not_fitting_them(toy_root):
 @pytest.mark.parametrize(("opacity", "least", "most"), [(0.1, 1 - 300 / 1024, 0.999), (0.001, 1, 1)])
 def test_a_splatter_image_of_few_gaussians_is_mostly_empty(toy_root, opacity, least, most):
     steps = 0 if opacity == 0.001 else 60
-    module, _ = scored("preoptimized", toy_root, f"model.fitting.opacity={opacity}", f"model.fitting.steps={steps}")
+    module = scored("preoptimized", toy_root, f"model.fitting.opacity={opacity}", f"model.fitting.steps={steps}")
     assert least <= module.test_results()["model"]["empty_pixels"] <= most
     assert module.evaluation.results()["model"]["scenes"] == 1
 

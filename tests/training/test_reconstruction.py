@@ -1,13 +1,9 @@
-"""Stage 1's module: what it starts from."""
-
 import pytest
 import torch
-from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from scenes_for_training import scene_batch
 from support import NETWORKS, compose_config
 
-from completesplat.errors import WeightsError
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.scene_module import copy_reference, repeat_image
 
@@ -26,17 +22,8 @@ def test_a_second_part_starts_from_the_weights_of_the_first(pipeline):
     assert any(not torch.equal(value, weights[key]) for key, value in module().state_dict().items())
 
 
-def test_weights_of_another_architecture_are_no_start(pipeline):
-    checkpoint = pipeline.var / "checkpoints/last.ckpt"
-    with pytest.raises(InstantiationException) as caught:
-        module(f"model.checkpoint={checkpoint}", "ablation=m1")
-    assert isinstance(caught.value.__cause__, WeightsError)
-    assert "another architecture" in str(caught.value.__cause__)
-
-
 @pytest.mark.parametrize("masked", [False, True])
 def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
-    """Boxes reach the model only where it is told so, and never what it is compared with."""
     scenes = scene_batch()
     scenes.visible[..., 4:12, 2:9] = 0
     trained = module(f"model.masked={str(masked).lower()}")

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 from hydra.utils import instantiate
-from lightning import Callback
+from lightning.pytorch.callbacks import LambdaCallback
 from support import SMALL, compose_config
 
 from completesplat.training.schedules import constant, cosine, exponential
@@ -28,35 +28,21 @@ def test_exponential_is_a_straight_line_in_the_logarithm_after_the_warm_up():
     assert values[1100] == values[1200] == pytest.approx(0.01)
 
 
-def test_cosine_ends_at_the_final_ratio():
+def test_cosine_ends_at_the_final_ratio_and_constant_stays():
     values = factors(cosine, 301, total_steps=200, warmup_steps=0, final_ratio=0.1)
     assert (values[0], values[100], values[200], values[300]) == pytest.approx((1.0, 0.55, 0.1, 0.1))
-
-
-def test_constant():
     assert set(factors(constant, 5, total_steps=3)) == {1.0}
-
-
-class LearningRates(Callback):
-    """Notes the rate of every step."""
-
-    def __init__(self) -> None:
-        self.rates: list[float] = []
-
-    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx) -> None:
-        self.rates.append(trainer.optimizers[0].param_groups[0]["lr"])
 
 
 @pytest.mark.parametrize("length", [["trainer.max_steps=6"], ["trainer.max_steps=-1", "+trainer.max_epochs=6"]])
 def test_the_schedule_ends_with_the_run_whether_steps_or_epochs_are_given(length, toy_root, tmp_path):
     settings = [*SMALL, *length, "schedule.warmup_steps=0", "optimizer.lr=1.0e-3", "data.references_per_sequence=1"]
-    config = compose_config(
-        "fit", "experiment=toy_var", f"data.root={toy_root}", *settings, "trainer.limit_val_batches=0",
-        "trainer.val_check_interval=null", f"out={tmp_path}",
-    )  # fmt: skip
-    noted = LearningRates()
+    settings += ["trainer.limit_val_batches=0", "trainer.val_check_interval=null", f"out={tmp_path}"]
+    config = compose_config("fit", "experiment=toy_var", f"data.root={toy_root}", *settings)
+    rates = []
+    noted = LambdaCallback(on_train_batch_start=lambda one, *_: rates.append(one.optimizers[0].param_groups[0]["lr"]))
     trainer = instantiate(config.trainer, callbacks=[noted], logger=False, _convert_="all", enable_progress_bar=False)
     data, module = (instantiate(part, _convert_="all") for part in (config.data, config.model))
     trainer.fit(module, datamodule=data)
     expected = [0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / 6)) for step in range(6)]
-    assert noted.rates == pytest.approx([1e-3 * factor for factor in expected])
+    assert rates == pytest.approx([1e-3 * factor for factor in expected])

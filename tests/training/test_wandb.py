@@ -1,5 +1,6 @@
 """What runs leave for Weights & Biases, without a network."""
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -35,41 +36,30 @@ LOGGED = [
 ]
 UNNAMED = {"train/scale", "train/opacity"}  # regularisers, off by default
 FEW_MODES = ["evaluation=hidden_modes", "evaluation.samples=2", "evaluation.views=1", "evaluation.spread_views=1"]
-SETTINGS = [*SMALL, "trainer.log_every_n_steps=1", "logger=wandb"]
 
 
 def fit_settings(pipeline, stage: str) -> list[str]:
     stage1 = f"model.autoreconstructor_checkpoint={pipeline.var / 'checkpoints/last.ckpt'}"
     own = ["experiment=toy_diffusion", stage1, "sampler.steps=2"] if stage == STAGE2 else ["experiment=toy_var"]
-    return [*own, f"data.root={pipeline.toy}", *SETTINGS]
-
-
-@pytest.fixture(autouse=True)
-def no_settings_from_outside(monkeypatch):
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+    return [*own, f"data.root={pipeline.toy}", *SMALL, "trainer.log_every_n_steps=1"]
 
 
 @pytest.fixture(scope="module")
 def run(pipeline, tmp_path_factory):
     """One W&B run, and its directory, for each kind; made when first asked for."""
-    made: dict[str, tuple] = {}
 
+    @cache
     def make(kind: str):
-        if kind not in made:
-            out = tmp_path_factory.mktemp("wandb") / "run"
-            checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
-            several = ["evaluation.scoring.samples=2", "trainer.accelerator=cpu", "logger=wandb"]
-            arguments = {
-                TEST: ["test", f"ckpt={checkpoint}", *several],
-                MODES: ["test", f"ckpt={checkpoint}", *FEW_MODES, "logger=wandb"],
-            }.get(kind)
-            with pytest.MonkeyPatch.context() as monkeypatch:
-                monkeypatch.delenv("WANDB_MODE", raising=False)
-                monkeypatch.chdir(out.parent)
-                assert call(monkeypatch, *(arguments or ["fit", *fit_settings(pipeline, kind)]), f"out={out}") == 0
-            made[kind] = (*offline_runs(out), out)
-        return made[kind]
+        out = tmp_path_factory.mktemp("wandb") / "run"
+        test = ["test", f"ckpt={pipeline.diffusion / 'checkpoints/last.ckpt'}"]
+        tests = {TEST: [*test, "evaluation.scoring.samples=2", "trainer.accelerator=cpu"], MODES: [*test, *FEW_MODES]}
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            monkeypatch.delenv("WANDB_MODE", raising=False)
+            monkeypatch.delenv("WANDB_DATA_DIR", raising=False)
+            monkeypatch.chdir(out.parent)
+            given = tests[kind] if kind in tests else ["fit", *fit_settings(pipeline, kind)]
+            assert call(monkeypatch, *given, "logger=wandb", f"out={out}") == 0
+        return (*offline_runs(out), out)
 
     return make
 
@@ -121,11 +111,8 @@ def test_a_test_tells_each_scene_by_pictures_and_scores(run):
                 assert row[f"{prefix}{region}_{view}_psnr"] == pytest.approx(expected)
     pictures = {name: Image.open(files[row[name]["path"]]) for name in list(row)[1:6]}
     # 32 px four times enlarged; the reference view and its two targets.
-    assert {name: picture.size for name, picture in pictures.items()} == {
-        name: (128, 128) if name == "input" else (3 * 128, 128) for name in pictures
-    }
-    reference = pictures["truth"].crop((0, 0, 128, 128))
-    assert same(reference, pictures["input"])
+    assert [picture.size for picture in pictures.values()] == [(128, 128), *[(3 * 128, 128)] * 4]
+    assert same(pictures["truth"].crop((0, 0, 128, 128)), pictures["input"])
     assert not same(pictures["sample 1"], pictures["sample 2"])
     assert len(imageio.imread(files[row["turntable"]["path"]], extension=".mp4")) == 48
     assert all(path.is_relative_to(out) for path in files.values())
@@ -148,17 +135,18 @@ def test_jobs_of_a_sweep_are_a_group_and_a_continued_job_is_the_same_run(command
         return step(self, scenes, index)
 
     monkeypatch.setattr(ReconstructionModule, "training_step", failing)
-    sweep = ["-m", *fit_settings(pipeline, STAGE1), "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    sweep = ["-m", *fit_settings(pipeline, STAGE1), "logger=wandb", "seed=0,1", f"out={tmp_path / 'some_sweep'}"]
     sweep += ["test=false", "callbacks.checkpoint.every_n_train_steps=1", "callbacks.pictures=null"]
     with pytest.raises(RuntimeError, match="the first job"):
         command("fit", *sweep)
     assert command("fit", *sweep).status == 0
     first, second = (offline_runs(tmp_path / "some_sweep" / f"seed-{seed}") for seed in (0, 1))
     assert [[one.only("exit").exit_code for one in job] for job in (first, second)] == [[1, 0], [0]]
-    told = [[(one.only("run").run_group, one.only("run").display_name) for one in job] for job in (first, second)]
-    assert told == [[("some_sweep", "seed-0")] * 2, [("some_sweep", "seed-1")]]
-    ids = [[one.only("run").run_id for one in job] for job in (first, second)]
-    assert ids[0][0] == ids[0][1] != ids[1][0]
+    started, continued, other = (one.only("run") for one in (*first, *second))
+    told = [(one.run_group, one.display_name) for one in (started, continued, other)]
+    assert told == [("some_sweep", "seed-0"), ("some_sweep", "seed-0"), ("some_sweep", "seed-1")]
+    assert started.run_id == continued.run_id != other.run_id
     steps = [[row["trainer/global_step"] for row in one.history if "train/mse" in row] for one in first]
     assert steps[0] == [0]
     assert set(steps[1]) == {1, 2}  # and behind the end the last figures again

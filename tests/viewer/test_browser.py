@@ -55,13 +55,6 @@ def page(tmp_path_factory):
     made.close()
 
 
-@pytest.fixture(scope="module")
-def tab(chromium, page):
-    tab = open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
-    yield tab
-    tab.close()
-
-
 def open_tab(chromium, address: str):
     tab = chromium.new_page(viewport=WINDOW)
     tab.goto(address)
@@ -71,12 +64,16 @@ def open_tab(chromium, address: str):
     return tab
 
 
+@pytest.fixture(scope="module")
+def tab(chromium, page):
+    return open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
+
+
 def pixels(tab) -> np.ndarray:
     """The scene's part of the window, [height width 3]."""
     tab.locator("canvas").first.wait_for(timeout=1000 * SECONDS)
     canvas = max(tab.locator("canvas").all(), key=lambda c: c.bounding_box()["width"])
-    shot = np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
-    return shot
+    return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
 
 
 def until(true, what: str) -> None:
@@ -144,7 +141,6 @@ def test_a_layer_disappears_when_it_is_switched_off(tab):
 
 
 def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
-    """In two browsers: what one asks for appears in the other, without loading anything again."""
     file = tmp_path / "photo.png"
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (4, 4, 3), np.uint8)).resize((64, 64)).save(file)
@@ -162,22 +158,10 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     changed(tab, first)
 
 
-def test_a_second_browser_shows_the_same_scene(tab, page, chromium):
-    page.show([balls_sample()])
-    first = settled(tab)
-    other = open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
-    second = settled(other)
-    for _, color in BALLS.values():
-        assert place(second, color) == pytest.approx(place(first, color), abs=2)
-    other.close()
-
-
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
     page.show([balls_sample()])
     write_page(page.server, tmp_path / "page.html")
-    alone = open_tab(chromium, f"file://{tmp_path / 'page.html'}")
-    seen = settled(alone)
+    seen = settled(open_tab(chromium, f"file://{tmp_path / 'page.html'}"))
     expected = ours(*seen.shape[:2], shrink=3)
     for _, color in BALLS.values():
         assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1)
-    alone.close()

@@ -8,7 +8,7 @@ import torch
 from viewer_scenes import balls, balls_sample
 
 from completesplat.gaussians import concatenate
-from completesplat.geometry.cameras import Cameras, invert_rigid, look_at
+from completesplat.geometry.cameras import look_at
 from completesplat.viewer.stage import arrangement_of, depth_colored, layer_of, to_splats
 
 
@@ -24,15 +24,12 @@ def test_one_sample_is_seen_as_its_reference_camera_sees_it():
     assert arrangement.shift(0).tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("count", [2, 3, 8])
+@pytest.mark.parametrize("count", [2, 8])
 def test_all_of_a_row_are_in_view_and_none_overlap(count):
-    sample = balls_sample()
-    arrangement = arrangement_of([sample] * count)
+    arrangement = arrangement_of([balls_sample()] * count)
     shifts = np.stack([arrangement.shift(i) for i in range(count)])
     assert shifts.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-5)
-    picture = (
-        2 * arrangement.pivots[0][2].item() * np.tan(np.radians(25))
-    )  # the width that the reference camera sees there
+    picture = 2 * arrangement.pivots[0][2].item() * np.tan(np.radians(25))  # the width that its camera sees there
     assert (np.diff(shifts[:, 0]) > picture).all()
     half_width = arrangement.distance * np.tan(arrangement.fov / 2) * 1.1  # a window a little wider than high
     assert abs(shifts[:, 0]).max() + picture / 2 < half_width
@@ -44,18 +41,17 @@ def test_a_camera_stays_while_the_scene_changes_a_little():
     nudged = replace(sample, gaussians=replace(sample.gaussians, means=sample.gaussians.means * 1.01))
     assert arrangement_of([nudged]).looks_like(one)
     assert not arrangement_of([sample, sample]).looks_like(one)
-    turned = invert_rigid(look_at(torch.tensor([3.0, 0, 4]), torch.tensor([0.0, 0, 4]), torch.tensor([0.0, -1, 0])))
-    camera = Cameras(invert_rigid(turned), sample.reference.intrinsics, sample.reference.image_size)
-    assert not arrangement_of([replace(sample, reference=camera)]).looks_like(one)
+    aside = look_at(torch.tensor([3.0, 0, 4]), torch.tensor([0.0, 0, 4]), torch.tensor([0.0, -1, 0]))
+    turned = replace(sample, reference=replace(sample.reference, world_to_camera=aside))
+    assert not arrangement_of([turned]).looks_like(one)
 
 
 def test_covariances_stretch_directions_as_the_axes_say():
     """The variance along each of a Gaussian's axes, found by rotating unit vectors one by one, is its scale squared."""
     gaussians = balls(points=5)
     splats = to_splats(gaussians)
-    for quaternion, scales, covariance in zip(
-        gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats.covariances, strict=True
-    ):
+    parts = gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats.covariances
+    for quaternion, scales, covariance in zip(*parts, strict=True):
         w, *xyz = (quaternion / np.linalg.norm(quaternion)).tolist()
         for axis, scale in zip(np.eye(3), scales, strict=True):
             turned = axis + 2 * np.cross(xyz, np.cross(xyz, axis) + w * axis)  # of the quaternion product q v q*
@@ -63,7 +59,7 @@ def test_covariances_stretch_directions_as_the_axes_say():
             assert covariance @ turned == pytest.approx(turned * (scale / splats.scale) ** 2, rel=1e-3, abs=1e-1)
 
 
-@pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("size", [1e-4, 1e4])
 def test_half_precision_keeps_the_shapes_at_every_size(size):
     gaussians = balls(points=5)
     scaled = to_splats(replace(gaussians, scales=gaussians.scales * size))
@@ -92,8 +88,7 @@ def test_the_layers_are_the_parts_in_order():
     gaussians = balls(points=3)
     parts = [layer_of(gaussians, layer, 4) for layer in range(4)]
     assert [part.count for part in parts] == [3] * 4
-    for one, other in zip(vars(concatenate(parts)).values(), vars(gaussians).values(), strict=True):
-        assert torch.equal(one, other)
+    torch.testing.assert_close(vars(concatenate(parts)), vars(gaussians), atol=0, rtol=0)
 
 
 def test_depth_colours_brighten_towards_the_camera_on_one_scale():
