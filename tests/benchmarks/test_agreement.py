@@ -66,6 +66,8 @@ def test_alphas_that_are_slightly_off_agree_where_that_is_tolerated(random_scene
     assert compare(rasterizer, *random_scene)["agrees"] is False
     monkeypatch.setitem(TOLERANCE, "tiled", 1e-4)
     assert compare(rasterizer, *random_scene)["agrees"] is True
+    row = compare(changed(lambda images: replace(images, alpha=math.nan * images.alpha)), *random_scene)
+    assert (row["agrees"], row["alpha"]) == (False, None)
 
 
 def test_each_backend_has_its_row_but_for_the_reference(random_scene) -> None:
