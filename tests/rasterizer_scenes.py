@@ -45,10 +45,8 @@ def draw_scene(generator: torch.Generator, batch: int, views: int, size: tuple[i
     matrices = look_at(eyes, uniform(-0.2, 0.2, batch, views, 3), torch.tensor([0.1, -1.0, 0.2]))
     height, width = size
     intrinsics = torch.eye(3).repeat(batch, views, 1, 1)
-    intrinsics[..., 0, 0] = uniform(0.8, 1.4, batch, views) * width
-    intrinsics[..., 1, 1] = uniform(0.8, 1.4, batch, views) * height
-    intrinsics[..., 0, 2] = uniform(0.4, 0.6, batch, views) * width
-    intrinsics[..., 1, 2] = uniform(0.4, 0.6, batch, views) * height
+    for row, column, low, high in ((0, 0, 0.8, 1.4), (1, 1, 0.8, 1.4), (0, 2, 0.4, 0.6), (1, 2, 0.4, 0.6)):
+        intrinsics[..., row, column] = uniform(low, high, batch, views) * (width, height)[row]
     return gaussians, Cameras(matrices, intrinsics, size)
 
 
@@ -97,15 +95,12 @@ def render_with_gradients(
     """The images, and the gradients of all inputs under these cotangents of colour, depth and alpha."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     cameras = cameras.map(lambda tensor: tensor.detach().requires_grad_())
-    inputs = vars(gaussians) | {"world_to_camera": cameras.world_to_camera}
-    if intrinsics:
-        inputs |= {"intrinsics": cameras.intrinsics}
-    else:
-        cameras.intrinsics.requires_grad_(False)
+    cameras.intrinsics.requires_grad_(intrinsics)
+    followed = ("world_to_camera", "intrinsics") if intrinsics else ("world_to_camera",)
+    inputs = vars(gaussians) | {name: getattr(cameras, name) for name in followed}
     rendering = rasterizer(gaussians, cameras)
-    images = [rendering.color, rendering.depth, rendering.alpha]
     # In one sum: an image of nothing but constants has no gradient of its own.
-    total = sum((image * cotangent).sum() for image, cotangent in zip(images, cotangents, strict=True))
+    total = sum((image * c).sum() for image, c in zip(vars(rendering).values(), cotangents, strict=True))
     gradients = torch.autograd.grad(total, list(inputs.values()))
     return rendering.detach(), dict(zip(inputs, gradients, strict=True))
 
@@ -132,9 +127,9 @@ def assert_agrees(
     doubles = [tensor.double() for tensor in cotangents]
     gaussians, cameras = gaussians.to(torch.float64), cameras.to(torch.float64)
     exact, exact_gradients = render_with_gradients(ReferenceRasterizer(constants), gaussians, cameras, doubles)
-    for name in ("color", "depth", "alpha"):
-        difference, size = getattr(found, name) - getattr(exact, name), getattr(exact, name).norm()
+    for name, expected in vars(exact).items():
+        difference = getattr(found, name) - expected
         assert difference.abs().max() <= image, name
-        assert difference.norm() <= image * size, name
+        assert difference.norm() <= image * expected.norm(), name
     for name in of or exact_gradients:
         assert (gradients[name] - exact_gradients[name]).norm() <= gradient * exact_gradients[name].norm(), name

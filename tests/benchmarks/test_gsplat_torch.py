@@ -5,39 +5,29 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
+from degenerate_gaussians import NEVER_DRAWN, changed, draw
+from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, scenes
 
 from completesplat.benchmarks import gsplat_torch
-from completesplat.benchmarks.gsplat_torch import GsplatTorchRasterizer, intersect_tiles, weights_along_rays
+from completesplat.benchmarks.gsplat_torch import GsplatTorchRasterizer, intersect_tiles
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import RenderingConstants
 
 
 @pytest.mark.parametrize(("seed", "size"), [(0, (13, 17)), (1, (40, 36)), (2, (9, 23))])
-def test_images_and_gradients_agree_with_the_float64_reference(
-    seed: int, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_and_gradients_agree_with_the_float64_reference(seed: int, size, monkeypatch) -> None:
     constants = RenderingConstants() if seed else replace(OTHER_CONSTANTS, frustum_margin=0.3)
     pytest.importorskip("gsplat")
     monkeypatch.setattr(gsplat_torch, "BUDGET", 2**14)  # so that a small scene takes several chunks
     gaussians, cameras = scenes(seed, 2, 3, size, constants)
-    assert_agrees(
-        GsplatTorchRasterizer(constants), constants, gaussians, cameras, seed, 1e-4, 1e-3, tuple(vars(gaussians))
-    )
+    of = tuple(vars(gaussians))
+    assert_agrees(GsplatTorchRasterizer(constants), constants, gaussians, cameras, seed, 1e-4, 1e-3, of)
 
 
 def test_nothing_to_draw() -> None:
     pytest.importorskip("gsplat")
-    gaussians, cameras = scenes(3, 1, 2, (7, 11), RenderingConstants(), count=3)
-    found, gradients = render_with_gradients(
-        GsplatTorchRasterizer(),
-        gaussians.map(lambda tensor: tensor - 100 if tensor.shape == gaussians.means.shape else tensor),
-        cameras,
-        cotangents_for(cameras, 3),
-    )
-    assert not found.color.any()
-    assert not found.alpha.any()
-    assert not any(gradient.any() for gradient in gradients.values())
+    images, gradients = draw(GsplatTorchRasterizer(), changed(NEVER_DRAWN["behind the camera"]), intrinsics=False)
+    assert not any(tensor.any() for tensor in (images, *gradients.values()))
 
 
 def test_the_lists_of_tiles_are_those_of_gsplat() -> None:
@@ -54,25 +44,11 @@ def test_the_lists_of_tiles_are_those_of_gsplat() -> None:
     assert torch.equal(listed, expected.long())
 
 
-def test_weights_along_rays_are_those_of_each_ray_alone() -> None:
-    alphas = torch.rand(50, generator=torch.Generator().manual_seed(0)) * 0.99
-    pixels = torch.tensor([3] * 20 + [1] + [7] * 29)
-    expected = []
-    for part in alphas.split([20, 1, 29]):
-        transmittance = 1.0
-        for alpha in part.tolist():
-            expected.append(alpha * transmittance)
-            transmittance *= 1 - alpha
-    assert torch.allclose(weights_along_rays(alphas, pixels), torch.tensor(expected), rtol=1e-5, atol=1e-30)
-
-
-def test_a_frustum_margin_that_gsplat_does_not_have_is_refused() -> None:
+def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a frustum margin that gsplat does not have, and where there is no gsplat."""
     pytest.importorskip("gsplat")
     with pytest.raises(CompleteSplatError, match="frustum_margin"):
         GsplatTorchRasterizer(OTHER_CONSTANTS)
-
-
-def test_without_gsplat_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     monkeypatch.setitem(sys.modules, "gsplat.cuda", None)
     with pytest.raises(CompleteSplatError, match="pip install gsplat"):

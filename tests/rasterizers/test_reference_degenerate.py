@@ -1,8 +1,10 @@
 """Bad Gaussians: the image and all gradients stay finite, and the healthy rest does not notice them."""
 
+from functools import partial
+
 import pytest
 import torch
-from degenerate_gaussians import DRAWN, INF, NAN, NEVER_DRAWN, assert_as_good_as_absent, changed, draw, healthy
+from degenerate_gaussians import DRAWN, NEVER_DRAWN, assert_as_good_as_absent, changed, draw, healthy
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
@@ -13,11 +15,6 @@ DTYPES = [torch.float32, torch.float64]
 
 LEFT_OUT = NEVER_DRAWN | {
     "on the camera's plane": {"means": (1.0, 0.5, 0.0)},
-    "depth NaN": {"means": (0.0, 0.0, NAN)},
-    "mean infinite": {"means": (INF, 0.0, 2.0)},
-    "mean far aside in both axes": {"means": (-1e30, 1e30, 2.0)},
-    "mean far behind": {"means": (1e30, -1e30, -1e30)},
-    "scale whose square overflows": {"scales": (1e30, 1e30, 1e30)},
     "one scale whose square overflows": {"scales": (1e30, 0.1, 0.1), "quaternions": (1.0, 2.0, 3.0, 4.0)},
     "scale whose determinant overflows": {"scales": (1e12, 1e12, 1e12), "quaternions": (1.0, 2.0, 3.0, 4.0)},
 }
@@ -28,7 +25,6 @@ EXTREME = DRAWN | {
         "quaternions": (-0.9036192297935486, 1.5352706909179688, -0.6311081051826477, -0.4898175895214081),
         "scales": (389714.34375, 0.00031615764601156116, 0.00031615764601156116),
     },
-    "scale 1e3": {"scales": (1e3, 1e3, 1e3)},
     "needle 1e-6": {"scales": (1e3, 1e-6, 1e-6)},
     "just beyond the near plane, far aside": {"means": (50.0, 0.0, 0.0101)},
     "very far in the corner": {"means": (1e30, 1e30, 1e30)},
@@ -39,8 +35,7 @@ def one(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
     return changed(changes).to(dtype)
 
 
-def render_and_differentiate(gaussians: Gaussians) -> tuple[Tensor, dict[str, Tensor]]:
-    return draw(ReferenceRasterizer(), gaussians)
+render_and_differentiate = partial(draw, ReferenceRasterizer())
 
 
 def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
@@ -81,11 +76,11 @@ def test_nothing_is_drawn_where_rounding_makes_the_exponent_positive() -> None:
     assert alphas[0, 0] == 0
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count: int, dtype: torch.dtype) -> None:
-    gaussians = concatenate([healthy(0).to(dtype), *[one(LEFT_OUT["behind the camera"], dtype)] * count])
-    image, gradients = render_and_differentiate(gaussians)
+@pytest.mark.parametrize("count", [0, 5])
+def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count: int) -> None:
+    image, gradients = render_and_differentiate(
+        concatenate([healthy(0), *[changed(NEVER_DRAWN["behind the camera"])] * count])
+    )
     assert not image.any()
     assert gradients["means"].shape == (1, count, 3)
     assert not any(gradient.any() for gradient in gradients.values())

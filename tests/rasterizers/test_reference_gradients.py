@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from rasterizer_scenes import CONSTANTS, assert_agrees, scenes
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
@@ -9,9 +10,7 @@ from completesplat.geometry.cameras import Cameras, look_at
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, alphas_at, project_gaussians
 
-CONSTANTS = RenderingConstants()
 SIZE = (4, 5)
-MARGIN = 1e-4  # a step of 1e-6 moves an alpha by less than this
 INPUTS = ("means", "quaternions", "scales", "opacities", "colors", "world_to_camera", "intrinsics")
 
 
@@ -50,52 +49,34 @@ def render(*values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return rendering.color, rendering.depth, rendering.alpha
 
 
-def discontinuities(scene: dict[str, Tensor]) -> tuple[float, Tensor, Tensor]:
-    """The smallest distance to any jump or kink; the alphas before clamp and threshold, and the transmittances."""
-    gaussians = Gaussians(*(scene[name] for name in INPUTS[:5]))
-    camera = Cameras(scene["world_to_camera"], scene["intrinsics"], SIZE)
+def alphas_of(scene: dict[str, Tensor]) -> Tensor:
+    """Before clamp and threshold, from front to back."""
+    gaussians, camera = Gaussians(*(scene[name] for name in INPUTS[:5])), Cameras(*map(scene.get, INPUTS[5:]), SIZE)
     centers, depths, covariances = project_gaussians(gaussians, camera, CONSTANTS)
-    order = depths.argsort()
     rows, columns = torch.meshgrid(torch.arange(SIZE[0]), torch.arange(SIZE[1]), indexing="ij")
     pixels = torch.stack([columns, rows], dim=-1).flatten(0, 1).double() + 0.5
     free = RenderingConstants(min_alpha=0.0, max_alpha=2.0)
-    alphas = alphas_at(pixels, centers, covariances, gaussians.opacities, free)[order]
-    used = torch.where(alphas < CONSTANTS.min_alpha, 0, alphas.clamp(max=CONSTANTS.max_alpha))
-    transmittances = torch.cumprod(1 - used, dim=0)
-    extent, focal = torch.tensor([5.0, 4.0]), scene["intrinsics"].diagonal()[:2]
-    beyond = 0.3 * extent / 2
-    inside = torch.minimum(centers + beyond, extent + beyond - centers) / focal  # in units of the slope
-    distances = [
-        (alphas - CONSTANTS.min_alpha).abs().min(),
-        (alphas - CONSTANTS.max_alpha).abs().min(),
-        10 * (transmittances - CONSTANTS.min_transmittance).abs().min(),
-        inside.abs().min(),
-        depths.sort().values.diff().min(),
-        depths.min() - CONSTANTS.near_plane,
-    ]
-    return min(d.item() for d in distances), alphas, transmittances
+    return alphas_at(pixels, centers, covariances, gaussians.opacities, free)[depths.argsort()]
 
 
-def test_the_soft_scene_is_smooth_and_has_contributions_on_both_sides_of_the_threshold() -> None:
-    distance, alphas, transmittances = discontinuities(soft_scene())
-    assert distance > MARGIN
-    assert (alphas < CONSTANTS.min_alpha).any()
-    assert (alphas > CONSTANTS.min_alpha).sum() > 20
-    assert transmittances.min() > CONSTANTS.min_transmittance
+def test_the_soft_scene_skips_and_the_opaque_one_clamps_and_stops() -> None:
+    """Without touching a limit, which finite differences would show."""
+    soft, opaque = alphas_of(soft_scene()), alphas_of(opaque_scene())
+    assert (soft < CONSTANTS.min_alpha).any()
+    assert (soft > CONSTANTS.min_alpha).sum() > 20
+    assert (soft < CONSTANTS.max_alpha).all()
+    assert (opaque > CONSTANTS.max_alpha).any()
+    left = torch.cumprod(1 - opaque.clamp(max=CONSTANTS.max_alpha), dim=0)[-1]
+    assert left.min() < CONSTANTS.min_transmittance < left.max()
 
 
-def test_the_opaque_scene_clamps_and_stops_without_touching_either_limit() -> None:
-    distance, alphas, transmittances = discontinuities(opaque_scene())
-    assert distance > MARGIN
-    assert (alphas > CONSTANTS.max_alpha).any()
-    stopped = transmittances < CONSTANTS.min_transmittance
-    assert stopped.any()
-    assert not stopped.all(dim=1)[-1]
+def test_single_precision_gradients_agree_with_double() -> None:
+    assert_agrees(ReferenceRasterizer(), CONSTANTS, *scenes(0, 1, 1, (9, 13), CONSTANTS), 0)
 
 
 @pytest.mark.parametrize("name", INPUTS)
 @pytest.mark.parametrize("make", [soft_scene, opaque_scene])
-def test_gradients_agree_with_finite_differences(make, name: str) -> None:  # type: ignore[no-untyped-def]
+def test_gradients_agree_with_finite_differences(make, name: str) -> None:
     scene = make()
 
     def function(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -103,19 +84,5 @@ def test_gradients_agree_with_finite_differences(make, name: str) -> None:  # ty
 
     value = scene[name].clone().requires_grad_()
     assert torch.autograd.gradcheck(function, value, eps=1e-6, atol=1e-7, rtol=1e-5, fast_mode=False)
-    (gradient,) = torch.autograd.grad(sum(out.sum() for out in function(value)), value)  # type: ignore[arg-type]
+    (gradient,) = torch.autograd.grad(sum(out.sum() for out in function(value)), value)
     assert gradient.abs().max() > 1e-4
-
-
-def test_single_precision_gradients_agree_with_double() -> None:
-    scene = soft_scene()
-    gradients = []
-    for dtype in (torch.float32, torch.float64):
-        values = [value.to(dtype).requires_grad_() for value in scene.values()]
-        generator = torch.Generator().manual_seed(0)
-        outputs = render(*values)
-        weights = [torch.rand(out.shape, generator=generator, dtype=torch.float64).to(dtype) for out in outputs]
-        loss = sum((w * out).sum() for w, out in zip(weights, outputs, strict=True))
-        gradients.append(torch.autograd.grad(loss, values))  # type: ignore[arg-type]
-    for single, double in zip(*gradients, strict=True):
-        assert (single.double() - double).norm() <= 1e-5 * double.norm()

@@ -1,36 +1,21 @@
 """The reference rasterizer on random scenes: exact Jacobians, sums to one, and an independent loop over pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
-from rasterizer_scenes import CONSTANTS, f64, render
+from rasterizer_scenes import CONSTANTS, draw_scene, f64, render
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, look_at, pinhole, transform_points
+from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.rasterizers.reference import ReferenceRasterizer, project_gaussians
 
 
-def random_scene(
-    batch: int, view: int, count: int, seed: int, size: tuple[int, int] = (10, 14)
-) -> tuple[Gaussians, Cameras]:
-    """Gaussians around the origin, seen from random places by cameras with an off-centre principal point."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def rand(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
-    gaussians = Gaussians(
-        rand(batch, count, 3) * 2 - 1,
-        rand(batch, count, 4) * 2 - 1,
-        0.02 + 0.3 * rand(batch, count, 3),
-        rand(batch, count),
-        rand(batch, count, 3),
-    )
-    eyes = torch.nn.functional.normalize(rand(batch, view, 3) - 0.5, dim=-1) * 2.5
-    poses = look_at(eyes, 0.2 * rand(batch, view, 3), f64(0.1, 1, 0.2))
-    intrinsics = (pinhole(50, size[1]).double() + f64([0, 0, 1.3], [0, 0.9, -3.1], [0, 0, 0])).repeat(batch, view, 1, 1)
-    return gaussians, Cameras(poses, intrinsics, size)
+def random_scene(batch: int, views: int, count: int, seed: int, size=(10, 14)) -> tuple[Gaussians, Cameras]:
+    drawn = draw_scene(torch.Generator().manual_seed(seed), batch, views, size, count)
+    return tuple(part.to(torch.float64) for part in drawn)
 
 
 def test_projected_covariances_are_the_exact_jacobians_inside_the_frustum() -> None:
@@ -54,36 +39,25 @@ def test_projected_covariances_are_the_exact_jacobians_inside_the_frustum() -> N
 
 
 def test_over_puts_the_background_behind() -> None:
-    gaussians, cameras = random_scene(2, 2, 30, seed=2)
+    """A scene of one colour over that colour is that colour: weights and transmittance sum to one at every pixel."""
+    gaussians, cameras = random_scene(2, 2, 60, seed=2)
     rendering = ReferenceRasterizer()(gaussians, cameras)
-    torch.testing.assert_close(rendering.over(0.0), rendering.color)
-    white = rendering.over(1.0)
-    torch.testing.assert_close(white - rendering.color, (1 - rendering.alpha).expand_as(white))
-    picture = torch.rand(2, 2, 3, 10, 14, dtype=torch.float64)
-    torch.testing.assert_close(rendering.over(picture), rendering.color + (1 - rendering.alpha) * picture)
-
-
-def test_a_scene_of_one_colour_over_that_colour_is_that_colour() -> None:
-    """Weights and transmittance sum to one at every pixel."""
-    gaussians, cameras = random_scene(1, 2, 60, seed=3)
+    for background in (0.0, 1.0, torch.rand(2, 2, 3, 10, 14, dtype=torch.float64)):
+        torch.testing.assert_close(rendering.over(background), rendering.color + (1 - rendering.alpha) * background)
     color = f64(0.3, 0.6, 0.8)
-    painted = Gaussians(
-        gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, color.expand_as(gaussians.colors)
-    )
-    image = ReferenceRasterizer()(painted, cameras).over(color.reshape(1, 1, 3, 1, 1))
-    torch.testing.assert_close(image, color[:, None, None].expand_as(image))
+    image = ReferenceRasterizer()(replace(gaussians, colors=color.expand_as(gaussians.colors)), cameras)
+    over = image.over(color.reshape(1, 1, 3, 1, 1))
+    torch.testing.assert_close(over, color[:, None, None].expand_as(over))
 
 
 def test_scenes_and_views_of_a_batch_do_not_mix() -> None:
     gaussians, cameras = random_scene(2, 3, 25, seed=4)
     together = ReferenceRasterizer()(gaussians, cameras)
     assert together.color.shape == (2, 3, 3, 10, 14)
-    assert together.depth.shape == together.alpha.shape == (2, 3, 1, 10, 14)
-    for b in range(2):
-        for v in range(3):
-            alone = render(gaussians[b], cameras[b, v])
-            assert torch.equal(together[b, v].color, alone.color[0, 0])
-            assert torch.equal(together[b, v].depth, alone.depth[0, 0])
+    for b, v in np.ndindex(2, 3):
+        alone = render(gaussians[b], cameras[b, v])
+        for name, image in vars(alone).items():
+            assert torch.equal(getattr(together[b, v], name), image[0, 0])
 
 
 def loop(gaussians: Gaussians, camera: Cameras) -> np.ndarray:
@@ -129,6 +103,5 @@ def test_a_plain_loop_over_pixels_agrees(seed: int) -> None:
     scene.opacities[::3] = 1.0  # so that pixels stop early
     depths = transform_points(cameras[0, 0].world_to_camera, scene.means)[:, 2]
     scene.means[0] -= cameras[0, 0].world_to_camera[2, :3] * (depths[0] + 1)  # one behind the camera
-    rendering = render(scene, cameras[0, 0])
-    image = torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=2)[0, 0]
+    image = torch.cat(list(vars(render(scene, cameras[0, 0])).values()), dim=2)[0, 0]
     np.testing.assert_allclose(image.numpy(), loop(scene, cameras[0, 0]), atol=1e-10)

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
-from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
+from rasterizer_scenes import CONSTANTS, OTHER_CONSTANTS, assert_agrees, cotangents_for, render_with_gradients, scenes
 
 from completesplat.errors import CompleteSplatError
+from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.tiled import TiledRasterizer
@@ -18,7 +20,7 @@ SEEDS = [*range(50), *(pytest.param(seed, marks=pytest.mark.slow) for seed in ra
 def test_images_and_gradients_agree_with_the_float64_reference(seed: int) -> None:
     """On a scene of a size that depends on the seed; every other time with unusual constants."""
     sizes = [(13, 17), (16, 16), (9, 23), (31, 6), (1, 40), (24, 20), (7, 5)]
-    constants = RenderingConstants() if seed % 2 else OTHER_CONSTANTS
+    constants = CONSTANTS if seed % 2 else OTHER_CONSTANTS
     batch, views = [(1, 2), (2, 3)][seed % 5 == 0]
     gaussians, cameras = scenes(seed, batch, views, sizes[seed % len(sizes)], constants)
     assert_agrees(TiledRasterizer(constants), constants, gaussians, cameras, seed)
@@ -26,18 +28,21 @@ def test_images_and_gradients_agree_with_the_float64_reference(seed: int) -> Non
 
 @pytest.mark.parametrize("size", [(20, 300), (5, 517), (1, 1), (130, 3), (1, 18), (15, 1), (4, 4)])
 def test_images_of_any_size(size: tuple[int, int]) -> None:
-    constants = RenderingConstants()
-    gaussians, cameras = scenes(sum(size), 1, 1, size, constants, count=12)
-    assert_agrees(TiledRasterizer(constants), constants, gaussians, cameras, 0)
+    gaussians, cameras = scenes(sum(size), 1, 1, size, CONSTANTS, count=12)
+    assert_agrees(TiledRasterizer(), CONSTANTS, gaussians, cameras, 0)
+
+
+def differentiable(gaussians: Gaussians) -> Gaussians:
+    return gaussians.map(lambda tensor: tensor.detach().requires_grad_())
 
 
 def test_each_image_alone_has_a_gradient() -> None:
-    gaussians, cameras = scenes(3, 1, 2, (11, 14), RenderingConstants())
+    gaussians, cameras = scenes(3, 1, 2, (11, 14), CONSTANTS)
     cotangents = cotangents_for(cameras, 3)
     _, together = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents)
     alone = []
     for name, cotangent in zip(("color", "depth", "alpha"), cotangents, strict=True):
-        inputs = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+        inputs = differentiable(gaussians)
         image = getattr(TiledRasterizer()(inputs, cameras), name)
         alone.append(torch.autograd.grad(image, list(vars(inputs).values()), cotangent))
     for total, *parts in zip([together[name] for name in vars(gaussians)], *alone, strict=True):
@@ -53,15 +58,14 @@ def test_cameras_alone_can_be_differentiated() -> None:
     for name in ("world_to_camera", "intrinsics"):
         one = replace(cameras, **{name: getattr(cameras, name).clone().requires_grad_()})
         rendering = TiledRasterizer(OTHER_CONSTANTS)(gaussians, one)
-        images = [rendering.color, rendering.depth, rendering.alpha]
-        (gradient,) = torch.autograd.grad(images, getattr(one, name), cotangents)
+        (gradient,) = torch.autograd.grad(list(vars(rendering).values()), getattr(one, name), cotangents)
         assert torch.equal(gradient, expected[name])
         assert gradient.any()
 
 
 def test_neighbours_in_depth_that_are_one_in_float32_keep_their_order() -> None:
     """As in any large scene. The one behind comes first, so that equal keys would leave it in front."""
-    gaussians, _ = scenes(6, 1, 1, (9, 9), RenderingConstants(), count=2)
+    gaussians, _ = scenes(6, 1, 1, (9, 9), CONSTANTS, count=2)
     gaussians.means[0] = torch.tensor([[1.5e-8, 0.0, 2.5], [0.0, 0.0, 2.5]])
     pose = torch.tensor([[0.8, 0, -0.6, 1.5], [0, 1, 0, 0], [0.6, 0, 0.8, 0], [0, 0, 0, 1]])
     intrinsics = torch.tensor([[20.0, 0, 4.5], [0, 20.0, 4.5], [0, 0, 1]])
@@ -69,19 +73,17 @@ def test_neighbours_in_depth_that_are_one_in_float32_keep_their_order() -> None:
     depths = (gaussians.means[0].double() @ pose[2, :3].double()).tolist()
     assert depths[0] > depths[1]
     assert torch.tensor(depths)[0] == torch.tensor(depths)[1]
-    assert_agrees(TiledRasterizer(), RenderingConstants(), gaussians, cameras, 6)
+    assert_agrees(TiledRasterizer(), CONSTANTS, gaussians, cameras, 6)
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:
-    gaussians, cameras = scenes(5, 1, 1, (50, 70), RenderingConstants())
-    cotangents = cotangents_for(cameras, 5)
-    threads = torch.get_num_threads()
-    results = []
+    gaussians, cameras = scenes(5, 1, 1, (50, 70), CONSTANTS)
+    threads, results = torch.get_num_threads(), []
     try:
         for number in (1, 2, 2, 3):
             torch.set_num_threads(number)
-            rendering, gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents)
-            results.append([rendering.color, rendering.depth, rendering.alpha, *gradients.values()])
+            images, gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents_for(cameras, 5))
+            results.append([*vars(images).values(), *gradients.values()])
     finally:
         torch.set_num_threads(threads)
     for other in results[1:]:
@@ -89,40 +91,31 @@ def test_the_number_of_threads_changes_no_bit() -> None:
 
 
 def test_two_renderings_at_once_do_not_share_memory() -> None:
-    first, second = (scenes(seed, 1, 2, (12, 12), RenderingConstants()) for seed in (7, 8))
+    first, second = (scenes(seed, 1, 2, (12, 12), CONSTANTS) for seed in (7, 8))
     cotangents = cotangents_for(first[1], 7)
     _, expected = render_with_gradients(TiledRasterizer(), *first, cotangents)
-    inputs = first[0].map(lambda tensor: tensor.detach().requires_grad_())
-    pending = TiledRasterizer()(inputs, first[1])
+    inputs = differentiable(first[0])
+    pending = vars(TiledRasterizer()(inputs, first[1])).values()
     render_with_gradients(TiledRasterizer(), *second, cotangents)
-    gradients = torch.autograd.grad(
-        [pending.color, pending.depth, pending.alpha], list(vars(inputs).values()), cotangents
-    )
+    gradients = torch.autograd.grad(list(pending), list(vars(inputs).values()), cotangents)
     assert all(torch.equal(a, b) for a, b in zip(gradients, [expected[x] for x in vars(inputs)], strict=True))
 
 
 def test_more_views_than_are_held_at_once_without_gradients() -> None:
-    gaussians, cameras = scenes(9, 2, 6, (6, 7), RenderingConstants(), count=10)
-    with torch.no_grad():
-        together = TiledRasterizer()(gaussians, cameras).color
-    one_by_one = [
-        TiledRasterizer()(gaussians[b : b + 1], cameras[b : b + 1, v : v + 1]).color[0, 0]
-        for b in range(2)
-        for v in range(6)
-    ]
-    assert torch.equal(together.flatten(0, 1), torch.stack(one_by_one))
-
-
-def test_inputs_need_not_be_contiguous() -> None:
-    gaussians, cameras = scenes(11, 2, 2, (8, 9), RenderingConstants())
+    """And of inputs that are not contiguous."""
+    gaussians, cameras = scenes(9, 2, 6, (6, 7), CONSTANTS, count=10)
     strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], dim=-1)[..., 0])
     assert not strided.means.is_contiguous()
-    assert torch.equal(TiledRasterizer()(strided, cameras).color, TiledRasterizer()(gaussians, cameras).color)
+    with torch.no_grad():
+        together = TiledRasterizer()(strided, cameras).color
+    for b, v in np.ndindex(2, 6):
+        alone = TiledRasterizer()(gaussians[b : b + 1], cameras[b : b + 1, v : v + 1])
+        assert torch.equal(together[b, v], alone.color[0, 0])
 
 
 def test_an_input_that_changes_before_the_backward_pass_is_noticed() -> None:
-    gaussians, cameras = scenes(12, 1, 1, (8, 9), RenderingConstants())
-    inputs = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    gaussians, cameras = scenes(12, 1, 1, (8, 9), CONSTANTS)
+    inputs = differentiable(gaussians)
     color = TiledRasterizer()(inputs, cameras).color
     with torch.no_grad():
         inputs.scales.mul_(2)
@@ -131,23 +124,24 @@ def test_an_input_that_changes_before_the_backward_pass_is_noticed() -> None:
 
 
 def test_refusals() -> None:
-    gaussians, cameras = scenes(13, 1, 1, (8, 9), RenderingConstants())
-    with pytest.raises(CompleteSplatError, match="means is float64"):
-        TiledRasterizer()(gaussians.to(torch.float64), cameras)
-    with pytest.raises(CompleteSplatError, match="on meta"):
-        TiledRasterizer()(gaussians, cameras.to("meta"))
-    with pytest.raises(CompleteSplatError, match=r"means should have the shape \[2, 60, 3\], not \[1, 60, 3\]"):
-        TiledRasterizer()(gaussians, cameras.map(lambda tensor: tensor.repeat(2, 1, 1, 1)))
-    with pytest.raises(CompleteSplatError, match="blur"):
-        TiledRasterizer(RenderingConstants(blur=0.0))
-    with pytest.raises(CompleteSplatError, match="near_plane"):
-        TiledRasterizer(RenderingConstants(near_plane=-1.0))
+    gaussians, cameras = scenes(13, 1, 1, (8, 9), CONSTANTS)
+    twice = cameras.map(lambda tensor: tensor.repeat(2, 1, 1, 1))
+    for inputs, said in [
+        ((gaussians.to(torch.float64), cameras), "means is float64"),
+        ((gaussians, cameras.to("meta")), "on meta"),
+        ((gaussians, twice), r"means should have the shape \[2, 60, 3\], not \[1, 60, 3\]"),
+    ]:
+        with pytest.raises(CompleteSplatError, match=said):
+            TiledRasterizer()(*inputs)
+    for name in ("blur", "near_plane"):
+        with pytest.raises(CompleteSplatError, match=name):
+            TiledRasterizer(RenderingConstants(**{name: -1.0}))
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_cuda_tensors_are_drawn_on_the_cpu() -> None:
-    gaussians, cameras = scenes(2, 1, 2, (11, 14), RenderingConstants())
+    gaussians, cameras = scenes(2, 1, 2, (11, 14), CONSTANTS)
     cotangents = cotangents_for(cameras, 2)
     expected, expected_gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents)
     moved = [tensor.cuda() for tensor in cotangents]
