@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -62,28 +61,14 @@ def imported(folder: str) -> dict[str, set[str]]:
     return {name: {normal(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
 
 
-NEEDED = declared(PROJECT["dependencies"])
-OPTIONAL = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
-DEVELOPERS = declared(EXTRAS["dev"])
-
-
-@pytest.mark.parametrize(
-    ("folder", "allowed"),
-    [("completesplat", NEEDED | OPTIONAL), ("tests", NEEDED | DEVELOPERS)],
-    ids=["package", "tests"],
-)
-def test_everything_imported_is_declared(folder: str, allowed: set[str]) -> None:
-    assert {name: found for name, found in imported(folder).items() if not found & allowed} == {}
-
-
-@pytest.mark.parametrize(
-    ("folder", "there"), [("completesplat", NEEDED | OPTIONAL), ("tests", DEVELOPERS)], ids=["package", "tests"]
-)
-def test_everything_declared_is_imported_or_has_a_reason(folder: str, there: set[str]) -> None:
-    used = set().union(*imported(folder).values(), *imported("completesplat").values())
-    assert there - used - NEVER_IMPORTED.keys() == set()
-
-
-def test_reasons_are_given_for_what_is_declared_and_not_imported_only() -> None:
-    used = set().union(*imported("completesplat").values(), *imported("tests").values())
-    assert NEVER_IMPORTED.keys() <= (NEEDED | OPTIONAL | DEVELOPERS) - used
+def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_imported() -> None:
+    needed, developers = declared(PROJECT["dependencies"]), declared(EXTRAS["dev"])
+    optional = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
+    package, tests = imported("completesplat"), imported("tests")
+    assert {name: found for name, found in package.items() if not found & (needed | optional)} == {}
+    assert {name: found for name, found in tests.items() if not found & (needed | developers)} == {}
+    used = set().union(*package.values())
+    assert needed | optional <= used | NEVER_IMPORTED.keys()
+    used |= set().union(*tests.values())
+    assert developers <= used | NEVER_IMPORTED.keys()
+    assert NEVER_IMPORTED.keys() <= (needed | optional | developers) - used

@@ -103,11 +103,3 @@ def test_the_command_does_what_it_is_printed_for(command, folder):
         pytest.skip("no Node.js here, which html needs")
     finished = run(command, folder)
     assert finished.returncode == 0, finished.stderr[-3000:]
-
-
-def test_commands_come_after_those_that_write_what_they_name():
-    order = in_order(runnable()[::-1])
-    assert len(order) > 30
-    for index, command in enumerate(order):
-        later = {written_by(other) for other in order[index + 1 :]} - {written_by(command)}
-        assert not named_in(command) & later

@@ -6,14 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import strict_json
-
-SCRIPT = "from completesplat import cli\n\nif __name__ == '__main__':\n    cli.main()\n"
+from support import script, strict_json
 
 
 def scores(checkpoint: Path, out: Path, folder: Path, *settings: str) -> dict:
-    (folder / "start.py").write_text(SCRIPT)
-    command = [sys.executable, str(folder / "start.py"), "test", f"ckpt={checkpoint}", f"out={out}", *settings]
+    command = [sys.executable, str(script(folder)), "test", f"ckpt={checkpoint}", f"out={out}", *settings]
     subprocess.run(command, check=True, timeout=300, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"})
     metrics = strict_json(out / "metrics.json")
     assert metrics["protocol"]["scenes"] == metrics["model"]["scenes"]
