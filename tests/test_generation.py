@@ -1,8 +1,10 @@
 import copy
 import json
+import math
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -130,17 +132,13 @@ def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
     assert not same(model(photograph, half)[0], model(other, half)[0])
 
 
-def test_skips_are_off_where_something_is_hidden_and_cannot_be_on(model, picture, half):
+def test_skips_are_off_where_something_is_hidden_and_weights_out_of_place_refused(model, picture, half):
     assert same(model(picture, half)[0], model(picture, half, skip_weight=0.0)[0])
-    with pytest.raises(CompleteSplatError, match=r"skip_weight=0\.5: must be 0"):
-        model(picture, half, skip_weight=0.5)
     everything = torch.ones_like(half)
     assert same(model(picture, everything, skip_weight=1.0)[0], model(picture)[0])
-
-
-@pytest.mark.parametrize(("name", "weight"), [("skip_weight", -0.5), ("guidance_weight", float("nan"))])
-def test_weights_outside_of_0_to_1_are_refused(model, picture, half, name, weight):
-    for visible in (None, half):
+    with pytest.raises(CompleteSplatError, match=r"skip_weight=0\.5: must be 0"):
+        model(picture, half, skip_weight=0.5)
+    for visible, (name, weight) in product((None, half), {"skip_weight": -0.5, "guidance_weight": math.nan}.items()):
         with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
             model(picture, visible, steps=1, **{name: weight})
 

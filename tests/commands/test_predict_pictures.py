@@ -72,28 +72,18 @@ def test_pictures_of_one_name_get_folders_of_their_own():
 
 
 def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):
-    photos = tmp_path / "photos"
-    picture(photos / "a.jpg")
-    picture(photos / "c.png")
-    (photos / "b.jpg").write_text("no picture")
-    finished = predict(photos)
+    picture(tmp_path / "x/a.png")
+    (tmp_path / "x/b.jpg").write_text("no picture")
+    finished = predict(f"[{tmp_path / 'x'},nowhere.png,{picture(tmp_path / 'y/a.png', 'blue')}]")
     assert finished.status == 2
-    told, summary = finished.err.splitlines()
-    assert re.match("error: .*b.jpg", told)
-    assert summary == f"error: 1 of 3 pictures failed (b.jpg); the others are in {tmp_path / 'out'}"
-    done = [line.partition(":")[0] for line in finished.out.splitlines() if "/3 " in line]
-    assert done == ["1/3 a.jpg", "3/3 c.png"]
-    assert [(tmp_path / "out" / name / "scene.json").is_file() for name in "abc"] == [True, False, True]
-    assert not (tmp_path / "out/b").exists()
-
-
-def test_a_list_may_name_files_of_one_name_and_missing_ones(predict, tmp_path):
-    one, other = picture(tmp_path / "x/a.png"), picture(tmp_path / "y/a.png", "blue")
-    finished = predict(f"[{one},{other},nowhere.png]")
-    assert finished.status == 2
-    assert "nowhere.png: no such file" in finished.err
-    files = {name: {path.name for path in (tmp_path / "out" / name).iterdir()} for name in ("a", "a_2")}
-    assert files["a"] == files["a_2"] == {"sample_00.ply", "sheet.png", "scene.json"}
+    broken, missing, summary = finished.err.splitlines()
+    assert re.match("error: .*b.jpg", broken)
+    assert "nowhere.png: no such file" in missing
+    assert summary == f"error: 2 of 4 pictures failed (b.jpg, nowhere.png); the others are in {tmp_path / 'out'}"
+    done = [line.partition(":")[0] for line in finished.out.splitlines() if "/4 " in line]
+    assert done == ["1/4 a.png", "4/4 a.png"]
+    found = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
+    assert sorted(found) == [(a, name) for a in ("a", "a_2") for name in ("sample_00.ply", "scene.json", "sheet.png")]
     assert (tmp_path / "out/a/sample_00.ply").read_bytes() != (tmp_path / "out/a_2/sample_00.ply").read_bytes()
 
 
