@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import pytest
 from filelock import FileLock
-from support import SMALL, call
+from support import SMALL, call, tiny_generator
 
 from completesplat.data.toy import write_objects
 
@@ -95,6 +95,12 @@ def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> 
     """The training set, encoded by the pipeline's stage 1."""
     given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
     return built_once("latents", lambda folder: made(folder / "cache", "data", "latents", *given)) / "cache"
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(built_once: Folders) -> Path:
+    """Of an untrained model for pictures of 32 x 32."""
+    return built_once("weights", lambda folder: tiny_generator().save_pretrained(folder))
 
 
 class Finished(NamedTuple):

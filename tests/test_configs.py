@@ -35,11 +35,7 @@ def test_nothing_in_the_tree_is_forgotten_here():
     assert all(compose_config(verb).out.startswith(f"outputs/{verb}/") for verb in VERBS)
 
 
-PAPERS_FIRST_STAGES = ("co3d_var_stage1", "re10k_var_stage1")
-FILES_OF_PROTOCOLS = {f"realestate10k_{size}": "evaluation_index" for size in (128, 256)}
-FILES_OF_PROTOCOLS["realestate10k_100"] = "scene_list"
-PARTS = ["autoreconstructor", "conditioning", "denoiser", "sampler", "rasterizer", "loss", "data"]
-SURROUNDINGS = ["optimizer", "schedule", "callbacks", "logger", "trainer"]
+WHOLES = ["model", "experiment", "ablation", "evaluation"]
 # Options of other groups differ in one part of a run only, so that one configuration has one of each group.
 DELTAS = ["experiment", "ablation"]
 
@@ -48,10 +44,11 @@ def needed(group: str, option: str) -> list[str]:
     """What else has to be said for an option, so that nothing is missing in the configuration."""
     given = ["data.category=y"] if option == "co3d_category" else []
     given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
-    given += ["autoreconstructor.pretrained=null"] if option in (*PAPERS_FIRST_STAGES, "stable_diffusion") else []
+    given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
     stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
-    given += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
+    given += ["evaluation.scene_list=x"] if option == "realestate10k_100" else []
+    given += ["evaluation.evaluation_index=x"] if option in ("realestate10k_128", "realestate10k_256") else []
     return given + (NEEDED if stage2 or option == "latent_diffusion" else [])
 
 
@@ -72,7 +69,7 @@ def test_every_option_composes_and_what_it_describes_is_built(group, option):
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     if group == "rasterizer":
         assert instantiate(config.rasterizer.constants) == RenderingConstants()
-    if group not in (*PARTS, *SURROUNDINGS) or (option == "cuda" and not torch.cuda.is_available()):
+    if group in WHOLES or (option == "cuda" and not torch.cuda.is_available()):
         return
     if group == "autoreconstructor":
         config.autoreconstructor.pretrained = None

@@ -28,13 +28,6 @@ def folder(model, tmp_path):
     return tmp_path / "weights"
 
 
-@pytest.fixture
-def unsealed(folder):
-    """A folder that anything may be changed in: without checksums."""
-    (folder / SUMS_FILE).unlink()
-    return folder
-
-
 @pytest.fixture(scope="module")
 def picture(toy_root):
     return sorted(toy_root.glob("*/*/images/*.jpg"))[0]
@@ -163,26 +156,28 @@ def test_another_sampler_is_saved_with_the_weights(model, picture, tmp_path):
     assert same(loaded(picture)[0], changed(picture)[0])
 
 
-def test_files_that_are_damaged_missing_or_of_another_model_are_refused(unsealed):
-    path = unsealed / WEIGHTS_FILE
+def test_files_that_are_damaged_missing_or_of_another_model_are_refused(folder):
+    (folder / SUMS_FILE).unlink()
+    path = folder / WEIGHTS_FILE
     content, weights = path.read_bytes(), load_file(path)
     weights.pop("latent_scale")
     for damaged in (save(weights), content[:-1000]):
         path.write_bytes(damaged)
         with pytest.raises(WeightsError, match="cannot be loaded"):
-            CompleteSplat.from_pretrained(unsealed)
+            CompleteSplat.from_pretrained(folder)
     for name in (WEIGHTS_FILE, CONFIG_FILE):
-        (unsealed / name).unlink()
+        (folder / name).unlink()
         with pytest.raises(WeightsError, match=name):
-            CompleteSplat.from_pretrained(unsealed)
+            CompleteSplat.from_pretrained(folder)
 
 
 @pytest.mark.parametrize("target", ["os.system", "completesplat.generation.torch.load"])
-def test_a_configuration_cannot_name_foreign_code(model, unsealed, target, tmp_path):
+def test_a_configuration_cannot_name_foreign_code(model, folder, target):
+    (folder / SUMS_FILE).unlink()
     with pytest.raises(WeightsError, match="no part of a model"):
         model.replace_sampler({"_target_": target, "scheduler": {}})
-    config = json.loads((unsealed / CONFIG_FILE).read_text())
-    config["sampler"]["scheduler"] = {"_target_": target, "f": str(tmp_path / "canary")}
-    (unsealed / CONFIG_FILE).write_text(json.dumps(config))
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    config["sampler"]["scheduler"] = {"_target_": target, "f": "canary"}
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
     with pytest.raises(WeightsError, match="no part of a model"):
-        CompleteSplat.from_pretrained(unsealed)
+        CompleteSplat.from_pretrained(folder)

@@ -1,4 +1,5 @@
 import csv
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,6 +9,10 @@ from support import SMALL, compose_config, strict_json
 
 from completesplat.commands.fit import refuse_missing, run
 from completesplat.errors import CompleteSplatError
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
@@ -24,13 +29,11 @@ def test_a_run_directory_is_complete(pipeline, stage):
     record = strict_json(run / "run.json")
     assert record["command"][0] == "completesplat fit"
     assert record["commit"] is None or len(record["commit"].removesuffix("-dirty")) == 40
-    contents = torch.load(run / "checkpoints/last.ckpt", map_location="cpu", weights_only=True)
-    assert contents["global_step"] == 2
+    assert torch.load(run / "checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
 
 def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
-    stage1 = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    stage2 = torch.load(pipeline.diffusion / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    stage1, stage2 = weights(pipeline.var), weights(pipeline.diffusion)
     for name, value in stage1.items():
         kept = stage2[name.replace("model.", "completesplat.autoreconstructor.", 1)]
         torch.testing.assert_close(kept, value, rtol=0, atol=0)
@@ -43,10 +46,7 @@ def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
 def test_the_seed_decides_the_weights(command, pipeline, tmp_path):
     settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=2", "seed=0"]
     assert command("fit", *settings, f"out={tmp_path / 'again'}").status == 0
-    again = torch.load(tmp_path / "again/checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    first = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    for name, value in first.items():
-        torch.testing.assert_close(again[name], value, rtol=0, atol=0)
+    torch.testing.assert_close(weights(tmp_path / "again"), weights(pipeline.var), rtol=0, atol=0)
 
 
 SCORED = ["evaluation.resolution=48", "+evaluation.data.evaluation_targets=1", "seed=4"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from fake_converter import calls, install
 from PIL import Image
-from support import compose_config, some_gaussians, strict_json, tiny_generator
+from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands.predict import find_pictures, folder_names, run, unusual_field_of_view
 from completesplat.data.pictures.photograph import Photograph
@@ -18,14 +18,6 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.generation import CompleteSplat
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory) -> Path:
-    """Of an untrained model for pictures of 32 x 32."""
-    folder = tmp_path_factory.mktemp("weights")
-    tiny_generator().save_pretrained(folder)
-    return folder
 
 
 def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settings: object) -> list[Gaussians]:
@@ -37,11 +29,12 @@ def draw(model: CompleteSplat, photograph: Photograph, visible: object, **settin
 
 
 @pytest.fixture
-def predict(command, weights, tmp_path, monkeypatch):
+def predict(command, tiny_weights, tmp_path, monkeypatch):
     monkeypatch.setattr(CompleteSplat, "forward", draw)
 
     def start(image: object, *settings: str):
-        return command("predict", f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", *QUICK, *settings)
+        given = [f"image={image}", f"weights={tiny_weights}", f"out={tmp_path / 'out'}", *QUICK]
+        return command("predict", *given, *settings)
 
     return start
 

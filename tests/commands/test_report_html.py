@@ -23,8 +23,7 @@ def results(tmp_path_factory):
 
 def written(runs: Path, out: Path, *settings: str) -> str:
     out.mkdir(exist_ok=True)
-    config = compose_config("report", "report_task=html", f"runs={runs}", *settings)
-    start("report", config, out)
+    start("report", compose_config("report", "report_task=html", f"runs={runs}", *settings), out)
     return (out / "report.html").read_text(encoding="utf-8")
 
 

@@ -1,7 +1,6 @@
 """Sweeps: one directory a job, named by what is swept; a sweep that is started again continues."""
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -53,17 +52,14 @@ def whole(toy_root, tmp_path_factory) -> Path:
     return sweep
 
 
-def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole, tmp_path):
-    sweep = shutil.copytree(whole, tmp_path / "sweep")
-    jobs = [sweep / "seed-0", sweep / "seed-1"]
+def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root, whole):
+    jobs = [whole / "seed-0", whole / "seed-1"]
     before = {job: (job / LAST).stat().st_mtime_ns for job in jobs}
-    for job in jobs:  # the directory was moved
-        (job / "config.yaml").write_text((job / "config.yaml").read_text().replace(str(whole), str(sweep)))
-    again = command(*settings(toy_root), "seed=0,1,2", f"out={sweep}")
+    again = command(*settings(toy_root), "seed=0,1,2", f"out={whole}")
     assert again.status == 0
     assert again.out.count("finished before, not repeated") == 2
     assert {job: (job / LAST).stat().st_mtime_ns for job in jobs} == before
-    assert (sweep / "seed-2/metrics.json").is_file()
+    assert (whole / "seed-2/metrics.json").is_file()
     assert any(not torch.equal(value, weights(jobs[1])[name]) for name, value in weights(jobs[0]).items())
 
 
@@ -87,12 +83,11 @@ def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
     assert not is_finished(whole, config)
 
 
-@pytest.mark.parametrize("variables", [{"LOCAL_RANK": "0"}, {"SLURM_STEP_NUM_TASKS": "2"}], ids=["torchrun", "srun"])
-def test_a_sweep_is_not_started_by_each_process_of_a_launcher(monkeypatch, variables):
+@pytest.mark.parametrize(("name", "value"), [("LOCAL_RANK", "0"), ("SLURM_STEP_NUM_TASKS", "2")])
+def test_a_sweep_is_not_started_by_each_process_of_a_launcher(monkeypatch, name, value):
     given = ["-m", "experiment=toy_var", "seed=0,1"]
     assert sweep_arguments("fit", given, "run")
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv(name, value)
     with pytest.raises(CompleteSplatError, match="start it once"):
         sweep_arguments("fit", given, "run")
 
@@ -163,13 +158,11 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
     start = f"model.checkpoint={one}/ablation-${{hydra:runtime.choices.ablation}}+seed-${{seed}}/{LAST}"
     assert command("fit", "-m", "experiment=toy_var_stage2", *shared, start, f"out={two}").status == 0
 
-    first, second = (
-        [weights(sweep / f"ablation-{row}+seed-0") for row in ("full", "no_lpips")] for sweep in (one, two)
-    )
+    jobs = ["ablation-full+seed-0", "ablation-no_lpips+seed-0"]
+    first, second = ([weights(sweep / job) for job in jobs] for sweep in (one, two))
     assert all(torch.equal(value, first[1][name]) for name, value in first[0].items())
+    for job, trained in zip(jobs, second, strict=True):
+        assert OmegaConf.load(two / job / "config.yaml").model.checkpoint == str(one / job / LAST)
+        assert any(not torch.equal(value, first[0][name]) for name, value in trained.items())
     assert any(not torch.equal(value, second[1][name]) for name, value in second[0].items())
-    for job, row in zip(second, ("full", "no_lpips"), strict=True):
-        config = OmegaConf.load(two / f"ablation-{row}+seed-0/config.yaml")
-        assert config.model.checkpoint == str(one / f"ablation-{row}+seed-0" / LAST)
-        assert any(not torch.equal(value, first[0][name]) for name, value in job.items())
     assert len((two / "summary.csv").read_text().splitlines()) >= 3
