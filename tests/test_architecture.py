@@ -95,16 +95,12 @@ def shared_class_names(trees: Mapping[str, ast.AST]) -> dict[str, list[str]]:
     return {name: paths for name, paths in places.items() if len(paths) > 1}
 
 
-def dotted(node: ast.expr) -> str:
-    return ast.unparse(node) if isinstance(node, ast.Name | ast.Attribute) else ""
-
-
 def unsafe_calls(tree: ast.AST, path: str) -> list[str]:
     found = [f"import of {m}" for m, _ in imports(tree, path) if m.split(".")[0] in FORBIDDEN_MODULES]
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
-        name = dotted(node.func)
+        name = ast.unparse(node.func)
         keywords = {k.arg: k.value for k in node.keywords}
         if name in FORBIDDEN_CALLS:
             found.append(f"line {node.lineno}: {name}")

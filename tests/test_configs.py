@@ -16,7 +16,6 @@ from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
 
 CONF = conf_folder()
-NEEDED = ["model.autoreconstructor_checkpoint=null"]
 
 
 def options(group: str) -> list[str]:
@@ -49,7 +48,7 @@ def needed(group: str, option: str) -> list[str]:
     stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
     given += ["evaluation.scene_list=x"] if option == "realestate10k_100" else []
     given += ["evaluation.evaluation_index=x"] if option in ("realestate10k_128", "realestate10k_256") else []
-    return given + (NEEDED if stage2 or option == "latent_diffusion" else [])
+    return given + (["model.autoreconstructor_checkpoint=null"] if stage2 or option == "latent_diffusion" else [])
 
 
 def complete(group: str, option: str):

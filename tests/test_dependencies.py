@@ -9,6 +9,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -27,13 +28,8 @@ NEVER_IMPORTED = {
 }
 
 
-def normal(name: str) -> str:
-    """The name of a distribution as PyPI compares it (PEP 503)."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
 def declared(lines: Iterable[str]) -> set[str]:
-    return {normal(Requirement(line).name) for line in lines}
+    return {canonicalize_name(Requirement(line).name) for line in lines}
 
 
 def modules(path: Path) -> Iterator[str]:
@@ -58,7 +54,7 @@ def imported(folder: str) -> dict[str, set[str]]:
         names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}
     own = {"completesplat", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
     others = names - own - set(sys.stdlib_module_names)
-    return {name: {normal(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
+    return {name: {canonicalize_name(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
 
 
 def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_imported() -> None:

@@ -104,9 +104,3 @@ def test_the_data_loaders_pinning_pins_every_tensor(monkeypatch: pytest.MonkeyPa
     item = make()
     assert isinstance(pin_memory([item])[0], Outer)
     assert {id(tensor) for tensor in asked} == {id(tensor) for tensor in tensors(item)}
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_pinned_memory_on_a_device() -> None:
-    assert make().pin_memory().inner.values.is_pinned()

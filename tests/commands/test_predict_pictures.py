@@ -115,18 +115,15 @@ def test_a_converter_that_is_missing_is_told_before_the_model_is_loaded(predict,
     assert finished.err.startswith("error: formats spz, sog and html need Node.js")
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        (["formats=[ply,obj]"], "formats=obj: choose from ply, splat, spz, sog, html"),
-        (["video=zoom"], "video=zoom: choose from orbit, swipe, wobble"),
-        (["mask=x.png"], "mask=FILE belongs to one picture"),
-    ],
-)
-def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path, settings, said):
-    config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", *settings)
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
-        run(config, tmp_path)
+def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_path):
+    for setting, said in (
+        ("formats=[ply,obj]", "formats=obj: choose from ply, splat, spz, sog, html"),
+        ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
+        ("mask=x.png", "mask=FILE belongs to one picture"),
+    ):
+        config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", setting)
+        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+            run(config, tmp_path)
 
 
 @pytest.mark.parametrize("broken", ["some", "all"])

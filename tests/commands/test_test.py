@@ -156,18 +156,15 @@ def test_weights_score_as_the_checkpoint_they_were_saved_with(scored, pipeline):
     assert first["protocol"]["checkpoint"]["path"] == str(pipeline.weights)
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
+def test_what_is_to_be_scored_is_said_once():
+    for given, said in (
         ({"ckpt": None}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
         ({"ckpt": "a", "weights": "b"}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
         ({"ckpt": None, "weights": "b"}, "weights know no data"),
         ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
-    ],
-)
-def test_what_is_to_be_scored_is_said_once(given, said):
-    with pytest.raises(CompleteSplatError, match=said):
-        Trained(**given).configuration()
+    ):
+        with pytest.raises(CompleteSplatError, match=said):
+            Trained(**given).configuration()
 
 
 def test_a_sampler_for_a_model_without_samples_is_refused(pipeline):

@@ -47,18 +47,15 @@ def test_what_a_path_stands_for(tmp_path):
     assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
 
 
-@pytest.mark.parametrize(
-    ("path", "said"),
-    [
+def test_what_cannot_be_shown_is_refused(tmp_path):
+    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
+    for path, said in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
         (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
         ("several", "2 predictions: give one of them"),
-    ],
-)
-def test_what_cannot_be_shown_is_refused(tmp_path, path, said):
-    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
-        settings_of(tmp_path / path)
+    ):
+        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+            settings_of(tmp_path / path)
 
 
 def test_the_flag_without_a_file_and_settings_out_of_their_ranges_are_refused():
