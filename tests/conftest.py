@@ -3,18 +3,17 @@
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from filelock import FileLock
-from support import SMALL, call
+from support import SMALL, call, tiny_generator
 
 from completesplat.data.toy import write_objects
 
 # W&B would go on reading what later tests of the process print, and complain in their logs that its run has ended.
 os.environ.setdefault("WANDB_CONSOLE", "off")
-
 
 Folders = Callable[[str, Callable[[Path], object]], Path]
 
@@ -56,8 +55,7 @@ def toy_root(built_once: Folders) -> Path:
     return built_once("toy", lambda root: write_objects(root, **size, workers=1, progress=False))
 
 
-@dataclass(frozen=True)
-class Pipeline:
+class Pipeline(NamedTuple):
     """Both stages, trained for two steps: run directories of the real thing, with no skill."""
 
     toy: Path
@@ -88,7 +86,6 @@ def pipeline(toy_root: Path, built_once: Folders) -> Pipeline:
 @pytest.fixture(scope="session")
 def packed_toys(pipeline: Pipeline, built_once: Folders) -> Path:
     """The pipeline's scenes, packed."""
-
     given = ["data=toy_objects", f"data.root={pipeline.toy}", "data.image_size=32", "workers=1"]
     return built_once("packed", lambda folder: made(folder / "store", "data", "prepare", *given)) / "store"
 
@@ -96,13 +93,17 @@ def packed_toys(pipeline: Pipeline, built_once: Folders) -> Path:
 @pytest.fixture(scope="session")
 def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> Path:
     """The training set, encoded by the pipeline's stage 1."""
-
     given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']"]
     return built_once("latents", lambda folder: made(folder / "cache", "data", "latents", *given)) / "cache"
 
 
-@dataclass(frozen=True)
-class Finished:
+@pytest.fixture(scope="session")
+def tiny_weights(built_once: Folders) -> Path:
+    """Of an untrained model for pictures of 32 x 32."""
+    return built_once("weights", lambda folder: tiny_generator().save_pretrained(folder))
+
+
+class Finished(NamedTuple):
     """What a command left behind."""
 
     status: int

@@ -14,14 +14,9 @@ SAFETENSORS, BIN = "diffusion_pytorch_model.safetensors", "diffusion_pytorch_mod
 
 
 def stable_diffusion_vae(channels=SHAPE["channels"], layers_per_block=1, norm_groups=4) -> AutoencoderKL:
-    return AutoencoderKL(
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        block_out_channels=channels,
-        layers_per_block=layers_per_block,
-        latent_channels=4,
-        norm_num_groups=norm_groups,
-    ).eval()
+    blocks = {"down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4}
+    shape = {"block_out_channels": channels, "layers_per_block": layers_per_block, "norm_num_groups": norm_groups}
+    return AutoencoderKL(**blocks, **shape, latent_channels=4).eval()
 
 
 def random_vae() -> AutoencoderKL:

@@ -22,17 +22,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
 NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
-SMALL = [
-    "trainer.max_steps=2",
-    "trainer.accelerator=cpu",
-    "trainer.val_check_interval=2",
-    "trainer.limit_val_batches=1",
-    "callbacks.progress=null",
-    "data.image_size=32",
-    "data.batch_size=2",
-    "data.evaluation_targets=2",
-    *NETWORKS,
-]
+SMALL = ["data.image_size=32", "data.batch_size=2", "data.evaluation_targets=2", "callbacks.progress=null", *NETWORKS]
+SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_interval=2", "limit_val_batches=1")]
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -42,6 +33,13 @@ def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 1
     return 0
+
+
+def script(folder: Path) -> Path:
+    """A program as the package's installation puts it on the PATH: for processes, which may start further ones."""
+    path = folder / "completesplat"
+    path.write_text("from completesplat.cli import main\n\nif __name__ == '__main__':\n    main()\n")
+    return path
 
 
 def strict_json(path: Path):
@@ -87,13 +85,8 @@ def write_capture(folder: Path, frames: int) -> None:
 
 def tiny_generator() -> CompleteSplat:
     """An untrained generator from the configs, with skips that pass something on."""
-    config = compose_config(
-        "fit",
-        "model=latent_diffusion",
-        "model.autoreconstructor_checkpoint=null",
-        "data.image_size=32",
-        "sampler.steps=2",
-    )
+    settings = ["model.autoreconstructor_checkpoint=null", "data.image_size=32", "sampler.steps=2"]
+    config = compose_config("fit", "model=latent_diffusion", *settings)
     torch.manual_seed(0)
     model = instantiate(config.model.completesplat, _convert_="all")
     for skip in model.autoreconstructor.reconstructor.skips.values():

@@ -18,14 +18,8 @@ def test_a_file_takes_the_place_of_the_old_one_in_a_folder_that_is_made(tmp_path
 def test_after_an_exception_the_old_file_is_as_it_was_and_nothing_lies_beside_it(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError):
-        fail_half_way(path)
+    with pytest.raises(ZeroDivisionError) as caught, atomic_path(path) as temporary:
+        raise ZeroDivisionError(temporary.parent, temporary.suffix, temporary.write_text("ne"))
+    assert caught.value.args[:2] == (path.parent, ".txt")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def fail_half_way(path: Path) -> None:
-    with atomic_path(path) as temporary:
-        assert (temporary.parent, temporary.suffix) == (path.parent, path.suffix)
-        temporary.write_text("ne")
-        raise ZeroDivisionError

@@ -11,12 +11,11 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from support import SMALL, call, compose_config
 
+from completesplat.cli import VERBS
 from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
 
 CONF = conf_folder()
-VERBS = ["fit", "test", "predict", "view", "data", "bench", "report", "doctor"]
-NEEDED = ["model.autoreconstructor_checkpoint=null"]
 
 
 def options(group: str) -> list[str]:
@@ -29,17 +28,13 @@ EVERY_OPTION = [(group, option) for group in TRAINING_GROUPS for option in optio
 
 
 def test_nothing_in_the_tree_is_forgotten_here():
-    roots = {path.stem for path in CONF.glob("*.yaml")}
-    assert roots == {*VERBS, "base"}
+    assert {path.stem for path in CONF.glob("*.yaml")} == {*VERBS, "base"}
     assert set(GROUPS) == {*TRAINING_GROUPS, "data_task", "bench_task", "report_task"}
     assert len(EVERY_OPTION) > 20
+    assert all(compose_config(verb).out.startswith(f"outputs/{verb}/") for verb in VERBS)
 
 
-PAPERS_FIRST_STAGES = ("co3d_var_stage1", "re10k_var_stage1")
-FILES_OF_PROTOCOLS = {f"realestate10k_{size}": "evaluation_index" for size in (128, 256)}
-FILES_OF_PROTOCOLS["realestate10k_100"] = "scene_list"
-PARTS = ["autoreconstructor", "conditioning", "denoiser", "sampler", "rasterizer", "loss", "data"]
-SURROUNDINGS = ["optimizer", "schedule", "callbacks", "logger", "trainer"]
+WHOLES = ["model", "experiment", "ablation", "evaluation"]
 # Options of other groups differ in one part of a run only, so that one configuration has one of each group.
 DELTAS = ["experiment", "ablation"]
 
@@ -48,11 +43,12 @@ def needed(group: str, option: str) -> list[str]:
     """What else has to be said for an option, so that nothing is missing in the configuration."""
     given = ["data.category=y"] if option == "co3d_category" else []
     given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
-    given += ["autoreconstructor.pretrained=null"] if option in (*PAPERS_FIRST_STAGES, "stable_diffusion") else []
+    given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
     stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
-    given += [f"evaluation.{FILES_OF_PROTOCOLS[option]}=x"] if option in FILES_OF_PROTOCOLS else []
-    return given + (NEEDED if stage2 or option == "latent_diffusion" else [])
+    given += ["evaluation.scene_list=x"] if option == "realestate10k_100" else []
+    given += ["evaluation.evaluation_index=x"] if option in ("realestate10k_128", "realestate10k_256") else []
+    return given + (["model.autoreconstructor_checkpoint=null"] if stage2 or option == "latent_diffusion" else [])
 
 
 def complete(group: str, option: str):
@@ -67,60 +63,26 @@ def complete(group: str, option: str):
 
 
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
-def test_every_option_composes_and_resolves(group, option):
-    assert OmegaConf.to_container(complete(group, option), resolve=True, throw_on_missing=True)
-
-
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_composes_and_says_what_it_does(verb):
-    config = compose_config(verb)
-    assert config.verb == verb
-    assert config.description
-    assert config.out.startswith(f"outputs/{verb}/")
-
-
-@pytest.mark.parametrize(("group", "option"), [(g, o) for g, o in EVERY_OPTION if g in PARTS])
-def test_every_part_instantiates_from_its_config(group, option):
-    if option == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a CUDA device")
+def test_every_option_composes_and_what_it_describes_is_built(group, option):
     config = complete(group, option)
+    assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    if group == "rasterizer":
+        assert instantiate(config.rasterizer.constants) == RenderingConstants()
+    if group in WHOLES or (option == "cuda" and not torch.cuda.is_available()):
+        return
     if group == "autoreconstructor":
         config.autoreconstructor.pretrained = None
     if (group, option) == ("loss", "stage2"):
         config.loss.terms.lpips = None  # its weights are not in the repository
     with torch.device("meta" if option.startswith("stable_diffusion") else "cpu"):
-        part = instantiate(config[group], _convert_="all")
-    assert part is not None
-
-
-@pytest.mark.parametrize("group", SURROUNDINGS)
-def test_what_surrounds_a_model_instantiates_from_its_config(group):
-    for option in options(group):
-        config = complete(group, option)
         made = instantiate(config[group], _convert_="all")
-        if group in ("callbacks", "logger"):
-            off = ["ema"] if (group, option) == ("callbacks", "default") else []
-            assert [name for name, value in made.items() if value is None] == off
-        elif group in ("optimizer", "schedule"):
-            optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
-            made(optimizer.param_groups[0]["params"]) if group == "optimizer" else made(optimizer, 100)
-        assert made is not None
-
-
-def test_all_rasterizers_share_the_default_constants():
-    for option in options("rasterizer"):
-        constants = instantiate(complete("rasterizer", option).rasterizer.constants)
-        assert constants == RenderingConstants()
-
-
-def test_the_papers_numbers():
-    config = compose_config("fit", "autoreconstructor=stable_diffusion", "denoiser=stable_diffusion")
-    assert config.autoreconstructor.reconstructor.parameterization.layers == 2
-    assert config.autoreconstructor.reconstructor.skip_levels == [0]
-    assert (config.loss.terms.mse.weight, config.loss.terms.ssim.weight) == (0.8, 0.2)
-    assert config.optimizer.lr == 5e-5
-    assert config.sampler.steps == 50
-    assert compose_config("fit", "model=latent_diffusion", *NEEDED).model.unconditional_probability == 0.2
+    assert made is not None
+    if group in ("callbacks", "logger"):
+        off = ["ema"] if (group, option) == ("callbacks", "default") else []
+        assert [name for name, value in made.items() if value is None] == off
+    elif group in ("optimizer", "schedule"):
+        optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+        made(optimizer.param_groups[0]["params"]) if group == "optimizer" else made(optimizer, 100)
 
 
 STARTS = {
@@ -141,34 +103,32 @@ def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from(data, stage
     assert missing == {STARTS[stage]} | (set() if data == "toy" else {"data.root"})
 
 
+def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock():
+    for experiment in [option for option in options("experiment") if option.startswith(("co3d_", "re10k_"))]:
+        config = compose_config("fit", f"experiment={experiment}")
+        assert config.rasterizer._target_.endswith("selection.cuda")
+        checkpoint = config.callbacks.checkpoint
+        assert (checkpoint.every_n_train_steps, checkpoint.every_minutes) == (None, 30)
+        elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
+        assert instantiate(elsewhere.rasterizer) is not None
+
+
 @pytest.mark.parametrize("data", ["co3d", "re10k"])
 def test_the_papers_stages(data):
     one, two = (complete("experiment", f"{data}_var_stage{n}") for n in (1, 2))
     lengths = [(c.trainer.get("max_epochs"), c.trainer.max_steps) for c in (one, two)]
     assert lengths == {"co3d": [(6000, -1), (8000, -1)], "re10k": [(None, 200_000), (None, 270_000)]}[data]
     assert [c.optimizer.lr for c in (one, two)] == [5e-5, 5e-6]
+    reconstructor = one.autoreconstructor.reconstructor
+    assert (reconstructor.parameterization.layers, reconstructor.skip_levels) == (2, [0])
     weights = [{name: term.weight for name, term in c.loss.terms.items() if term.weight} for c in (one, two)]
     assert weights[0] == {"mse": 0.8, "ssim": 0.2, "kl": 1e-6}
     assert weights[1] == weights[0] | {"lpips": 0.01}
     assert (one.data.batch_size, one.data.image_size) == (two.data.batch_size, two.data.image_size) == (32, 128)
-    assert one.data.color_jitter == two.data.color_jitter
-    assert one.data.color_jitter is not None
+    assert one.data.color_jitter == two.data.color_jitter is not None
     if data == "co3d":  # tested on sequences never seen, with all their frames
         assert (one.data.subset, one.data.allow_shared_sequences) == ("fewview_dev", False)
         assert (one.data.validation_targets, one.data.evaluation_targets) == (8, None)
-
-
-PAPERS = [option for option in options("experiment") if option.startswith(("co3d_", "re10k_"))]
-
-
-@pytest.mark.parametrize("experiment", PAPERS)
-def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock(experiment):
-    config = compose_config("fit", f"experiment={experiment}")
-    assert config.rasterizer._target_.endswith("selection.cuda")
-    checkpoint = config.callbacks.checkpoint
-    assert (checkpoint.every_n_train_steps, checkpoint.every_minutes) == (None, 30)
-    elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
-    assert instantiate(elsewhere.rasterizer) is not None
 
 
 def test_the_cached_experiment_is_the_papers_without_jitter_and_asks_for_its_cache():
@@ -195,6 +155,7 @@ def test_the_papers_diffusion(data):
         assert names == ["StableDiffusionConditioning", "TextlessStableDiffusion"]
         assert config.autoreconstructor.encoder.channels == config.conditioning.channels == [128, 256, 512, 512]
         assert config.denoiser.latent_channels == config.denoiser.conditioning_channels == 4
+        assert config.sampler.steps == 50
     assert (main.data.box_masks, main.model.skip_weight) == (None, 1)
     assert (masked.data.box_masks.probability, masked.model.skip_weight) == (0.5, 0)
     assert masked.model.autoreconstructor_checkpoint is None

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -28,13 +28,8 @@ NEVER_IMPORTED = {
 }
 
 
-def normal(name: str) -> str:
-    """The name of a distribution as PyPI compares it (PEP 503)."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
 def declared(lines: Iterable[str]) -> set[str]:
-    return {normal(Requirement(line).name) for line in lines}
+    return {canonicalize_name(Requirement(line).name) for line in lines}
 
 
 def modules(path: Path) -> Iterator[str]:
@@ -59,31 +54,17 @@ def imported(folder: str) -> dict[str, set[str]]:
         names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}
     own = {"completesplat", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
     others = names - own - set(sys.stdlib_module_names)
-    return {name: {normal(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
+    return {name: {canonicalize_name(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
 
 
-NEEDED = declared(PROJECT["dependencies"])
-OPTIONAL = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
-DEVELOPERS = declared(EXTRAS["dev"])
-
-
-@pytest.mark.parametrize(
-    ("folder", "allowed"),
-    [("completesplat", NEEDED | OPTIONAL), ("tests", NEEDED | DEVELOPERS)],
-    ids=["package", "tests"],
-)
-def test_everything_imported_is_declared(folder: str, allowed: set[str]) -> None:
-    assert {name: found for name, found in imported(folder).items() if not found & allowed} == {}
-
-
-@pytest.mark.parametrize(
-    ("folder", "there"), [("completesplat", NEEDED | OPTIONAL), ("tests", DEVELOPERS)], ids=["package", "tests"]
-)
-def test_everything_declared_is_imported_or_has_a_reason(folder: str, there: set[str]) -> None:
-    used = set().union(*imported(folder).values(), *imported("completesplat").values())
-    assert there - used - NEVER_IMPORTED.keys() == set()
-
-
-def test_reasons_are_given_for_what_is_declared_and_not_imported_only() -> None:
-    used = set().union(*imported("completesplat").values(), *imported("tests").values())
-    assert NEVER_IMPORTED.keys() <= (NEEDED | OPTIONAL | DEVELOPERS) - used
+def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_imported() -> None:
+    needed, developers = declared(PROJECT["dependencies"]), declared(EXTRAS["dev"])
+    optional = declared(line for name, lines in EXTRAS.items() if name != "dev" for line in lines)
+    package, tests = imported("completesplat"), imported("tests")
+    assert {name: found for name, found in package.items() if not found & (needed | optional)} == {}
+    assert {name: found for name, found in tests.items() if not found & (needed | developers)} == {}
+    used = set().union(*package.values())
+    assert needed | optional <= used | NEVER_IMPORTED.keys()
+    used |= set().union(*tests.values())
+    assert developers <= used | NEVER_IMPORTED.keys()
+    assert NEVER_IMPORTED.keys() <= (needed | optional | developers) - used

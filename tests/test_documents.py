@@ -15,10 +15,6 @@ YOURS = "conf/rasterizer/mine.yaml"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def named(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
-
-
 def prose(path: Path) -> str:
     return BLOCK.sub("", path.read_text())
 
@@ -34,7 +30,7 @@ def links(path: Path) -> list[str]:
     return [link for link in LINK.findall(prose(path)) if "://" not in link]
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_lead_somewhere_and_paths_and_targets_of_make_exist(document):
     for link in links(document):
         file, _, anchor = link.partition("#")
@@ -76,16 +72,12 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
     assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_the_hooks_are_the_checks_of_make():
+def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold():
     hooks = [hook for repo in OmegaConf.load(ROOT / ".pre-commit-config.yaml").repos for hook in repo.hooks]
     recipe = subprocess.run(["make", "--dry-run", "check"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     assert all(hook.language == "system" for hook in hooks)
     assert {hook.entry.removesuffix(" --force-exclude") for hook in hooks} <= set(recipe.splitlines())
-
-
-def test_the_workflow_runs_what_must_hold_before_a_change_lands():
     text = (ROOT / ".github/workflows/ci.yml").read_text()
     assert "- run: .ci/run\n" in text
     assert re.findall(r"uses: \S+", text) == re.findall(r"uses: actions/[\w-]+@v\d+(?=\n)", text)
-    lowest = PROJECT["requires-python"].removeprefix(">=")
-    assert f'python-version: "{lowest}"' in text
+    assert f'python-version: "{PROJECT["requires-python"].removeprefix(">=")}"' in text

@@ -86,14 +86,14 @@ def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
     """A page is served until it is stopped: until its address is printed."""
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     process = subprocess.Popen(program, cwd=folder, env=os.environ | {"PYTHONUNBUFFERED": "1"}, **streams)
-    said = ""
+    said = []
     for line in process.stdout:
-        said += line
+        said.append(line)
         if "http://127.0.0.1" in line:
             process.send_signal(signal.SIGINT)
             process.wait(timeout=60)
-            return subprocess.CompletedProcess(program, 0, said, "")
-    return subprocess.CompletedProcess(program, process.wait(), said, said)
+            return subprocess.CompletedProcess(program, 0)
+    return subprocess.CompletedProcess(program, process.wait(), stderr="".join(said))
 
 
 @pytest.mark.slow
@@ -103,11 +103,3 @@ def test_the_command_does_what_it_is_printed_for(command, folder):
         pytest.skip("no Node.js here, which html needs")
     finished = run(command, folder)
     assert finished.returncode == 0, finished.stderr[-3000:]
-
-
-def test_commands_come_after_those_that_write_what_they_name():
-    order = in_order(runnable()[::-1])
-    assert len(order) > 30
-    for index, command in enumerate(order):
-        later = {written_by(other) for other in order[index + 1 :]} - {written_by(command)}
-        assert not named_in(command) & later

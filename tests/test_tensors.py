@@ -29,13 +29,9 @@ class Outer(TensorDataclass):
 
 
 def make(index: int = 0) -> Outer:
-    return Outer(
-        floats=torch.arange(6.0).reshape(2, 3) + index,
-        integers=torch.arange(2) + 2**40 + index,
-        flags=torch.tensor([True, False]),
-        inner=Inner(torch.full((2, 5), float(index))),
-        name=f"scene{index}",
-    )
+    floats, integers = torch.arange(6.0).reshape(2, 3) + index, torch.arange(2) + 2**40 + index
+    inner = Inner(torch.full((2, 5), float(index)))
+    return Outer(floats, integers, torch.tensor([True, False]), inner, f"scene{index}")
 
 
 def tensors(item: Outer) -> list[Tensor]:
@@ -46,8 +42,6 @@ def tensors(item: Outer) -> list[Tensor]:
     ("args", "kwargs"),
     [
         ((torch.float64,), {}),
-        ((), {"dtype": torch.float64}),
-        (("cpu", torch.float64), {}),
         (("cpu",), {"dtype": torch.float64}),
         ((torch.zeros(1, dtype=torch.float64),), {}),
         ((), {"dtype": torch.float64, "copy": True}),
@@ -63,61 +57,41 @@ def test_to_casts_only_floats_in_every_form_of_the_call(args: tuple, kwargs: dic
     assert (moved.name, moved.note, moved.inner.size) == (item.name, None, (4, 6))
 
 
-def test_map_detach_and_to_reach_every_tensor_and_leave_the_original() -> None:
-    item = make()
-    assert {tensor.device.type for tensor in tensors(item.to("meta"))} == {"meta"}
+def test_map_detach_and_indexing_reach_every_tensor_and_leave_the_original() -> None:
+    item = make(1)
     tracked = replace(item, inner=Inner(item.inner.values.clone().requires_grad_() * 2))
     assert not tracked.detach().inner.values.requires_grad
-    doubled = item.map(lambda tensor: tensor * 2)
-    assert torch.equal(doubled.inner.values, item.inner.values * 2)
-    assert torch.equal(doubled.integers, item.integers * 2)
-    assert torch.equal(item.floats, make().floats)
+    for one, other in zip(tensors(item.map(lambda tensor: tensor * 2)), tensors(item), strict=True):
+        assert torch.equal(one, other * 2)
+    for index in (1, torch.tensor([False, True]), None):
+        assert all(torch.equal(a, b[index]) for a, b in zip(tensors(item[index]), tensors(item), strict=True))
+    assert torch.equal(item.floats, make(1).floats)
 
 
-def test_indexing_acts_on_the_leading_axes_of_all_tensors() -> None:
-    item = make()
-    assert torch.equal(item[1].floats, item.floats[1])
-    assert torch.equal(item[1].inner.values, item.inner.values[1])
-    mask = torch.tensor([False, True])
-    assert torch.equal(item[mask].inner.values, item.inner.values[1:])
-    assert item[None].floats.shape == (1, 2, 3)
-
-
-def test_stack_adds_a_leading_axis_and_collects_the_names() -> None:
+def test_stack_adds_a_leading_axis_and_collects_the_names_also_in_a_data_loader() -> None:
     items = [make(i) for i in range(3)]
     batch = stack(items)
-    assert batch.floats.shape == (3, 2, 3)
-    assert batch.inner.values.shape == (3, 2, 5)
-    assert batch.name == ("scene0", "scene1", "scene2")
-    assert batch.inner.size == (4, 6)
+    assert (batch.name, batch.inner.size) == (("scene0", "scene1", "scene2"), (4, 6))
     for i, item in enumerate(items):
-        assert torch.equal(batch[i].floats, item.floats)
-        assert torch.equal(batch[i].inner.values, item.inner.values)
+        assert all(torch.equal(a, b) for a, b in zip(tensors(batch[i]), tensors(item), strict=True))
+    loaded = list(DataLoader(items, batch_size=2, collate_fn=stack, num_workers=1))  # type: ignore[arg-type]
+    assert [part.name for part in loaded] == [("scene0", "scene1"), ("scene2",)]
+    assert torch.equal(torch.cat([part.integers for part in loaded]), batch.integers)
 
 
-def test_stack_refuses_static_values_that_differ_even_when_nested() -> None:
+def test_stack_refuses_nothing_and_static_values_that_differ_even_when_nested() -> None:
     other = replace(make(), inner=Inner(torch.zeros(2, 5), size=(4, 7)))
     with pytest.raises(ValueError, match=r"static values differ.*\(4, 6\).*\(4, 7\)"):
         stack([make(), other])
-    with pytest.raises(ValueError, match="static values differ"):
-        stack([make(), replace(make(), note="text")])
     with pytest.raises(ValueError, match="empty"):
         stack([])
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_a_data_loader_collates_with_stack(workers: int) -> None:
-    items = [make(i) for i in range(5)]
-    batches = list(DataLoader(items, batch_size=2, collate_fn=stack, num_workers=workers))  # type: ignore[arg-type]
-    assert [batch.name for batch in batches] == [("scene0", "scene1"), ("scene2", "scene3"), ("scene4",)]
-    assert torch.equal(torch.cat([batch.integers for batch in batches]), torch.stack([i.integers for i in items]))
 
 
 def test_lightning_moves_a_batch_although_it_is_frozen() -> None:
     batch = stack([make(0), make(1)])
     moved = move_data_to_device({"scenes": [batch]}, torch.device("meta"))["scenes"][0]
     assert isinstance(moved, Outer)
-    assert moved.inner.values.device.type == "meta"
+    assert {tensor.device.type for tensor in tensors(moved)} == {"meta"}
     assert moved.name == ("scene0", "scene1")
 
 
@@ -128,13 +102,5 @@ def test_the_data_loaders_pinning_pins_every_tensor(monkeypatch: pytest.MonkeyPa
     asked = []
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor, *_: asked.append(tensor) or tensor.clone())
     item = make()
-    pinned = pin_memory([item])[0]
-    assert isinstance(pinned, Outer)
+    assert isinstance(pin_memory([item])[0], Outer)
     assert {id(tensor) for tensor in asked} == {id(tensor) for tensor in tensors(item)}
-    assert pinned.inner.values is not item.inner.values
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_pinned_memory_on_a_device() -> None:
-    assert make().pin_memory().inner.values.is_pinned()

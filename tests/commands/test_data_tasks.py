@@ -1,6 +1,5 @@
 """`completesplat data toy`, `stats`, `show`, `prepare` and `import`: what they write, say and refuse."""
 
-import shutil
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -33,21 +32,19 @@ def test_toy_objects_are_written_where_asked(command, tmp_path):
     assert (tmp_path / "toy/run.json").is_file()
 
 
-@pytest.mark.parametrize("kind", ["objects", "rooms"])
-def test_statistics_are_written_drawn_and_shown(command, sets, kind, tmp_path):
+COUNTS = {
+    "objects": {"train": (2, 8), "val": (1, 4), "test": (1, 4)},
+    "rooms": {"train": (4, 16), "val": (1, 4), "test": (1, 4)},
+}
+
+
+@pytest.mark.parametrize("kind", COUNTS)
+def test_statistics_are_drawn_and_the_sheet_shows_as_many_scenes_as_asked(command, sets, kind, tmp_path):
     finished = command("data", "stats", *sets[kind], f"out={tmp_path / 'out'}")
-    assert finished.status == 0
+    assert (finished.status, finished.out.splitlines()[-1]) == (0, str(tmp_path / "out"))
     splits = strict_json(tmp_path / "out/stats.json")["splits"]
-    assert {split: (n["sequences"], n["frames"]) for split, n in splits.items()} == {
-        "objects": {"train": (2, 8), "val": (1, 4), "test": (1, 4)},
-        "rooms": {"train": (4, 16), "val": (1, 4), "test": (1, 4)},
-    }[kind]
+    assert {split: (n["sequences"], n["frames"]) for split, n in splits.items()} == COUNTS[kind]
     assert imageio.imread(tmp_path / "out/stats.png").shape[2] >= 3
-    assert finished.out.splitlines()[-1] == str(tmp_path / "out")
-
-
-@pytest.mark.parametrize("kind", ["objects", "rooms"])
-def test_the_sheet_shows_as_many_scenes_as_asked(command, sets, kind, tmp_path):
     heights = []
     for scenes in (1, 2):
         assert command("data", "show", *sets[kind], f"scenes={scenes}", f"out={tmp_path / str(scenes)}").status == 0
@@ -56,29 +53,24 @@ def test_the_sheet_shows_as_many_scenes_as_asked(command, sets, kind, tmp_path):
     assert "scenes <= 8" in refused("data", "data_task=show", *sets[kind], "scenes=9")
 
 
-@pytest.mark.parametrize("kind", ["objects", "rooms"])
-def test_prepared_data_pass_the_check_and_are_not_prepared_again(command, sets, kind, tmp_path):
-    store, settings = tmp_path / "store", [s for s in sets[kind] if not s.startswith("data.root")]
-    assert command("data", "prepare", *sets[kind], "workers=1", f"out={store}").status == 0
-    made = {path.name: path.stat().st_mtime_ns for path in store.glob("*.arrow")}
-    again = command("data", "prepare", *sets[kind], "workers=1", f"out={store}")
-    assert again.status == 0
-    assert {path.name: path.stat().st_mtime_ns for path in store.glob("*.arrow")} == made
-    checked = command("data", "check", *settings, f"data.root={store}", "workers=1", f"out={tmp_path / 'check'}")
-    assert checked.status == 0
-    assert strict_json(tmp_path / "check/check.json")["refused"] == []
-    assert "prepared already" in refused("data", "data_task=prepare", *settings, f"data.root={store}")
-
-
-def test_a_flipped_bit_in_a_shard_is_found(command, packed_toys, tmp_path):
-    store = shutil.copytree(packed_toys, tmp_path / "store")
+@pytest.mark.parametrize("kind", COUNTS)
+def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_again(command, sets, kind, tmp_path):
+    store, out = tmp_path / "store", tmp_path / "check"
+    settings = [*(s for s in sets[kind] if not s.startswith("data.root")), f"data.root={store}"]
+    made = []
+    for _ in range(2):
+        assert command("data", "prepare", *sets[kind], "workers=1", f"out={store}").status == 0
+        made.append({path: path.stat().st_mtime_ns for path in store.glob("*.arrow")})
+    assert made[0] == made[1]
+    assert "prepared already" in refused("data", "data_task=prepare", *settings)
+    assert command("data", "check", *settings, "workers=1", f"out={out}").status == 0
+    assert strict_json(out / "check.json")["refused"] == []
     shard = next(store.glob("train-*.arrow"))
     content = bytearray(shard.read_bytes())
     content[len(content) // 2] ^= 1
     shard.write_bytes(content)
-    settings = ["data=toy_objects", "data.image_size=32", f"data.root={store}", "workers=1"]
-    assert command("data", "check", *settings, f"out={tmp_path / 'check'}").status == 0
-    found = strict_json(tmp_path / "check/check.json")
+    assert command("data", "check", *settings, "workers=1", f"out={out}").status == 0
+    found = strict_json(out / "check.json")
     assert any(entry["file"] == str(shard) for entry in found["refused"])
     assert "changed file" in found["counts"]
 

@@ -1,4 +1,5 @@
 import csv
+from pathlib import Path
 
 import pytest
 import torch
@@ -8,6 +9,10 @@ from support import SMALL, compose_config, strict_json
 
 from completesplat.commands.fit import refuse_missing, run
 from completesplat.errors import CompleteSplatError
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
@@ -24,13 +29,11 @@ def test_a_run_directory_is_complete(pipeline, stage):
     record = strict_json(run / "run.json")
     assert record["command"][0] == "completesplat fit"
     assert record["commit"] is None or len(record["commit"].removesuffix("-dirty")) == 40
-    contents = torch.load(run / "checkpoints/last.ckpt", map_location="cpu", weights_only=True)
-    assert contents["global_step"] == 2
+    assert torch.load(run / "checkpoints/last.ckpt", weights_only=True)["global_step"] == 2
 
 
 def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
-    stage1 = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    stage2 = torch.load(pipeline.diffusion / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    stage1, stage2 = weights(pipeline.var), weights(pipeline.diffusion)
     for name, value in stage1.items():
         kept = stage2[name.replace("model.", "completesplat.autoreconstructor.", 1)]
         torch.testing.assert_close(kept, value, rtol=0, atol=0)
@@ -43,10 +46,7 @@ def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
 def test_the_seed_decides_the_weights(command, pipeline, tmp_path):
     settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "trainer.max_steps=2", "seed=0"]
     assert command("fit", *settings, f"out={tmp_path / 'again'}").status == 0
-    again = torch.load(tmp_path / "again/checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    first = torch.load(pipeline.var / "checkpoints/last.ckpt", weights_only=True)["state_dict"]
-    for name, value in first.items():
-        torch.testing.assert_close(again[name], value, rtol=0, atol=0)
+    torch.testing.assert_close(weights(tmp_path / "again"), weights(pipeline.var), rtol=0, atol=0)
 
 
 SCORED = ["evaluation.resolution=48", "+evaluation.data.evaluation_targets=1", "seed=4"]
@@ -76,7 +76,6 @@ def test_a_fit_scores_what_a_test_of_its_checkpoint_scores(command, pipeline, tm
 
 
 def test_a_protocol_that_does_not_fit_is_refused_before_training(toy_root, tmp_path, monkeypatch):
-    """Each protocol that does not fit is refused in `test_test`."""
     monkeypatch.setattr(Trainer, "fit", lambda *_, **__: pytest.fail("it trained"))
     given = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "evaluation.scoring.samples=2"]
     with pytest.raises(CompleteSplatError, match="draws no samples"):
@@ -84,35 +83,25 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(toy_root, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("settings", "asked"),
+    ("experiment", "place", "asked"),
     [
-        (
-            ["experiment=co3d_var_stage1", "data=toy_objects"],
-            "autoreconstructor.pretrained is needed: give autoreconstructor.pretrained=stabilityai/sd-vae-ft-mse, "
-            "or null for random weights",
-        ),
-        (["experiment=toy_var_masked"], "model.checkpoint is needed: give model.checkpoint=RUN/checkpoints/last.ckpt"),
-        (["experiment=re10k_diffusion"], "data.root is needed: give data.root=DIR"),
-        (
-            ["experiment=toy_diffusion"],
-            "model.autoreconstructor_checkpoint is needed: "
-            "give model.autoreconstructor_checkpoint=RUN/checkpoints/last.ckpt of stage 1",
-        ),
+        ("co3d_var_stage1", "autoreconstructor.pretrained", "stabilityai/sd-vae-ft-mse, or null for random weights"),
+        ("toy_var_masked", "model.checkpoint", "RUN/checkpoints/last.ckpt"),
+        ("re10k_diffusion", "data.root", "DIR"),
+        ("toy_diffusion", "model.autoreconstructor_checkpoint", "RUN/checkpoints/last.ckpt of stage 1"),
     ],
-    ids=["pretrained", "checkpoint", "data", "stage 1"],
 )
-def test_a_missing_setting_is_asked_for(settings, asked):
+def test_a_missing_setting_is_asked_for(experiment, place, asked):
+    given = ["data=toy_objects"] if place == "autoreconstructor.pretrained" else []
     with pytest.raises(CompleteSplatError) as caught:
-        refuse_missing(compose_config("fit", *settings))
-    assert str(caught.value) == asked
+        refuse_missing(compose_config("fit", f"experiment={experiment}", *given))
+    assert str(caught.value) == f"{place} is needed: give {place}={asked}"
 
 
 def test_random_weights_are_had_by_asking_and_a_continued_run_needs_no_other(command, pipeline, tmp_path):
-    settings = [
-        "experiment=co3d_var_stage1", "data=toy_objects", f"data.root={pipeline.toy}", *SMALL, "rasterizer=tiled",
-        "autoreconstructor.encoder.layers_per_block=1", "autoreconstructor.encoder.norm_groups=8", "test=false",
-        "callbacks.pictures=null",
-    ]  # fmt: skip
+    settings = ["experiment=co3d_var_stage1", "data=toy_objects", f"data.root={pipeline.toy}", *SMALL]
+    settings += ["autoreconstructor.encoder.layers_per_block=1", "autoreconstructor.encoder.norm_groups=8"]
+    settings += ["rasterizer=tiled", "test=false", "callbacks.pictures=null"]
     assert command("fit", *settings, "autoreconstructor.pretrained=null", f"out={tmp_path / 'run'}").status == 0
     resume = f"ckpt_path={tmp_path / 'run/checkpoints/last.ckpt'}"
     assert command("fit", *settings, resume, "trainer.max_steps=3", f"out={tmp_path / 'more'}").status == 0

@@ -8,15 +8,9 @@ FEW = [f"evaluation.{few}" for few in ("samples=3", "batch=2", "views=1", "sprea
 FIGURES = {"coverage", "total_variation", "sharpness", "rejected", "scenes", "samples"}
 
 
-@pytest.mark.parametrize(
-    ("stage", "methods"),
-    [
-        ("diffusion", {"model"}),
-        pytest.param("var", {"model", "posterior_samples"}, marks=pytest.mark.slow),
-    ],
-    ids=["diffusion", "var"],
-)
-def test_every_method_is_scored(command, pipeline, tmp_path, stage, methods):
+@pytest.mark.parametrize("stage", ["diffusion", pytest.param("var", marks=pytest.mark.slow)])
+def test_every_method_is_scored(command, pipeline, tmp_path, stage):
+    methods = {"model"} if stage == "diffusion" else {"model", "posterior_samples"}
     given = ["evaluation=hidden_modes", f"ckpt={getattr(pipeline, stage) / 'checkpoints/last.ckpt'}", *FEW]
     finished = command("test", *given, f"out={tmp_path / 'out'}")
     assert finished.status == 0, finished.err
@@ -43,12 +37,6 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage, methods):
     assert strict_json(tmp_path / "out/protocol.json")["skipped"] == []
 
 
-@pytest.mark.parametrize(
-    ("setting", "reason"),
-    [
-        ("samples=1", "evaluation.samples=1: must be at least 2"),
-        ("views=0", "evaluation.views=0: must be at least 1"),
-    ],
-)
-def test_too_small_numbers_are_refused(setting, reason):
-    assert refused("test", "evaluation=hidden_modes", "ckpt=none", f"evaluation.{setting}") == reason
+def test_too_small_numbers_are_refused():
+    said = refused("test", "evaluation=hidden_modes", "ckpt=none", "evaluation.samples=1")
+    assert said == "evaluation.samples=1: must be at least 2"

@@ -9,21 +9,18 @@ import time
 from pathlib import Path
 
 import pytest
-from support import SMALL, strict_json
+from support import SMALL, script, strict_json
 
 pytestmark = pytest.mark.slow
 JOBS = ["ablation-full+seed-0", "ablation-full+seed-1", "ablation-m1+seed-0", "ablation-m1+seed-1"]
 
 
 def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
-    script = folder / "completesplat"
-    script.write_text("from completesplat.cli import main\n\nif __name__ == '__main__':\n    main()\n")
-    arguments = [
-        "fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, "trainer.max_steps=60", f"out={out}",
-        "callbacks.checkpoint.every_n_train_steps=3",
-        "callbacks.pictures=null", "trainer.val_check_interval=60", "ablation=full,m1", "seed=0,1",
-    ]  # fmt: skip
-    return subprocess.Popen([sys.executable, script, *arguments], start_new_session=True, stdout=subprocess.DEVNULL)
+    arguments = ["fit", "-m", "experiment=toy_var", f"data.root={root}", *SMALL, "trainer.max_steps=60", f"out={out}"]
+    arguments += ["callbacks.checkpoint.every_n_train_steps=3", "callbacks.pictures=null"]
+    arguments += ["trainer.val_check_interval=60", "ablation=full,m1", "seed=0,1"]
+    program = [sys.executable, script(folder), *arguments]
+    return subprocess.Popen(program, start_new_session=True, stdout=subprocess.DEVNULL)
 
 
 def kill_in_the_middle_of(job: Path, process: subprocess.Popen) -> None:

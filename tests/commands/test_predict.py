@@ -4,14 +4,11 @@ from pathlib import Path
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-import torch
-from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from PIL import Image
 from plyfile import PlyData
 from support import compose_config, strict_json
 
-from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.commands.predict import PredictNumbers, visible_part
 from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
@@ -43,7 +40,7 @@ def splats(folder: Path) -> list[bytes]:
 
 
 def test_every_file_is_there_and_opens(predict):
-    folder = predict()
+    folder = predict("steps=null")
     names = {"sample_00.ply", "sample_01.ply", "orbit_00.mp4", "orbit_01.mp4", "sheet.png", "scene.json"}
     assert {path.name for path in folder.iterdir()} == names
     vertices = PlyData.read(folder / "sample_01.ply")["vertex"].data
@@ -52,8 +49,23 @@ def test_every_file_is_there_and_opens(predict):
     assert len(imageio.mimread(folder / "orbit_00.mp4", memtest=False)) == 4
     Image.open(folder / "sheet.png").verify()
     scene = strict_json(folder / "scene.json")
-    assert scene["seed"] == 0
-    assert scene["settings"]["gaussians"] == [2048, 2048]
+    settings = scene["settings"]
+    assert (scene["seed"], settings["gaussians"]) == (0, [2048, 2048])
+    assert (settings["sampler"], settings["steps"]) == ("DDIMScheduler", 2)  # those that the weights were saved with
+
+
+def test_maps_another_sampler_and_a_field_of_view_can_be_asked_for(predict):
+    folder = predict("maps=true", "fov=90", "sampler=dpm20", "steps=null", "batch=1")
+    names = {f"{kind}_{index:02}.png" for kind in ("depth", "normals", "opacity") for index in (0, 1)}
+    assert {Image.open(folder / name).size for name in names} == {(32, 32)}
+    scene = strict_json(folder / "scene.json")
+    assert names <= set(scene["files"].values())
+    assert scene["reference_camera"]["intrinsics"][0][0] == pytest.approx(16)
+    settings = scene["settings"]
+    near, far = settings["depth_map_ends"]
+    assert 0 < near < far
+    assert settings["fov_source"] == "given"
+    assert (settings["sampler"], settings["steps"]) == ("DPMSolverMultistepScheduler", 20)
 
 
 def test_the_seed_decides_the_bytes_and_each_control_changes_every_scene(predict):
@@ -61,12 +73,6 @@ def test_the_seed_decides_the_bytes_and_each_control_changes_every_scene(predict
     controls = ["seed=0", "seed=1", "skip_weight=0", "guidance_weight=0.5", "steps=4", "sampler=dpm20"]
     made = [splats(predict(control, "video=[]", out=str(index))) for index, control in enumerate(controls)]
     assert len({scene for scenes in made for scene in scenes}) == 2 * len(controls)
-
-
-def test_the_field_of_view_reaches_the_scene(predict):
-    scene = strict_json(predict("fov=90") / "scene.json")
-    assert scene["settings"]["fov_source"] == "given"
-    assert scene["reference_camera"]["intrinsics"][0][0] == pytest.approx(16)
 
 
 BOX = "box=[0.5,0,1,1]"
@@ -80,9 +86,9 @@ def test_what_a_box_hides_has_no_influence(predict, tmp_path):
     other[:, 60:110] = 255 - one[:, 60:110]  # the box, in the central square's pixels 10 to 110
     found = []
     for name, pixels in (("one", one), ("other", other)):
-        (tmp_path / name).mkdir()
-        Image.fromarray(pixels).save(tmp_path / name / "picture.png")
         image = tmp_path / name / "picture.png"
+        image.parent.mkdir()
+        Image.fromarray(pixels).save(image)
         found.append(predict(BOX, image=image, out=f"{name}/out"))
     assert files(found[0]) == files(found[1])
     scene = strict_json(found[0] / "scene.json")["settings"]
@@ -93,68 +99,30 @@ def test_a_mask_hides_what_a_box_hides(predict, tmp_path):
     pixels = np.zeros((32, 32), np.uint8)
     pixels[:, 16:] = 255
     Image.fromarray(pixels).save(tmp_path / "mask.png")
-    found = []
-    for setting in (BOX, f"mask={tmp_path / 'mask.png'}", "skip_weight=0"):
-        found.append(splats(predict(setting, out=str(len(found)))))
-    assert found[0] == found[1]
-    assert not set(found[1]) & set(found[2])
+    hidden = (BOX, f"mask={tmp_path / 'mask.png'}", "skip_weight=0")
+    box, mask, nothing = (splats(predict(setting, "video=[]", out=str(n))) for n, setting in enumerate(hidden))
+    assert box == mask
+    assert not set(mask) & set(nothing)
 
 
-@pytest.mark.parametrize(("name", "scheduler"), [("dpm20", "DPMSolverMultistepScheduler"), (None, "DDIMScheduler")])
-def test_the_sampler_can_be_another_one(predict, name, scheduler):
-    settings = [] if name is None else [f"sampler={name}"]
-    scene = strict_json(predict(*settings, "steps=null", "batch=1") / "scene.json")["settings"]
-    assert scene["sampler"] == scheduler
-    # Of the configuration, or those that the weights were saved with.
-    assert scene["steps"] == (20 if name else 2)
+def test_settings_have_ranges():
+    for setting, least in (
+        ("samples=0", "at least 1"),
+        ("steps=1001", "1 and 1000"),
+        ("guidance_weight=-1", "0 and 1"),
+    ):
+        with pytest.raises(CompleteSplatError, match=f"{setting}: must .*{least}"):
+            check_settings(PredictNumbers, compose_config("predict", "image=a.png", setting))
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("sampler=nonsense", "nonsense"),
-        ("samples=0", "samples=0: must be at least 1"),
-        ("batch=0", "batch=0: must be at least 1"),
-        ("steps=1001", "steps=1001: must lie between 1 and 1000"),
-        ("background=2", "background=2: must lie between 0 and 1"),
-        ("skip_weight=2", "skip_weight=2: must lie between 0 and 1"),
-        ("guidance_weight=-1", "guidance_weight=-1: must lie between 0 and 1"),
-    ],
-)
-def test_settings_have_ranges(setting, said):
-    with pytest.raises((CompleteSplatError, HydraException), match=re.escape(said)):
-        check_settings(PredictNumbers, compose_config("predict", "image=a.png", setting))
-
-
-@pytest.mark.parametrize(
-    ("hidden", "said"),
-    [
+def test_what_hides_nothing_is_refused(tmp_path):
+    Image.new("RGB", (32, 32)).save(tmp_path / "a.png")
+    for hidden, said in (
         ({"box": [0, 0, 1]}, "box=[0, 0, 1]: give [x0,y0,x1,y1]"),
-        ({"box": 0.5}, "box=0.5: give [x0,y0,x1,y1]"),
         ({"box": ["a", "b", "c", "d"]}, "give [x0,y0,x1,y1]"),
         ({"box": [0.5, 0, 0.5, 1]}, "needs 0 <= x0 < x1 <= 1"),
         ({"mask": "nowhere.png"}, "nowhere.png: no such file"),
         ({"mask": "nowhere.png", "box": [0.5, 0, 1, 1]}, "not both"),
-    ],
-)
-def test_what_hides_nothing_is_refused(tmp_path, hidden, said):
-    image = tmp_path / "a.png"
-    Image.new("RGB", (32, 32)).save(image)
-    config = OmegaConf.create({"box": None, "mask": None} | hidden)
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
-        visible_part(config, image, 32)
-
-
-def test_skips_are_refused_where_something_is_hidden():
-    with pytest.raises(CompleteSplatError, match="skip_weight=1: must be 0 where the picture is hidden"):
-        allowed_skip_weight(1, torch.zeros(1, 2, 2))
-
-
-def test_maps_are_written_if_wanted(predict):
-    folder = predict("maps=true")
-    names = {f"{kind}_{index:02}.png" for kind in ("depth", "normals", "opacity") for index in (0, 1)}
-    assert {Image.open(folder / name).size for name in names} == {(32, 32)}
-    scene = strict_json(folder / "scene.json")
-    assert names <= set(scene["files"].values())
-    near, far = scene["settings"]["depth_map_ends"]
-    assert 0 < near < far
+    ):
+        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+            visible_part(OmegaConf.create({"box": None, "mask": None} | hidden), tmp_path / "a.png", 32)

@@ -6,14 +6,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import strict_json
-
-SCRIPT = "from completesplat import cli\n\nif __name__ == '__main__':\n    cli.main()\n"
+from support import script, strict_json
 
 
 def scores(checkpoint: Path, out: Path, folder: Path, *settings: str) -> dict:
-    (folder / "start.py").write_text(SCRIPT)
-    command = [sys.executable, str(folder / "start.py"), "test", f"ckpt={checkpoint}", f"out={out}", *settings]
+    command = [sys.executable, str(script(folder)), "test", f"ckpt={checkpoint}", f"out={out}", *settings]
     subprocess.run(command, check=True, timeout=300, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"})
     metrics = strict_json(out / "metrics.json")
     assert metrics["protocol"]["scenes"] == metrics["model"]["scenes"]
@@ -22,14 +19,12 @@ def scores(checkpoint: Path, out: Path, folder: Path, *settings: str) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["var", "diffusion"])
-def test_two_processes_find_what_one_finds(pipeline, tmp_path, stage):
-    checkpoint = getattr(pipeline, stage) / "checkpoints/last.ckpt"
+def test_two_processes_find_what_one_finds(pipeline, tmp_path):
+    checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
     # Three test scenes: one process has two of them, the other one.
     changes = [f"data.root={tmp_path / 'more'}", "data.scenes=30", "data.frames=3", "data.evaluation_batch_size=1"]
     settings = ["trainer.accelerator=cpu", "overrides=[" + ",".join(f"'{change}'" for change in changes) + "]"]
-    if stage == "diffusion":
-        settings += ["sampler=dpm10", "evaluation.scoring.samples=2"]
+    settings += ["sampler=dpm10", "evaluation.scoring.samples=2"]
     one = scores(checkpoint, tmp_path / "one", tmp_path, *settings)
     two = scores(checkpoint, tmp_path / "two", tmp_path, *settings, "trainer.devices=2", "+trainer.strategy=ddp")
     assert one["model"]["scenes"] == 3

@@ -14,10 +14,8 @@ from completesplat.export.ply import write_ply
 @pytest.mark.parametrize(
     ("typed", "given"),
     [
-        ([], []),
         (["image=a.png", "weights=b"], ["image=a.png", "weights=b"]),
-        (["a b,c.ply"], ["path='a b,c.ply'"]),
-        (["it's.ply", "port=1"], ["path='it\\'s.ply'", "port=1"]),
+        (["it's a,b.ply", "port=1"], ["path='it\\'s a,b.ply'", "port=1"]),
         (["--export", "page.html", "scene.ply"], ["export='page.html'", "path='scene.ply'"]),
         (["scene.ply", "--export=a=b.html"], ["path='scene.ply'", "export='a=b.html'"]),
         (["--help"], ["--help"]),
@@ -25,11 +23,6 @@ from completesplat.export.ply import write_ply
 )
 def test_a_path_and_the_flag_become_settings(typed, given):
     assert overrides(typed) == given
-
-
-def test_the_flag_without_a_file_is_refused():
-    with pytest.raises(CompleteSplatError, match="--export needs a file"):
-        overrides(["scene.ply", "--export"])
 
 
 def folder(path, *names: str):
@@ -54,31 +47,23 @@ def test_what_a_path_stands_for(tmp_path):
     assert settings_of(files / "photo.jpg") == {"image": str(files / "photo.jpg")}
 
 
-@pytest.mark.parametrize(
-    ("path", "said"),
-    [
+def test_what_cannot_be_shown_is_refused(tmp_path):
+    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
+    for path, said in (
         ("nowhere.ply", "nowhere.ply: no such file or folder"),
         (".", "neither weights (config.json, model.safetensors, here or in weights/) nor a prediction"),
         ("several", "2 predictions: give one of them"),
-    ],
-)
-def test_what_cannot_be_shown_is_refused(tmp_path, path, said):
-    folder(tmp_path / "several", "a/sample_00.ply", "b/sample_00.ply")
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
-        settings_of(tmp_path / path)
+    ):
+        with pytest.raises(CompleteSplatError, match=re.escape(said)):
+            settings_of(tmp_path / path)
 
 
-@pytest.mark.parametrize(
-    ("setting", "said"),
-    [
-        ("samples=9", "samples=9: must lie between 1 and 8"),
-        ("skip_weight=-1", "skip_weight=-1: must lie between 0 and 1"),
-        ("port=99999", "port=99999: must lie between 1 and 65535"),
-    ],
-)
-def test_settings_have_ranges(setting, said):
-    with pytest.raises(CompleteSplatError, match=re.escape(said)):
-        check_settings(ViewNumbers, compose_config("view", setting))
+def test_the_flag_without_a_file_and_settings_out_of_their_ranges_are_refused():
+    with pytest.raises(CompleteSplatError, match="--export needs a file"):
+        overrides(["scene.ply", "--export"])
+    for setting, said in (("samples=9", "between 1 and 8"), ("port=99999", "between 1 and 65535")):
+        with pytest.raises(CompleteSplatError, match=f"{setting}: must lie {said}"):
+            check_settings(ViewNumbers, compose_config("view", setting))
 
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
@@ -88,22 +73,19 @@ def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path)
     assert finished.err == 'error: the viewer needs viser: pip install "completesplat[view]"\n'
 
 
-def test_an_offline_page_is_written_from_a_scene(command, tmp_path):
+def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, pipeline, tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    out = f"out={tmp_path / 'out'}"
     write_ply(tmp_path / "my scene.ply", balls(points=5))
-    finished = command("view", "my scene.ply", "--export", "page.html", f"out={tmp_path / 'out'}")
+    finished = command("view", "my scene.ply", "--export", "page.html", out)
     assert finished.status == 0, finished.err
     text = (tmp_path / "page.html").read_text()
     assert text.startswith("<!doctype html>")
     assert "__VISER_EMBED_DATA__" in text
-
-
-def test_an_offline_page_is_written_of_what_is_drawn(command, pipeline, tmp_path):
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    given = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=2", "steps=2", f"out={tmp_path / 'out'}"]
-    assert command("view", *given, "export=page.html").status == 0
-    assert (tmp_path / "page.html").is_file()
-    finished = command("view", pipeline.weights, "export=other.html", f"out={tmp_path / 'out'}")
+    drawn = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=2", "steps=2", "export=drawn.html"]
+    assert command("view", *drawn, out).status == 0
+    assert (tmp_path / "drawn.html").is_file()
+    finished = command("view", pipeline.weights, "export=other.html", out)
     assert finished.status == 2
     assert "there is nothing to export" in finished.err
     assert not (tmp_path / "other.html").exists()
