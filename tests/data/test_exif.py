@@ -124,8 +124,7 @@ def test_an_impossible_field_of_view_is_refused(tmp_path, fov):
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp"])
 @pytest.mark.parametrize(
-    "record",
-    [b"garbage", b"MM\0*\0\0", b"II*\0\xff\xff\xff\x7f", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50],
+    "record", [b"garbage", b"MM\0*\0\0", b"II*\0\xff\xff\xff\x7f", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50]
 )
 def test_a_damaged_exif_record_is_none(tmp_path, name, record):
     Image.new("RGB", (SIZE, SIZE)).save(tmp_path / name, exif=b"Exif\0\0" + record)
