@@ -70,14 +70,11 @@ def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     assert len(list(one_bad.test_dataloader())) == 8  # One is no share.
 
 
-def test_nothing_that_can_be_read_is_an_error(tmp_path):
+def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):
     data = module(make_tree(tmp_path, KEYS), max_bad_fraction=2.0)
     for loader in (data.train_dataloader(), data.test_dataloader()):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
-
-
-def test_an_unknown_policy_is_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
         module(tmp_path, on_bad="ignore")
 
