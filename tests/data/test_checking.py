@@ -103,17 +103,14 @@ def test_two_processes_find_the_same_in_the_same_order() -> None:
     assert together.sequences == 43
 
 
-def test_long_and_strange_names_are_shown_whole_and_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sound_data_show_no_table_and_strange_names_are_shown_whole(capsys: pytest.CaptureFixture[str]) -> None:
     """Neither markup nor control characters nor undecodable bytes in a name change how the table looks."""
-    name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
-    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
-    shown = capsys.readouterr().out
-    assert max(map(len, shown.splitlines())) <= 120
-    cell = "".join(line.split("│")[3].strip() for line in shown.splitlines() if "│" in line)
-    # Lines may end at a space, which is then not shown.
-    assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")
-
-
-def test_sound_data_show_no_table(capsys: pytest.CaptureFixture[str]) -> None:
     show(check_quietly(train=Source({"a": (1, 2)}), val=Source({})))
     assert capsys.readouterr().out == "usable sequences: 1, their usable frames: 2 (train 1 and 2, val 0 and 0)\n"
+    name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
+    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
+    shown = capsys.readouterr().out.splitlines()
+    assert max(map(len, shown)) <= 120
+    cell = "".join(line.split("│")[3].strip() for line in shown if "│" in line)
+    # Lines may end at a space, which is then not shown.
+    assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")
