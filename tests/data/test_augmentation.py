@@ -1,5 +1,3 @@
-"""Augmented scenes: mirrored as a whole, jittered alike, partly hidden, and drawn from the generator only."""
-
 from dataclasses import replace
 
 import numpy as np

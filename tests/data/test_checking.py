@@ -1,5 +1,3 @@
-"""Checking finds every planted fault once and nothing else, and counts what is left."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""JSON files and paths that are refused, and those that are not."""
-
 import gzip
 import json
 from pathlib import Path

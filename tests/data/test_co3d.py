@@ -1,5 +1,3 @@
-"""The data module on toy objects: shapes, frames of reference, protocols and repeatability."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Which sequences and frames of a category are taken for which split: set lists, a split by seed, filters."""
-
 import json
 import math
 from collections.abc import Mapping, Sequence

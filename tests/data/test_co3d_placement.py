@@ -1,5 +1,3 @@
-"""Where the object is and how large: from the point cloud, from depth maps, from cameras alone."""
-
 from pathlib import Path
 
 import numpy as np

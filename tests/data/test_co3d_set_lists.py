@@ -1,5 +1,3 @@
-"""Sequences that training and test share, lists without validation, and what results say of both."""
-
 from pathlib import Path
 
 import pytest

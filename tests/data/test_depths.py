@@ -1,5 +1,3 @@
-"""True depth in the square pictures, against the point cloud and in closed form."""
-
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock

@@ -1,5 +1,3 @@
-"""Image files and depth maps of data sets: unusual but sound ones give exactly their pixels, others are refused."""
-
 import io
 import struct
 import warnings

@@ -1,5 +1,3 @@
-"""Training from the latent cache: what is drawn is what training from pictures draws."""
-
 from dataclasses import fields
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""A latent cache that is not what was written does not open."""
-
 import json
 import pickle
 import shutil

@@ -1,5 +1,3 @@
-"""Batches depend on (seed, epoch, item) only: not on workers, on what came before, or on an interruption."""
-
 import multiprocessing
 from collections.abc import Iterator
 from pathlib import Path
@@ -117,8 +115,7 @@ class Recorder(LightningModule):
         self.seen.append((self.current_epoch, index, batch.names, batch.all_views().images.double().sum().item()))
         return self.weight**2
 
-    def validation_step(self, batch, index):
-        """So that epochs are interrupted by validation."""
+    def validation_step(self, batch, index): ...  # So that epochs are interrupted by validation.
 
     def configure_optimizers(self):
         return torch.optim.SGD(self.parameters(), 0.1)

@@ -1,5 +1,3 @@
-"""What cannot be read: raised with its place in every process, or counted, told and limited."""
-
 import logging
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""What of a photograph stays visible, and that resizing carries nothing of the rest into it."""
-
 from pathlib import Path
 
 import numpy as np

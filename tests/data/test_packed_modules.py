@@ -1,5 +1,3 @@
-"""Prepared data through the data modules: the same batches as from the files that they were made from."""
-
 import json
 import logging
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The data module: both forms, geometry, protocols, repeatability, and a step of training."""
-
 import json
 import logging
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Lists of test views in the formats of the works that publish them: read exactly, or refused."""
-
 import json
 import logging
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Which frames are drawn, and that a draw depends on nothing but seed, epoch and index."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""COLMAP models: what is written shows the scene where its cameras say."""
-
 import sys
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""What is held out, in which order frames stand, and the lens model against another implementation."""
-
 import json
 from itertools import product
 

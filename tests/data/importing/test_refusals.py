@@ -1,5 +1,3 @@
-"""Captures that are refused: what is wrong, in which file, at which frame; nothing is left behind."""
-
 import pytest
 from PIL import Image
 

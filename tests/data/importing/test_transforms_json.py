@@ -1,5 +1,3 @@
-"""transforms.json: what is written shows the scene where its cameras say."""
-
 import json
 import logging
 

@@ -1,5 +1,3 @@
-"""Toy objects in every colour of the patch: the pictures on the disk are one of them, and the front tells nothing."""
-
 import json
 import shutil
 from itertools import combinations

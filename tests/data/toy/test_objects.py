@@ -1,5 +1,3 @@
-"""Toy objects on disk: determinism, layout, splits, and geometry that agrees between views."""
-
 import gzip
 import json
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Toy rooms and the camera in them: what a point looks like, what the files' numbers mean."""
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

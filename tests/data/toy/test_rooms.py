@@ -1,5 +1,3 @@
-"""Toy rooms on disk: determinism, layout, and two forms that say the same."""
-
 import json
 from pathlib import Path
 
