@@ -126,9 +126,6 @@ BAD_ENTRIES: dict[str, tuple[str, Edit, type[DataError], str | None, int | None,
     "no_number": (FRAMES, put("frame_number", value=...), BadAnnotation, "a", None, "no frame_number", [2], 1),
     "name_is_a_number": (FRAMES, put("sequence_name", value=0), BadAnnotation, None, None, "entry 2: seq", [2], 2),
     "frame_twice": (FRAMES, lambda e: e.append(e[2]), BadAnnotation, "a", 2, "annotated twice", [], 1),
-    "sequence_without_name": (
-        SEQUENCES, put("sequence_name", value=..., entry=0), BadAnnotation, None, None, "entry 0: no", [0, 1, 2, 3], 2,
-    ),
     "sequence_twice": (SEQUENCES, lambda e: e.append(e[0]), BadAnnotation, "a", None, "annotated twice", [], 1),
     "cloud_outside": (
         SEQUENCES, put("point_cloud", "path", value="../x", entry=0), OutsidePath, "a", None, "outside",

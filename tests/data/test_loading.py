@@ -104,8 +104,6 @@ def test_processes_have_their_own_items_and_equally_many(root, monkeypatch, worl
 
 
 class Recorder(LightningModule):
-    """Writes down each batch: its names and the sum of its pictures."""
-
     def __init__(self) -> None:
         super().__init__()
         self.weight = torch.nn.Parameter(torch.zeros(()))

@@ -89,7 +89,6 @@ BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int 
     "one_frame": (first(1), TooFewFrames, None),
     "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadPicture, 2),
     "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadPicture, 0),
-    "bomb_of_51_megapixels_first": (picture(0, lambda _: encode(np.zeros((7200, 7100), bool), "PNG")), BadPicture, 0),
     "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadPicture, 2),
 }  # fmt: skip
 
