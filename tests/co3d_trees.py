@@ -116,7 +116,6 @@ def frame_entry(
 
 
 def sequence_entry(name: str, quality: float | None = 1.0, cloud_quality: float | None = 1.0) -> dict[str, Any]:
-    """A sequence's annotation."""
     cloud = {"path": f"{CATEGORY}/{name}/pointcloud.ply", "quality_score": cloud_quality, "n_points": 6}
     return {"sequence_name": name, "category": CATEGORY, "viewpoint_quality_score": quality, "point_cloud": cloud}
 

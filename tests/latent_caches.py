@@ -16,11 +16,8 @@ FRAMES = 5
 
 def small_autoreconstructor(seed: int = 0, latent_channels: int = 4) -> VariationalAutoReconstructor:
     """16 x 16 pixels become 2 x 2 latents."""
-    sizes = [
-        "autoreconstructor.encoder.channels=[8,8,16,16]",
-        f"autoreconstructor.encoder.latent_channels={latent_channels}",
-    ]
-    config = compose_config("fit", *sizes)
+    sizes = {"channels": "[8,8,16,16]", "latent_channels": latent_channels}
+    config = compose_config("fit", *(f"autoreconstructor.encoder.{name}={size}" for name, size in sizes.items()))
     torch.manual_seed(seed)
     return instantiate(config.autoreconstructor, _convert_="all").eval()
 

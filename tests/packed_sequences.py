@@ -62,7 +62,6 @@ class ListedSource:
     was_read: list[str] = field(default_factory=list)
 
     def read(self, name: str) -> PosedSequence:
-        """A sequence, from nothing but its name."""
         if self.stop_after is not None and len(self.was_read) >= self.stop_after:
             raise KeyboardInterrupt
         self.was_read.append(name)
@@ -71,15 +70,12 @@ class ListedSource:
         return make_sequence(name, self.frames, self.masked, bad=tuple(self.bad_frames.get(name, ())))
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Chunks of neighbours."""
         numbers = list(range(len(names)))
         return [numbers[start : start + self.group_size] for start in range(0, len(names), self.group_size)]
 
     def fingerprint(self) -> str:
-        """Of what the sequences are made from."""
         return self.content
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files of a folder."""
     return {path.name: path.read_bytes() for path in folder.iterdir()}

@@ -104,13 +104,10 @@ def same(a: SceneBatch, b: SceneBatch) -> bool:
 
     def tensors(batch: SceneBatch) -> list[torch.Tensor]:
         views = batch.all_views()
-        cameras = views.cameras
-        return [
-            *(views.images, views.masks, cameras.world_to_camera, cameras.intrinsics),
-            *(batch.depth_range, batch.visible),
-        ]
+        cameras = (views.cameras.world_to_camera, views.cameras.intrinsics)
+        return [views.images, views.masks, *cameras, batch.depth_range, batch.visible]
 
-    return a.names == b.names and all(torch.equal(x, y) for x, y in zip(tensors(a), tensors(b), strict=True))
+    return a.names == b.names and all(map(torch.equal, tensors(a), tensors(b)))
 
 
 def equal(one: list[SceneBatch], other: list[SceneBatch]) -> bool:

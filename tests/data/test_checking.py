@@ -1,5 +1,3 @@
-"""Checking finds every planted fault once and nothing else, and counts what is left."""
-
 from pathlib import Path
 
 import pytest
@@ -50,13 +48,25 @@ PLANTED = {
 }
 
 
-def test_every_planted_fault_is_found_once_and_a_sequence_is_usable_with_two_usable_frames() -> None:
+def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, capsys) -> None:
     """`a` keeps 1 and 3, `b` 10 to 40, `f` both; `c` and `e` keep one frame, `d` none."""
     findings = check_quietly(**damaged())
     assert places(findings) == PLANTED
     assert len(findings.refused) == len(PLANTED)
-    assert (findings.sequences, findings.frames) == (3, 2 + 4 + 2)
     assert findings.splits == {"train": {"sequences": 2, "frames": 2 + 3}, "val": {"sequences": 2, "frames": 3 + 2}}
+    findings.write(tmp_path / "check.json")
+    written = strict_json(tmp_path / "check.json")
+    assert written == findings.json()
+    assert written["usable"] == {"sequences": 3, "frames": 2 + 4 + 2}
+    assert {"sequence": "a", "frame": 2, "file": "a/2.jpg", "reason": "truncated"} in written["refused"]
+    assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
+    others = dict.fromkeys(("missing file", "changed file", "malformed annotation", "too few frames"), 1)
+    assert written["counts"] == {"unusable picture": 3, "left out: score below 0.5": 2, **others}
+    show(findings)
+    shown = capsys.readouterr().out
+    for text in ("left out: score below 0.5", "unusable picture", "a/2.jpg, a, frame 2: truncated"):
+        assert text in shown
+    assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"
 
 
 def test_pictures_in_several_splits_are_read_once(tmp_path: Path) -> None:
@@ -70,16 +80,15 @@ def test_pictures_in_several_splits_are_read_once(tmp_path: Path) -> None:
     assert findings.splits["val"] == {"sequences": 1, "frames": 2}
 
 
-def test_a_sequence_refused_in_one_split_is_still_read_in_the_other() -> None:
+def test_splits_are_read_by_themselves_and_too_few_frames_reported_only_where_nothing_else_explains_them() -> None:
     findings = check_quietly(train=Source({"a": (1, 2)}, broken_sequences={"a"}), val=Source({"a": (3, 4)}))
     assert places(findings) == {("malformed annotation", "a", None)}
     assert findings.splits == {"train": {"sequences": 0, "frames": 0}, "val": {"sequences": 1, "frames": 2}}
-
-
-def test_too_few_frames_are_reported_only_where_nothing_else_explains_them() -> None:
     findings = check_quietly(train=Source({"a": (1, 2), "b": (1,)}, broken_pictures={("a", 1)}))
     assert places(findings) == {("unusable picture", "a", 1), ("too few frames", "b", None)}
     assert (findings.sequences, findings.frames) == (0, 0)
+    with pytest.raises(ZeroDivisionError, match="a mistake in the reader"):
+        check_quietly(train=Source(dict.fromkeys("abcd", (1, 2)), bugs={"c"}))
 
 
 def test_two_processes_find_the_same_in_the_same_order() -> None:
@@ -92,48 +101,14 @@ def test_two_processes_find_the_same_in_the_same_order() -> None:
     assert together.sequences == 43
 
 
-def test_a_mistake_in_a_reader_is_no_refusal() -> None:
-    with pytest.raises(ZeroDivisionError, match="a mistake in the reader"):
-        check_quietly(train=Source(dict.fromkeys("abcd", (1, 2)), bugs={"c"}))
-
-
-def test_the_file_holds_what_was_found(tmp_path: Path) -> None:
-    findings = check_quietly(**damaged())
-    findings.write(tmp_path / "check.json")
-    written = strict_json(tmp_path / "check.json")
-    assert written == findings.json()
-    assert written["usable"] == {"sequences": 3, "frames": 8}
-    assert {"sequence": "a", "frame": 2, "file": "a/2.jpg", "reason": "truncated"} in written["refused"]
-    assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
-    assert written["counts"] == {
-        "unusable picture": 3,
-        "left out: score below 0.5": 2,
-        "missing file": 1,
-        "changed file": 1,
-        "malformed annotation": 1,
-        "too few frames": 1,
-    }
-
-
-def test_what_is_shown_names_counts_examples_and_what_is_left(capsys: pytest.CaptureFixture[str]) -> None:
-    show(check_quietly(**damaged()))
-    shown = capsys.readouterr().out
-    for text in ("left out: score below 0.5", "unusable picture", "a/2.jpg, a, frame 2: truncated"):
-        assert text in shown
-    assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"
-
-
-def test_long_and_strange_names_are_shown_whole_and_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_sound_data_show_no_table_and_strange_names_are_shown_whole(capsys: pytest.CaptureFixture[str]) -> None:
     """Neither markup nor control characters nor undecodable bytes in a name change how the table looks."""
-    name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
-    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
-    shown = capsys.readouterr().out
-    assert max(map(len, shown.splitlines())) <= 120
-    cell = "".join(line.split("│")[3].strip() for line in shown.splitlines() if "│" in line)
-    # Lines may end at a space, which is then not shown.
-    assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")
-
-
-def test_sound_data_show_no_table(capsys: pytest.CaptureFixture[str]) -> None:
     show(check_quietly(train=Source({"a": (1, 2)}), val=Source({})))
     assert capsys.readouterr().out == "usable sequences: 1, their usable frames: 2 (train 1 and 2, val 0 and 0)\n"
+    name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
+    show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
+    shown = capsys.readouterr().out.splitlines()
+    assert max(map(len, shown)) <= 120
+    cell = "".join(line.split("│")[3].strip() for line in shown if "│" in line)
+    # Lines may end at a space, which is then not shown.
+    assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")

@@ -1,5 +1,3 @@
-"""JSON files and paths that are refused, and those that are not."""
-
 import gzip
 import json
 from pathlib import Path
@@ -35,18 +33,14 @@ def flipped(position: int) -> bytes:
 # name: (file name, content, part of the message)
 BAD: dict[str, tuple[str, bytes, str]] = {
     "empty": ("a.json", b"", "Expecting value"),
-    "two_values": ("a.json", b"[1][2]", "Extra data"),
     "nan": ("a.json", b'{"x": NaN}', "NaN is no JSON"),
     "latin_1": ("a.json", TEXT.decode().encode("latin-1"), "utf-8"),
     "deep_lists": ("a.json", b"[" * 10**5 + b"]" * 10**5, "recursion"),
-    "huge_integer": ("a.json", b"1" * 10**4, "not a JSON file"),
-    "empty_gzip": ("a.jgz", b"", "not a JSON file"),
     "not_gzipped": ("a.jgz", TEXT, "Not a gzipped file"),
     "cut_gzip": ("a.jgz", gzip.compress(TEXT)[:-12], "not a JSON file"),
     "gzip_with_wrong_checksum": ("a.jgz", flipped(-6), "CRC check failed"),
     "broken_deflate": ("a.jgz", flipped(10), "invalid block type"),
     "trailing_garbage": ("a.jgz", gzip.compress(TEXT) + b"garbage", "Not a gzipped file"),
-    "gzipped_nan": ("a.jgz", gzip.compress(b"[NaN]"), "NaN is no JSON"),
     "gzip_bomb": ("a.jgz", gzip.compress(b"[" + b" " * 2**27 + b"]"), "hold more than"),
 }
 
@@ -61,14 +55,6 @@ def test_bad_files_are_refused_by_name(name, tmp_path):
     assert part in caught.value.reason
 
 
-def test_good_files_are_read(tmp_path):
-    (tmp_path / "a.json").write_bytes(TEXT)
-    (tmp_path / "a.jgz").write_bytes(gzip.compress(TEXT[:100]) + gzip.compress(TEXT[100:]))
-    assert read_json(tmp_path / "a.json") == read_json(tmp_path / "a.jgz") == CONTENT
-    (tmp_path / "nan.json").write_text("[NaN]")
-    assert np.isnan(read_json(tmp_path / "nan.json", allow_nan=True)[0])
-
-
 @pytest.mark.parametrize("file", ["a.json", "a.jgz"])
 def test_the_limit_on_bytes_is_on_the_text(tmp_path, file, monkeypatch):
     (tmp_path / file).write_bytes(gzip.compress(TEXT) if file == "a.jgz" else TEXT)
@@ -79,8 +65,13 @@ def test_the_limit_on_bytes_is_on_the_text(tmp_path, file, monkeypatch):
         read_json(tmp_path / file)
 
 
-def test_missing_files_are_refused(tmp_path):
-    for path in (tmp_path / "a.json", tmp_path / "a.jgz", tmp_path):
+def test_good_files_are_read_and_missing_ones_refused(tmp_path):
+    (tmp_path / "a.json").write_bytes(TEXT)
+    (tmp_path / "a.jgz").write_bytes(gzip.compress(TEXT[:100]) + gzip.compress(TEXT[100:]))
+    assert read_json(tmp_path / "a.json") == read_json(tmp_path / "a.jgz") == CONTENT
+    (tmp_path / "nan.json").write_text("[NaN]")
+    assert np.isnan(read_json(tmp_path / "nan.json", allow_nan=True)[0])
+    for path in (tmp_path / "b.json", tmp_path / "b.jgz", tmp_path):
         with pytest.raises(MissingFile):
             read_json(path)
 
@@ -93,30 +84,20 @@ def test_paths_that_are_not_plainly_below_the_root_are_refused(tmp_path, relativ
         inside(tmp_path, relative)
 
 
-@pytest.fixture
-def linked(tmp_path: Path) -> Path:
-    root = tmp_path / "root"
+def test_links_must_not_leave_the_root_which_may_be_a_link(tmp_path: Path):
+    root, alias = tmp_path / "root", tmp_path / "alias"
     (root / "a").mkdir(parents=True)
     (tmp_path / "root_of_others").mkdir()
-    (root / "out").symlink_to(tmp_path)
-    (root / "sibling").symlink_to(tmp_path / "root_of_others")
-    (root / "hop").symlink_to("out")
-    (root / "within").symlink_to("a")
-    (root / "ring").symlink_to("ring")
-    (tmp_path / "alias").symlink_to(root)
-    return root
-
-
-@pytest.mark.parametrize("relative", ["out", "sibling/x.png", "hop/x.png", "within/../out/x"])
-def test_links_that_leave_the_root_are_refused(linked, relative):
-    with pytest.raises(OutsidePath):
-        inside(linked, relative)
-
-
-@pytest.mark.parametrize("relative", ["a/x.png", "within/x.png", "not_there/x.png", "...", "a/..x", "ring"])
-def test_paths_below_the_root_are_taken_also_where_the_root_is_a_link(linked, relative):
-    assert inside(linked, relative) == linked / relative
-    assert inside(linked.parent / "alias", relative) == linked.parent / "alias" / relative
+    targets = {"out": tmp_path, "sibling": tmp_path / "root_of_others", "hop": "out", "within": "a", "ring": "ring"}
+    for name, target in targets.items():
+        (root / name).symlink_to(target)
+    alias.symlink_to(root)
+    for relative in ("out", "sibling/x.png", "hop/x.png", "within/../out/x"):
+        with pytest.raises(OutsidePath):
+            inside(root, relative)
+    for relative in ("a/x.png", "within/x.png", "not_there/x.png", "...", "a/..x", "ring"):
+        assert inside(root, relative) == root / relative
+        assert inside(alias, relative) == alias / relative
 
 
 def test_fields_have_exactly_the_asked_type():

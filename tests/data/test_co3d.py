@@ -1,15 +1,12 @@
-"""The data module on toy objects: shapes, frames of reference, protocols and repeatability."""
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, change, write_tree
-from lightning import LightningModule, Trainer
 from PIL import Image
 from plyfile import PlyData
-from realestate10k_trees import epoch, equal
+from realestate10k_trees import epoch, equal, same
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.selection import Filters, SeededSplit, SplitMembers, read_category
@@ -38,9 +35,8 @@ def scene(data: CO3DDataModule, split: str, index: int, reference: int, targets:
     return store.scene(store.source.read(store.names[index]), reference, targets)
 
 
-def test_training_batches_have_the_stated_shapes(toy_root):
-    data = module(toy_root, references_per_sequence=3)
-    batches = epoch(data.train_dataloader(), 0)
+def test_training_batches_have_the_stated_shapes_in_the_reference_frame(toy_root):
+    batches = epoch(module(toy_root, references_per_sequence=3).train_dataloader(), 0)
     assert [len(batch.names) for batch in batches] == [2, 2, 2]
     batch = batches[0]
     assert batch.reference.images.shape == (2, 3, 16, 16)
@@ -48,15 +44,9 @@ def test_training_batches_have_the_stated_shapes(toy_root):
     assert batch.targets.masks.shape == (2, 2, 1, 16, 16)
     assert batch.targets.cameras.world_to_camera.shape == (2, 2, 4, 4)
     assert batch.reference.cameras.image_size == (16, 16)
-    assert batch.depth_range.shape == (2, 2)
     assert batch.reference.images.dtype == batch.reference.cameras.world_to_camera.dtype == torch.float32
     assert 0 <= batch.reference.images.min() < batch.reference.images.max() <= 1
-
-
-def test_the_world_is_the_reference_frame(toy_root):
-    for batch in epoch(module(toy_root).train_dataloader(), 0):
-        identity = torch.eye(4).expand(2, 4, 4)
-        torch.testing.assert_close(batch.reference.cameras.world_to_camera, identity, atol=1e-6, rtol=0)
+    torch.testing.assert_close(batch.reference.cameras.world_to_camera, torch.eye(4).expand(2, 4, 4))
 
 
 def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
@@ -73,67 +63,48 @@ def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
     local = torch.from_numpy((points @ pose[:3, :3].T + pose[:3, 3]) * factor).float()
     for view in range(3):
         pixels = project(seen.targets.cameras[view], local)[0].long()
-        mask = seen.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]]
-        assert (mask > 0).float().mean() > 0.97
+        assert (seen.targets.masks[view, 0][pixels[:, 1], pixels[:, 0]] > 0).float().mean() > 0.97
     middle = (pose[2, :3] @ center.numpy() + pose[2, 3]) * factor
     assert seen.depth_range.tolist() == pytest.approx([middle - 1, middle + 2], abs=1e-4)
     assert 1.8 < middle < 2.4
-
-
-def test_the_near_end_stays_in_front_of_the_camera(toy_root):
+    # The near end stays in front of the camera.
     near, far = scene(module(toy_root, depth_before=50.0), "test", 0, 0, [1]).depth_range.tolist()
     assert 0 < near < far
 
 
-def test_pictures_are_the_files_where_nothing_is_resized(toy_root):
-    seen = scene(module(toy_root, image_size=32), "train", 1, 2, [0])
-    frame = members(toy_root, "train").frames[seen.names][2]
-    expected = torch.from_numpy(np.asarray(Image.open(frame.image)).copy()).permute(2, 0, 1) / 255
-    torch.testing.assert_close(seen.reference.images, expected)
-    mask = torch.from_numpy(np.asarray(Image.open(frame.mask)).copy())[None] / 255
-    torch.testing.assert_close(seen.reference.masks, mask)
-
-
-def test_epochs_differ_and_can_be_repeated(toy_root):
-    data = module(toy_root, references_per_sequence=4)
-    loader = data.train_dataloader()
-    first = epoch(loader, 0)
-    assert not equal(first, epoch(loader, 1))
-    assert equal(first, epoch(module(toy_root, references_per_sequence=4).train_dataloader(), 0))
-    assert not equal(first, epoch(module(toy_root, references_per_sequence=4, seed=1).train_dataloader(), 0))
-
-
-def test_an_item_draws_other_views_in_another_epoch(toy_root):
-    items = module(toy_root, references_per_sequence=4).train_dataloader().dataset
-    drawn = [[items[epoch, i].scenes for i in range(8)] for epoch in (0, 1, 1)]
-    assert not equal(drawn[0], drawn[1])
-    assert equal(drawn[1], drawn[2])
+def test_pictures_are_the_files_and_masks_may_be_cut_at_a_probability(toy_root):
+    seen = scene(module(toy_root, image_size=32), "train", 1, 2, [0]).reference
+    frames = list(members(toy_root, "train").frames.values())[1]
+    expected, soft = (torch.from_numpy(np.array(Image.open(file))) / 255 for file in (frames[2].image, frames[2].mask))
+    torch.testing.assert_close(seen.images, expected.permute(2, 0, 1))
+    torch.testing.assert_close(seen.masks, soft[None])
+    assert ((soft > 0) & (soft < 1)).any()
+    for threshold in (0.25, 1.0):
+        data = module(toy_root, image_size=32, mask_threshold=threshold)
+        assert torch.equal(scene(data, "train", 1, 2, [0]).reference.masks[0], (seen.masks[0] >= threshold).float())
 
 
 def test_neither_workers_nor_the_cache_change_what_is_drawn(toy_root):
-    plain = module(toy_root, references_per_sequence=4, cache=False).train_dataloader()
-    loader = module(toy_root, references_per_sequence=4, workers=2).train_dataloader()
-    for number in (0, 1):
-        assert equal(epoch(plain, number), epoch(loader, number))
+    plain, other, seeded = (
+        module(toy_root, references_per_sequence=4, **settings).train_dataloader()
+        for settings in ({"cache": False}, {"workers": 2}, {"seed": 1})
+    )
+    first, second = epoch(plain, 0), epoch(plain, 1)
+    assert equal(first, epoch(other, 0))
+    assert equal(second, epoch(other, 1))
+    assert not equal(first, second)
+    assert not equal(first, epoch(seeded, 0))
 
 
-def test_evaluation_goes_from_the_first_frame_to_all_others(toy_root):
+def test_evaluation_goes_from_the_first_frame_to_all_others_or_to_as_many_as_asked_for(toy_root):
     data = module(toy_root)
     for loader, split in ((data.test_dataloader(), "test"), (data.val_dataloader(), "val")):
         (batch,) = list(loader)
-        expected = scene(data, split, 0, 0, [1, 2, 3])
         assert batch.names == tuple(members(toy_root, split).frames)
-        assert torch.equal(batch.reference.images[0], expected.reference.images)
-        assert torch.equal(batch.targets.images[0], expected.targets.images)
-    (batch,) = list(module(toy_root, evaluation_targets=1).test_dataloader())
-    assert batch.targets.images.shape[1] == 1
-
-
-def test_validation_shows_fewer_targets_than_the_test_where_asked(toy_root):
-    data = module(toy_root, validation_targets=2)
-    assert [batch.targets.images.shape[1] for batch in (*data.val_dataloader(), *data.test_dataloader())] == [2, 3]
-    same = module(toy_root, evaluation_targets=1)
-    assert [batch.targets.images.shape[1] for batch in (*same.val_dataloader(), *same.test_dataloader())] == [1, 1]
+        assert same(batch[0], scene(data, split, 0, 0, [1, 2, 3]))
+    for settings, counts in (({"validation_targets": 2}, [2, 3]), ({"evaluation_targets": 1}, [1, 1])):
+        data = module(toy_root, **settings)
+        assert [b.targets.images.shape[1] for b in (*data.val_dataloader(), *data.test_dataloader())] == counts
 
 
 def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
@@ -143,38 +114,7 @@ def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
     assert [batch.targets.images.shape[:2] for batch in data.val_dataloader()] == [(2, 3)]
 
 
-class Recorder(LightningModule):
-    """Keeps the first reference image of every epoch, trains nothing."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.seen: list[torch.Tensor] = []
-
-    def training_step(self, batch: SceneBatch, index: int) -> torch.Tensor:
-        if index == 0:
-            self.seen.append(batch.reference.images)
-        return self.weight * 0
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), lr=0.1)
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_lightning_tells_the_sampler_the_epoch(toy_root, workers):
-    data = module(toy_root, workers=workers, references_per_sequence=2)
-    recorder = Recorder()
-    Trainer(
-        max_epochs=3, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, limit_val_batches=0,
-    ).fit(recorder, datamodule=data)  # fmt: skip
-    loader = module(toy_root, references_per_sequence=2).train_dataloader()
-    for number, image in enumerate(recorder.seen):
-        assert torch.equal(image, epoch(loader, number)[0].reference.images)
-    assert len(recorder.seen) == 3
-
-
-def test_typical_camera_is_the_mean_of_the_training_frames(toy_root):
+def test_typical_camera_and_mean_image_are_the_means_of_the_training_frames(toy_root):
     data = module(toy_root, depth_before=1.0, depth_after=2.0)
     fov, (near, far), _ = data.typical_camera()
     scenes = [scene(data, "train", i, f, [0]) for i in range(2) for f in range(4)]
@@ -183,12 +123,7 @@ def test_typical_camera_is_the_mean_of_the_training_frames(toy_root):
     # Half of the image over the focal length is the tangent of half of the angle.
     angles = [2 * np.degrees(np.arctan(8 / seen.reference.cameras.intrinsics[0, 0].item())) for seen in scenes]
     assert fov == pytest.approx(np.mean(angles))
-
-
-def test_mean_image_is_the_mean_of_the_training_frames(toy_root):
-    data = module(toy_root)
-    images = [scene(data, "train", i, f, [0]).reference.images for i in range(2) for f in range(4)]
-    torch.testing.assert_close(data.mean_image(), torch.stack(images).mean(dim=0))
+    torch.testing.assert_close(data.mean_image(), torch.stack([seen.reference.images for seen in scenes]).mean(dim=0))
 
 
 def test_an_empty_split_is_refused_where_it_is_needed(tmp_path):
@@ -200,28 +135,21 @@ def test_an_empty_split_is_refused_where_it_is_needed(tmp_path):
         assert caught.value.file == str(tmp_path)
 
 
-@pytest.mark.parametrize("threshold", [0.25, 0.5, 1.0])
-def test_masks_are_soft_or_cut_at_a_probability(toy_root, threshold):
-    soft = scene(module(toy_root), "test", 0, 0, [1, 2]).targets.masks
-    cut = scene(module(toy_root, mask_threshold=threshold), "test", 0, 0, [1, 2]).targets.masks
-    assert ((soft > 0) & (soft < 1)).any()
-    assert torch.equal(cut, (soft >= threshold).float())
-
-
 def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
     category = write_tree(tmp_path, {"a": 3, "b": 3, "c": 3}, {"train": ["a"], "val": ["b"], "test": ["c"]})
 
     def fingerprint() -> str:
         return CO3DDataModule(str(tmp_path), CATEGORY, image_size=8).source("train").fingerprint()
 
-    found = [fingerprint(), fingerprint()]
-    change(category / SEQUENCES, lambda entries: entries[0].update(viewpoint_quality_score=0.5))
-    found.append(fingerprint())
-    change(category / FRAMES, lambda entries: entries[0]["viewpoint"].update(focal_length=[3, 3.1]))
-    found.append(fingerprint())
-    change(category / SET_LIST, lambda splits: splits["val"].clear())
-    found.append(fingerprint())
-    assert found[0] == found[1]
+    found = [fingerprint()]
+    assert fingerprint() == found[0]
+    for file, edit in (
+        (SEQUENCES, lambda entries: entries[0].update(viewpoint_quality_score=0.5)),
+        (FRAMES, lambda entries: entries[0]["viewpoint"].update(focal_length=[3, 3.1])),
+        (SET_LIST, lambda splits: splits["val"].clear()),
+    ):
+        change(category / file, edit)
+        found.append(fingerprint())
     assert len(set(found)) == 4
 
 

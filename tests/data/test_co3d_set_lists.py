@@ -1,10 +1,7 @@
-"""Sequences that training and test share, lists without validation, and what results say of both."""
-
-import json
 from pathlib import Path
 
 import pytest
-from co3d_trees import CATEGORY, SET_LIST, write_tree
+from co3d_trees import CATEGORY, SET_LIST, change, write_tree
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.errors import DataError
@@ -23,11 +20,19 @@ def names(data: CO3DDataModule) -> dict[str, list[str]]:
     return {split: data.source(split).names for split in ("train", "val", "test")}
 
 
-def test_few_views_of_sequences_never_seen_are_the_default(tmp_path):
+def test_few_views_of_sequences_never_seen_are_the_default_and_a_split_by_seed_must_be_asked_for(tmp_path):
     """Splatter Image takes `fewview_dev` (`data_preprocessing/preprocess_co3d.py`)."""
-    write_tree(tmp_path, COUNTS, APART)
-    assert names(module(tmp_path)) == {split: list(listed) for split, listed in APART.items()}
-    assert module(tmp_path).describe()["subset"] == "fewview_dev"
+    write_tree(tmp_path / "lists", COUNTS, APART)
+    data = module(tmp_path / "lists")
+    assert names(data) == {split: list(listed) for split, listed in APART.items()}
+    assert data.describe()["subset"] == "fewview_dev"
+    write_tree(tmp_path / "none", COUNTS, None)
+    with pytest.raises(DataError, match=r"data\.subset=null"):
+        module(tmp_path / "none").setup("fit")
+    by_seed = module(tmp_path / "none", subset=None)
+    by_seed.setup("fit")
+    assert by_seed.describe()["subset"] is None
+    assert "seed 0" in by_seed.describe()["split"]
 
 
 @pytest.mark.parametrize("on_bad", ["skip", "raise"])
@@ -63,23 +68,10 @@ def test_a_seeded_part_of_training_validates_where_nothing_else_does(tmp_path, c
     assert "validates" in module(tmp_path).describe()["split"]
 
 
-def test_without_set_lists_a_split_by_seed_must_be_asked_for(tmp_path):
-    write_tree(tmp_path, COUNTS, None)
-    with pytest.raises(DataError, match=r"data\.subset=null"):
-        module(tmp_path).setup("fit")
-    by_seed = module(tmp_path, subset=None)
-    by_seed.setup("fit")
-    assert by_seed.describe()["subset"] is None
-    assert "seed 0" in by_seed.describe()["split"]
-
-
 def test_a_source_knows_how_many_sequences_its_list_has(tmp_path):
     """Also those that filters leave out or that cannot be read."""
     category = write_tree(tmp_path, COUNTS, APART | {"train": "abcd", "test": "efh"})
-    assert module(tmp_path).source("test").listed == 3
     assert module(tmp_path, min_frames=4).source("test").listed == 3
-    lists = category / SET_LIST
-    content = json.loads(lists.read_text())
-    content["test"].append(["gone", 0, "x"])
-    lists.write_text(json.dumps(content))
-    assert (len(module(tmp_path).source("test").names), module(tmp_path).source("test").listed) == (3, 4)
+    change(category / SET_LIST, lambda splits: splits["test"].append(["gone", 0, "x"]))
+    source = module(tmp_path).source("test")
+    assert (len(source.names), source.listed) == (3, 4)

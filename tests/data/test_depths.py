@@ -1,7 +1,6 @@
-"""True depth in the square pictures, against the point cloud and in closed form."""
-
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -53,31 +52,17 @@ def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
         assert ((z - seen).abs() < 0.03 * seen).double().mean() > 0.2
 
 
-def read_depth_with(data: ToyObjectsDataModule, monkeypatch: pytest.MonkeyPatch, reader: object) -> None:
-    (name,) = data.store("test").names
-    sequence = replace(data.source("test").read(name), read_depth=reader)
-    monkeypatch.setattr(type(data.source("test")), "read", lambda *_: sequence)
-
-
-def test_data_without_depth_have_none(data, monkeypatch):
-    read_depth_with(data, monkeypatch, None)
-    assert scene_of(data).all_views().depths is None
-
-
-def test_a_depth_map_that_cannot_be_read_costs_the_depths_of_its_scene_not_the_scene(data, monkeypatch):
-    def damaged(_: int) -> torch.Tensor:
-        raise BadPicture("no finite depth in it", "depth.png")
-
-    read_depth_with(data, monkeypatch, damaged)
-    loader = data.test_dataloader()
-    (batch,) = loader
-    assert batch.all_views().depths is None
-    assert (loader.refused, [error.file for error in loader.refused_depths]) == ([], ["depth.png"])
-
-
-def test_only_the_test_reads_depths(data):
+def test_only_the_test_reads_depths_and_what_has_none_costs_no_scene(data, monkeypatch):
     for loader in (data.train_dataloader(), data.val_dataloader()):
         assert next(iter(loader)).all_views().depths is None
+    source, error = data.source("test"), BadPicture("no finite depth in it", "depth.png")
+    sequence = source.read(data.store("test").names[0])
+    for reader, refused in ((None, []), (Mock(side_effect=error), ["depth.png"])):
+        monkeypatch.setattr(type(source), "read", lambda *_, reader=reader: replace(sequence, read_depth=reader))
+        loader = data.test_dataloader()
+        (batch,) = loader
+        assert batch.all_views().depths is None
+        assert (loader.refused, [error.file for error in loader.refused_depths]) == ([], refused)
 
 
 def test_depths_are_unknown_where_only_other_scenes_of_a_batch_have_them(data):

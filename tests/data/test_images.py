@@ -1,5 +1,3 @@
-"""Image files and depth maps of data sets: unusual but sound ones give exactly their pixels, others are refused."""
-
 import io
 import struct
 import warnings
@@ -7,6 +5,7 @@ import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -47,10 +46,6 @@ def saved(pixels: np.ndarray | Image.Image, kind: str = "PNG", orientation: int 
     return buffer.getvalue()
 
 
-def opaque(pixels: np.ndarray) -> np.ndarray:
-    return np.dstack([pixels, np.full(pixels.shape[:2], 255, dtype=np.uint8)])
-
-
 def palette(pixels: np.ndarray) -> Image.Image:
     """A picture of at most 48 colours as indices into a palette."""
     colors, index = np.unique(pixels.reshape(-1, 3), axis=0, return_inverse=True)
@@ -77,18 +72,13 @@ RIGHT: dict[str, tuple[bytes, str, np.ndarray]] = {
     "png_grey_as_mask": (saved(GREY), "L", GREY),
     "rgb_of_equal_channels_as_mask": (saved(grey_rgb(GREY)), "L", GREY),
     "one_bit_png": (saved(BITS), "L", np.uint8(255) * BITS),
-    "one_bit_tiff": (saved(BITS, "TIFF", compression="group4"), "L", np.uint8(255) * BITS),
     "sixteen_bit_png_as_mask": (saved(DEEP), "L", EIGHT),
-    "sixteen_bit_png_as_rgb": (saved(DEEP), "RGB", grey_rgb(EIGHT)),
-    "sixteen_bit_tiff": (saved(DEEP, "TIFF"), "L", EIGHT),
     "sixteen_bit_big_endian_tiff": (
         saved(Image.frombytes("I;16B", (8, 6), DEEP.astype(">u2").tobytes()), "TIFF"), "L", EIGHT,
     ),
     "palette_of_greys_as_mask": (saved(palette(grey_rgb(GREY))), "L", GREY),
     "palette_with_opaque_transparency": (saved(palette(RGB), transparency=bytes([255] * 48)), "RGB", RGB),
-    "palette_bmp": (saved(palette(RGB), "BMP"), "RGB", RGB),
-    "opaque_rgba": (saved(opaque(RGB)), "RGB", RGB),
-    "opaque_grey_with_alpha": (saved(Image.fromarray(opaque(GREY[..., None]), "LA")), "L", GREY),
+    "opaque_rgba": (saved(Image.fromarray(RGB).convert("RGBA")), "RGB", RGB),
     # Without black, red is what cyan leaves of white, and so on.
     "cmyk_tiff": (saved(Image.fromarray(INKS, "CMYK"), "TIFF"), "RGB", 255 - INKS[..., :3]),
     "png_with_foreign_profile": (saved(RGB, icc_profile=PROFILE), "RGB", RGB),
@@ -96,7 +86,6 @@ RIGHT: dict[str, tuple[bytes, str, np.ndarray]] = {
     "meaningless_orientation": (saved(RGB, orientation=99), "RGB", RGB),
     "trailing_bytes": (saved(RGB) + b"more", "RGB", RGB),
     **{f"png_orientation_{n}": (saved(RGB, orientation=n), "RGB", UPRIGHT[n](RGB)) for n in UPRIGHT},
-    "tiff_orientation_6": (saved(RGB, "TIFF", orientation=6), "RGB", UPRIGHT[6](RGB)),
     "sixteen_bit_orientation_6": (saved(DEEP, orientation=6), "L", UPRIGHT[6](EIGHT)),
 }  # fmt: skip
 
@@ -116,16 +105,14 @@ def test_the_pixels_are_those_of_the_file(name, tmp_path):
     ("content", "expected"),
     [
         (saved(grey_rgb(SMOOTH), "JPEG", quality=95, progressive=True), grey_rgb(SMOOTH)),
-        (saved(SMOOTH, "JPEG", quality=95), grey_rgb(SMOOTH)),
         (saved(Image.fromarray(grey_rgb(SMOOTH)).convert("CMYK"), "JPEG"), grey_rgb(SMOOTH)),
-        (saved(Image.fromarray(grey_rgb(SMOOTH)).convert("YCbCr"), "TIFF"), grey_rgb(SMOOTH)),
         (
             saved(SMOOTH, "MPO", save_all=True, append_images=[Image.fromarray(255 - SMOOTH)], quality=95),
             grey_rgb(SMOOTH),
         ),
         (saved(SMOOTH, "JPEG", quality=95, orientation=8), np.rot90(grey_rgb(SMOOTH))),
     ],
-    ids=["progressive_jpeg", "grey_jpeg", "cmyk_jpeg", "ycbcr_tiff", "mpo_of_two", "jpeg_orientation_8"],
+    ids=["progressive_jpeg", "cmyk_jpeg", "mpo_of_two", "jpeg_orientation_8"],
 )
 def test_lossy_files_are_read_to_within_their_loss(content, expected):
     assert np.abs(np.asarray(decode(content, "a", "RGB")).astype(int) - expected).max() <= 4
@@ -134,15 +121,13 @@ def test_lossy_files_are_read_to_within_their_loss(content, expected):
 @pytest.fixture
 def ramp(tmp_path):
     """A 20 x 30 picture (height x width) whose value is four times the column plus five times the row."""
-    column, row = np.meshgrid(np.arange(30), np.arange(20))
-    Image.fromarray((4 * column + 5 * row).astype(np.uint8)).save(tmp_path / "ramp.png")
+    Image.fromarray((4 * np.arange(30) + 5 * np.arange(20)[:, None]).astype(np.uint8)).save(tmp_path / "ramp.png")
     return tmp_path / "ramp.png"
 
 
 def test_a_whole_pixel_crop_without_resizing_is_a_slice(ramp, tmp_path):
     pixels = read_square(ramp, (20, 30), Square(7, 3, 10), 10, "L")
-    column, row = np.meshgrid(np.arange(7, 17), np.arange(3, 13))
-    assert np.array_equal(pixels[0].numpy(), 4 * column + 5 * row)
+    assert np.array_equal(pixels[0].numpy(), 4 * np.arange(7, 17) + 5 * np.arange(3, 13)[:, None])
     Image.fromarray(DEEP).save(tmp_path / "mask.png")
     square = read_square(tmp_path / "mask.png", (6, 8), Square(1, 0, 6), 6, "L")
     assert np.array_equal(square[0].numpy(), EIGHT[:, 1:7])
@@ -175,23 +160,11 @@ def png(width: int, height: int, *chunks: tuple[bytes, bytes]) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def bmp(width: int, height: int) -> bytes:
-    """A header without pixels."""
-    return struct.pack("<2sIHHI", b"BM", 54, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, width, height, 1, 24, *[0] * 6)
-
-
 def wrong_checksum() -> bytes:
     """Pixels replaced together with zlib's own checksum; only the chunk's tells."""
     rows = b"".join(b"\0" + row.tobytes() for row in LARGE)
     good, other = zlib.compress(rows, 0), zlib.compress(rows[:-1] + bytes([rows[-1] ^ 1]), 0)
     return png(32, 24, (b"IDAT", good)).replace(good, other)
-
-
-def translucent(value: int, mode: str) -> Image.Image:
-    image, layer = Image.fromarray(LARGE).convert(mode), Image.new("L", (32, 24), 255)
-    layer.putpixel((3, 4), value)
-    image.putalpha(layer)
-    return image
 
 
 NEGATIVE = [Image.fromarray(255 - LARGE)]
@@ -203,19 +176,14 @@ BAD: dict[str, tuple[bytes, str, str]] = {
     "postscript": (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n", "RGB", "not an image"),
     "gif": (saved(LARGE, "GIF"), "RGB", "not an image in one of the formats JPEG, PNG, WEBP, TIFF, BMP"),
     **{f"cut_{kind}": (cut(saved(LARGE, kind)), "RGB", "cannot be decoded") for kind in ("JPEG", "PNG", "WEBP")},
-    **{f"cut_{kind}": (cut(saved(LARGE, kind)), "RGB", "cannot be decoded") for kind in ("TIFF", "BMP")},
     "another_checksum": (wrong_checksum(), "RGB", "cannot be decoded"),
     "text_bomb": (
         png(1, 1, (b"zTXt", b"k\0\0" + zlib.compress(bytes(10**7))), (b"IDAT", zlib.compress(bytes(4)))),
         "RGB", "cannot be decoded",
     ),
     "bomb_of_51_megapixels": (png(7200, 7100, (b"IDAT", zlib.compress(bytes(99)))), "RGB", "50,000,000 pixels"),
-    "bomb_of_400_megapixels": (png(20000, 20000, (b"IDAT", b"")), "RGB", "50,000,000 pixels"),
-    "bmp_of_a_huge_header": (bmp(12000, 12000), "RGB", "50,000,000 pixels"),
     "animated_png": (saved(LARGE, save_all=True, append_images=NEGATIVE), "RGB", "2 frames"),
-    "tiff_of_two_pages": (saved(LARGE, "TIFF", save_all=True, append_images=NEGATIVE), "RGB", "2 frames"),
-    "one_translucent_pixel": (saved(translucent(254, "RGBA")), "RGB", "transparent"),
-    "translucent_grey": (saved(translucent(9, "LA")), "L", "transparent"),
+    "hardly_translucent": (saved(np.dstack([LARGE, 255 - np.eye(24, 32, dtype=np.uint8)])), "RGB", "transparent"),
     "transparent_colour": (saved(LARGE, transparency=tuple(LARGE[0, 0].tolist())), "RGB", "transparent"),
     "transparent_deep_grey": (
         saved(LARGE_GREY.astype(np.uint16) * 257, transparency=int(LARGE_GREY[0, 0]) * 257), "L", "transparent",
@@ -223,7 +191,6 @@ BAD: dict[str, tuple[bytes, str, str]] = {
     "transparent_palette_entry": (saved(Image.fromarray(LARGE).quantize(16), transparency=0), "RGB", "transparent"),
     "coloured_mask": (saved(LARGE), "L", "has colours"),
     "float_tiff": (saved(LARGE_GREY.astype(np.float32) / 255, "TIFF"), "RGB", "colour mode F"),
-    "lab_tiff": (saved(Image.fromarray(LARGE).convert("LAB"), "TIFF"), "RGB", "colour mode LAB"),
     "other_size": (saved(LARGE[:23]), "RGB", "has 23 x 32 pixels, its annotation says 24 x 32"),
     "annotated_before_rotation": (saved(LARGE, orientation=6), "RGB", "before it is turned as its EXIF orientation 6"),
 }  # fmt: skip
@@ -246,19 +213,16 @@ def test_a_bad_image_is_refused_by_name(name, tmp_path, monkeypatch):
     content, mode, part = BAD[name]
     path = tmp_path / f"{name}.jpg"
     path.write_bytes(content)
-    if "megapixels" in name or "huge" in name:
+    if "megapixels" in name:
         monkeypatch.setattr(ImageFile.ImageFile, "load", lambda self: pytest.fail("decoded"))
     refuse(lambda: decode(path, str(path), mode, (24, 32)), str(path), part)
     refuse(lambda: decode(content, "frame 7 of x", mode, (24, 32)), "frame 7 of x", part)
 
 
-def test_places_without_a_file_are_refused(tmp_path):
+def test_places_without_a_usable_file_are_refused(tmp_path):
     (tmp_path / "ring.png").symlink_to("ring.png")
     for place in (tmp_path / "none.png", tmp_path, tmp_path / "ring.png", tmp_path / ("n" * 300)):
         refuse(lambda place=place: decode(place, str(place), "RGB"), str(place), "no such file", MissingFile)
-
-
-def test_a_file_of_too_many_bytes_is_refused_before_it_is_read(tmp_path):
     with (tmp_path / "sparse.png").open("wb") as file:
         file.truncate(10**12)
     refuse(lambda: decode(tmp_path / "sparse.png", "sparse", "RGB"), "sparse", "bytes")
@@ -266,14 +230,9 @@ def test_a_file_of_too_many_bytes_is_refused_before_it_is_read(tmp_path):
 
 @pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), KeyError("x"), struct.error("short")])
 def test_whatever_a_decoder_raises_is_a_data_error(monkeypatch, error):
-    def fail(self):
-        raise error
-
-    monkeypatch.setattr(ImageFile.ImageFile, "load", fail)
+    monkeypatch.setattr(ImageFile.ImageFile, "load", Mock(side_effect=error))
     refuse(lambda: decode(saved(RGB, "BMP"), "name", "RGB"), "name", "cannot be decoded")
-
-
-def test_a_process_that_lets_truncated_files_pass_is_refused(monkeypatch):
+    monkeypatch.undo()
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     refuse(lambda: decode(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
 
@@ -320,15 +279,12 @@ def test_a_depth_map_is_float16_times_the_scale_and_unknown_where_not_finite(tmp
     [
         (saved(GREY), 1.0, "16 bits"),
         (saved(DEEP, "TIFF"), 1.0, "formats PNG"),
-        (cut(depth_png(LARGE_GREY / 255)), 1.0, "cannot be decoded"),
-        (b"depth", 1.0, "not an image"),
         (depth_png([[1.0, -0.5]]), 1.0, "negative"),
         (depth_png([[np.nan, np.inf]]), 1.0, "no finite depth"),
         (saved(np.arange(1, 1000, dtype=np.uint16)[None]), 1.0, "integers"),
-        (png(12000, 12000, (b"IDAT", b"")), 1.0, "50,000,000 pixels"),
         *((depth_png(np.ones((2, 2))), scale, "scale adjustment") for scale in (0.0, float("nan"), float("inf"))),
     ],
-    ids=["eight_bits", "tiff", "cut", "text", "negative", "not_finite", "integers", "bomb", "zero", "nan", "infinite"],
+    ids=["eight_bits", "tiff", "negative", "not_finite", "integers", "zero", "nan", "infinite"],
 )
 def test_a_bad_depth_map_is_refused_by_name(tmp_path: Path, content, scale, part):
     path = tmp_path / "d.png"

@@ -1,5 +1,3 @@
-"""Training from the latent cache: what is drawn is what training from pictures draws."""
-
 from dataclasses import fields
 from pathlib import Path
 
@@ -31,72 +29,48 @@ def cache(root, tmp_path_factory) -> Path:
     return out
 
 
-def loader(root: Path, cache: Path, workers: int = 0) -> SceneLoader:
-    return rooms(root, latent_cache=str(cache), box_masks=BOXES, workers=workers).train_dataloader()
-
-
-def same(one: CachedScene, other: CachedScene) -> bool:
-    values = [[getattr(one, field.name), getattr(other, field.name)] for field in fields(CachedScene)]
-    return all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b for a, b in values)
-
-
-def equal(one: list[CachedScene], other: list[CachedScene]) -> bool:
-    return len(one) == len(other) and all(map(same, one, other))
-
-
-def epoch(batches: SceneLoader, number: int) -> list[CachedScene]:
-    batches.sampler.set_epoch(number)
-    return list(batches)
+def drawn(loader: SceneLoader, number: int) -> list[list]:
+    """All that the batches of an epoch hold, to be compared bit by bit."""
+    loader.sampler.set_epoch(number)
+    values = [[getattr(batch, field.name) for field in fields(CachedScene)] for batch in loader]
+    return [[v.tolist() if isinstance(v, torch.Tensor) else v for v in batch] for batch in values]
 
 
 @pytest.mark.parametrize("references", [1, 3])
-def test_an_item_is_the_sequence_and_reference_that_pictures_give(root, cache, references):
+def test_an_item_is_the_sequence_and_the_encoded_reference_that_pictures_give(root, cache, references):
     settings = {"box_masks": BOXES, "references_per_sequence": references}
     pictures = rooms(root, **settings).train_dataloader()
     cached = rooms(root, latent_cache=str(cache), **settings).train_dataloader()
     assert [list(part) for part in cached.sampler.groups] == [list(part) for part in pictures.sampler.groups]
     assert len(cached.dataset) == len(pictures.dataset) == SEQUENCES * references
-    for key in [(number, index) for number in (0, 1) for index in range(len(pictures.dataset))]:
-        expected, found = pictures.dataset[key], cached.dataset[key]
-        scene, reference = found.scenes, expected.scenes
-        assert (scene.names, scene.reference_frame.item()) == (reference.names, reference.reference_frame.item())
-        assert torch.equal(scene.condition, reference.reference.images * reference.visible)
-
-
-def test_an_item_holds_the_encoding_of_its_reference_picture(root, cache):
     encoder = small_autoreconstructor().encoder
-    pictures, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(cache)).train_dataloader()
-    for index in range(SEQUENCES):
+    for key in [(number, index) for number in (0, 1) for index in range(len(pictures.dataset))]:
+        scene, drawn = cached.dataset[key].scenes, pictures.dataset[key].scenes
+        assert (scene.names, scene.reference_frame.item()) == (drawn.names, drawn.reference_frame.item())
+        assert torch.equal(scene.condition, drawn.reference.images * drawn.visible)
         with torch.no_grad():
-            posterior, _ = encoder(pictures.dataset[0, index].scenes.reference.images[None])
-        scene = cached.dataset[0, index].scenes
+            posterior, _ = encoder(drawn.reference.images[None])
         torch.testing.assert_close(scene.mean, posterior.mean[0], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(scene.log_variance, posterior.log_variance[0], rtol=1e-4, atol=1e-5)
 
 
-def test_batches_are_stacked_items(root, cache):
-    batch = epoch(loader(root, cache), 0)[0]
+def test_batches_are_stacked_items_and_a_resumed_epoch_continues_exactly(root, cache):
+    data = rooms(root, latent_cache=str(cache), box_masks=BOXES)
+    interrupted, resumed = data.train_dataloader(), data.train_dataloader()
+    expected = drawn(interrupted, 1)
+    assert drawn(interrupted, 0) != expected
+    interrupted.sampler.set_epoch(1)
+    batch = next(iter(interrupted))
     assert batch.mean.shape == (3, 4, 2, 2)
     assert batch.condition.shape == (3, 3, 16, 16)
     assert len(batch.names) == len(batch.reference_frame) == 3
-    assert same(batch[0:2], batch[0:2])
     assert batch[1].names == batch.names[1]
-
-
-def test_workers_do_not_change_the_batches(root, cache):
-    one, other = loader(root, cache), loader(root, cache, workers=2)
-    epochs = [epoch(one, number) for number in (0, 1)]
-    assert not equal(*epochs)
-    for number, expected in enumerate(epochs):
-        assert equal(epoch(other, number), expected)
-
-
-def test_a_resumed_epoch_continues_exactly(root, cache):
-    expected, interrupted, resumed = epoch(loader(root, cache), 1), loader(root, cache), loader(root, cache)
-    interrupted.sampler.set_epoch(1)
-    assert same(next(iter(interrupted)), expected[0])
     resumed.load_state_dict(interrupted.state_dict())
-    assert equal(epoch(resumed, 1), expected[1:])
+    assert drawn(resumed, 1) == expected[1:]
+    workers = rooms(root, latent_cache=str(cache), box_masks=BOXES, workers=2).train_dataloader()
+    assert drawn(workers, 1) == expected
+    # Validation reads pictures.
+    assert next(iter(data.val_dataloader())).targets.images.shape[-3:] == (3, 16, 16)
 
 
 def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp_path):
@@ -118,17 +92,6 @@ def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp
         store.scene(name, 0)
 
 
-def test_validation_reads_pictures(root, cache):
-    batch = next(iter(rooms(root, latent_cache=str(cache)).val_dataloader()))
-    assert batch.targets.images.shape[-3:] == (3, 16, 16)
-
-
-@pytest.mark.parametrize("changes", [{"color_jitter": dict.fromkeys(STRENGTHS, 0.1)}, {"horizontal_flip": True}])
-def test_what_would_change_pictures_is_refused(tmp_path, changes):
-    with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):
-        rooms(tmp_path, latent_cache="somewhere", **changes)
-
-
 class Halves(torch.nn.Module):
     """A frozen conditioning: the mean of each quarter of a picture."""
 
@@ -138,12 +101,15 @@ class Halves(torch.nn.Module):
         return torch.nn.functional.avg_pool2d(images, 8)
 
 
-def test_features_are_given_as_they_were_stored_and_cannot_be_masked(tmp_path):
+def test_features_are_given_as_they_were_stored_and_cannot_be_changed(tmp_path):
     root, out = sound_rooms(tmp_path / "root"), tmp_path / "cache"
     encode_training_set(small_autoreconstructor(), rooms(root), out, conditioning=Halves(), progress=False)
     pictures, cached = rooms(root).train_dataloader(), rooms(root, latent_cache=str(out)).train_dataloader()
     expected = Halves()(pictures.dataset[0, 1].scenes.reference.images)
     torch.testing.assert_close(cached.dataset[0, 1].scenes.condition, expected)
+    for changes in ({"color_jitter": dict.fromkeys(STRENGTHS, 0.1)}, {"horizontal_flip": True}):
+        with pytest.raises(CompleteSplatError, match=r"data\.color_jitter=null"):
+            rooms(root, latent_cache=str(out), **changes)
     masked = rooms(root, latent_cache=str(out), box_masks=BOXES)
     with pytest.raises(CompleteSplatError, match=r"data\.box_masks cannot"):
         masked.setup("fit")

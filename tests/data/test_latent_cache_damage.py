@@ -1,5 +1,3 @@
-"""A latent cache that is not what was written does not open."""
-
 import json
 import pickle
 import shutil
@@ -28,19 +26,16 @@ def copy(sound, tmp_path) -> Path:
     return Path(shutil.copytree(sound, tmp_path / "copy"))
 
 
-@pytest.mark.parametrize("damage", ["cut", "header", "longer", "gone", "empty", "other", "objects"])
+@pytest.mark.parametrize("damage", ["cut", "header", "longer", "gone", "other", "objects"])
 def test_a_damaged_array_is_refused_by_its_name(copy, damage):
     path = copy / "log_variance.npy"
     content = path.read_bytes()
-    changed = {"cut": content[:-1], "header": content[:40], "longer": content + b"x", "empty": b""}
+    changed = {"cut": content[:-1], "header": content[:40], "longer": content + b"x"}
+    path.unlink()
     if damage in changed:
         path.write_bytes(changed[damage])
-    else:
-        path.unlink()
-    if damage == "other":
-        np.save(path, np.zeros((3, 4), np.float32))
-    elif damage == "objects":
-        np.save(path, np.array([{}, []], dtype=object), allow_pickle=True)
+    elif damage != "gone":
+        np.save(path, np.zeros((3, 4), np.float32) if damage == "other" else np.array([{}, []], dtype=object))
     with pytest.raises(DataError) as caught:
         LatentCache(copy)
     assert caught.value.file == str(path)
@@ -51,17 +46,12 @@ def test_a_damaged_array_is_refused_by_its_name(copy, damage):
     ("place", "value"),
     [
         (("format",), 99),
-        (("kind",), "prepared"),
-        (("scale",), -1.0),
         (("sequences", 0, "stored"), [0, 0]),
-        (("sequences", 0, "stored"), []),
         (("sequences", 0, "frames"), 2),
-        (("sequences", 0, "first"), 10**6),
         (("sequences", 0, "name"), "taken"),
         (("arrays", "mean", "file"), "../mean.npy"),
         (("arrays", "mean", "dtype"), "object"),
         (("arrays", "mean", "shape"), [20, 4, 2]),
-        (("arrays", "condition"), None),
         (("origin", "frames"), "all"),
     ],
 )
@@ -75,7 +65,12 @@ def test_a_manifest_that_cannot_be_true_is_refused(copy, place, value):
         LatentCache(copy)
 
 
-def test_a_manifest_that_is_cut_short_is_refused(copy):
+def test_a_store_goes_to_other_processes_without_its_arrays_and_without_a_manifest_is_none(sound, copy):
+    store = LatentCache(sound)
+    again = pickle.loads(pickle.dumps(store))
+    assert len(pickle.dumps(store)) < 1000
+    assert all(isinstance(array, np.memmap) for array in again.arrays.values())
+    assert again.manifest == store.manifest
     path = copy / "manifest.json"
     path.write_text(path.read_text()[:-20])
     with pytest.raises(DataError, match="not a JSON file"):
@@ -85,16 +80,11 @@ def test_a_manifest_that_is_cut_short_is_refused(copy):
         LatentCache(copy)
 
 
-def test_a_store_goes_to_other_processes_without_its_arrays(sound):
-    store = LatentCache(sound)
-    again = pickle.loads(pickle.dumps(store))
-    assert len(pickle.dumps(store)) < 1000
-    assert all(isinstance(array, np.memmap) for array in again.arrays.values())
-    assert again.manifest == store.manifest
-
-
 @pytest.mark.parametrize("parts", [[], [1], [3, 0, 100_000]])
-def test_rows_are_read_as_they_were_written(tmp_path, parts):
+def test_rows_are_read_as_they_were_written_and_those_of_an_interrupted_writing_are_removed(tmp_path, parts):
+    with pytest.raises(KeyboardInterrupt), ArrayWriter(tmp_path / "rows.npy", (1, 2, 1), "float16"):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
     rng = np.random.default_rng(0)
     blocks = [rng.normal(size=(count, 1, 2, 1)).astype(np.float16) for count in parts]
     with ArrayWriter(tmp_path / "rows.npy", (1, 2, 1), "float16") as writer:
@@ -104,9 +94,3 @@ def test_rows_are_read_as_they_were_written(tmp_path, parts):
     assert np.array_equal(np.load(tmp_path / "rows.npy"), expected)
     if parts:
         assert np.array_equal(open_array(tmp_path, writer.described()), expected)
-
-
-def test_rows_of_an_interrupted_writing_are_removed(tmp_path):
-    with pytest.raises(KeyboardInterrupt), ArrayWriter(tmp_path / "rows.npy", (1, 2, 1), "float16"):
-        raise KeyboardInterrupt
-    assert list(tmp_path.iterdir()) == []

@@ -1,5 +1,3 @@
-"""What cannot be read: raised with its place in every process, or counted, told and limited."""
-
 import logging
 from pathlib import Path
 
@@ -63,22 +61,18 @@ def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     root = make_tree(tmp_path, ["c5"], ["c2", "c6"])
     with pytest.raises(DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"):
         list(module(root, max_bad_fraction=0.25).test_dataloader())
+    with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
+        list(module(root, max_bad_fraction=0.1, workers=2, val_fraction=0.0).train_dataloader())
     assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
+    one_bad = module(make_tree(tmp_path / "one", ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1)
+    assert len(list(one_bad.test_dataloader())) == 8  # One is no share.
 
 
-def test_one_bad_item_is_no_share(tmp_path):
-    data = module(make_tree(tmp_path, ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1)
-    assert len(list(data.test_dataloader())) == 8
-
-
-def test_nothing_that_can_be_read_is_an_error(tmp_path):
-    data = module(make_tree(tmp_path, KEYS), max_bad_fraction=100.0)
+def test_nothing_that_can_be_read_and_an_unknown_policy_are_errors(tmp_path):
+    data = module(make_tree(tmp_path, KEYS), max_bad_fraction=2.0)
     for loader in (data.train_dataloader(), data.test_dataloader()):
         with pytest.raises(DataError, match="items cannot be read"):
             list(loader)
-
-
-def test_an_unknown_policy_is_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match=r"data\.on_bad=ignore: choose one of skip, raise"):
         module(tmp_path, on_bad="ignore")
 

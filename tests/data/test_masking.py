@@ -1,5 +1,3 @@
-"""What of a photograph stays visible, and that resizing carries nothing of the rest into it."""
-
 from pathlib import Path
 
 import numpy as np
@@ -45,29 +43,21 @@ def test_no_visible_pixel_holds_anything_hidden(pictures, size, form):
     assert visible.unique().tolist() == [0, 1]
 
 
-def test_a_picture_of_the_right_size_is_hidden_to_the_pixel(pictures):
-    first, _, mask = pictures(32, 32)
-    expected = torch.ones(1, 32, 32)
+def test_a_picture_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pixels_more_at_most(pictures):
+    expected, grown = torch.ones(2, 1, 32, 32)
     expected[:, 16:, 8:24] = 0
+    grown[:, 13:, 5:27] = 0
+    first, _, mask = pictures(32, 32)
     assert torch.equal(outside_of_box(first, BOX, 32), expected)
     assert torch.equal(outside_of_mask(first, mask, 32), expected)
+    assert torch.equal(outside_of_box(pictures(640, 640)[0], BOX, 32), grown)
 
 
-def test_what_is_hidden_grows_by_no_more_than_three_pixels(pictures):
-    first, _, _ = pictures(640, 640)
-    expected = torch.ones(1, 32, 32)
-    expected[:, 13:, 5:27] = 0
-    assert torch.equal(outside_of_box(first, BOX, 32), expected)
-
-
-@pytest.mark.parametrize("box", [(0, 0, 1), (0, 0, 0, 1), (0.5, 0, 0.4, 1), (-0.1, 0, 1, 1), (0, 0, 1, 1.1)])
-def test_what_is_no_box_is_refused(pictures, box):
-    with pytest.raises(CompleteSplatError, match="box="):
-        outside_of_box(pictures(32, 32)[0], box, 32)
-
-
-def test_masks_that_are_none_are_refused(pictures, tmp_path):
+def test_boxes_and_masks_that_are_none_are_refused(pictures, tmp_path):
     first = pictures(32, 32)[0]
+    for box in ((0, 0, 1), (0, 0, 0, 1), (0.5, 0, 0.4, 1), (-0.1, 0, 1, 1), (0, 0, 1, 1.1)):
+        with pytest.raises(CompleteSplatError, match="box="):
+            outside_of_box(first, box, 32)
     Image.new("L", (32, 32)).save(tmp_path / "black.png")
     with pytest.raises(CompleteSplatError, match=r"black.png: hides nothing"):
         outside_of_mask(first, tmp_path / "black.png", 32)

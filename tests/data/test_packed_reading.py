@@ -59,13 +59,16 @@ def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 
 
 
 @pytest.mark.parametrize(("codec", "masked"), [("png", True), ("bmp", False)])
-def test_png_and_bmp_give_back_every_bit(masked: bool, codec: str, tmp_path: Path) -> None:
+def test_png_and_bmp_give_back_every_bit_also_in_other_processes(masked: bool, codec: str, tmp_path: Path) -> None:
     source = PackedSource(make(tmp_path / "store", masked, codec=codec), "train")
     assert isinstance(source, SequenceSource)
     assert source.names == NAMES
     assert (source.refused, source.left_out, source.fingerprint()) == ([], {}, "a")
     for name in NAMES:
         assert_same(source.read(name), make_sequence(name, masked=masked))
+    small = pickle.dumps(source)
+    assert b"datasets" not in small
+    assert_same(pickle.loads(small).read("s0"), make_sequence("s0", masked=masked))
 
 
 def test_jpeg_keeps_cameras_and_masks_and_changes_colours_by_little(tmp_path: Path) -> None:
@@ -97,43 +100,28 @@ def test_names_keep_the_order_of_the_source_though_chunks_lie_together(tmp_path:
         assert_same(source.read(name), make_sequence(name))
 
 
-def test_a_source_travels_to_other_processes_without_the_files_it_has_open(store: Path) -> None:
+def test_only_a_complete_store_with_its_own_shards_opens(store: Path, tmp_path: Path) -> None:
     source = PackedSource(store, "train")
-    source.read("s0")
-    small = pickle.dumps(source)
-    assert b"datasets" not in small
-    assert_same(pickle.loads(small).read("s0"), make_sequence("s0"))
-
-
-def test_only_a_complete_store_and_the_splits_in_it_open(store: Path, tmp_path: Path) -> None:
+    assert is_packed(store)
+    assert source.verify() == []
     with pytest.raises(DataError, match=r"no split test .* there are: train"):
         PackedSource(store, "test")
-    assert is_packed(store)
     assert not is_packed(tmp_path)
     with pytest.raises(MissingFile):
         read_manifest(tmp_path)
-
-
-def test_opening_notices_shards_that_are_missing_or_of_another_size(store: Path) -> None:
-    content = (store / SHARD).read_bytes()
-    (store / SHARD).write_bytes(content + b"\0")
+    shard = store / SHARD
+    content = shard.read_bytes()
+    shard.write_bytes(content[:-99] + bytes([content[-99] ^ 1]) + content[-98:])
+    assert [error.file for error in source.verify()] == [str(shard)]
+    shard.write_bytes(content + b"\0")
     with pytest.raises(ChangedFile, match=SHARD):
         PackedSource(store, "train")
-    (store / SHARD).unlink()
+    shard.unlink()
     with pytest.raises(MissingFile, match=SHARD):
         PackedSource(store, "train")
-    (store / SHARD).symlink_to(store.parent / "elsewhere")
+    shard.symlink_to(store.parent / "elsewhere")
     with pytest.raises(OutsidePath):
         PackedSource(store, "train")
-
-
-def test_verifying_finds_the_shard_with_a_changed_bit(store: Path) -> None:
-    source = PackedSource(store, "train")
-    assert source.verify() == []
-    content = bytearray((store / SHARD).read_bytes())
-    content[len(content) // 2] ^= 1
-    (store / SHARD).write_bytes(content)
-    assert [error.file for error in source.verify()] == [str(store / SHARD)]
 
 
 def test_wherever_a_byte_of_a_shard_changes_its_sequences_are_refused_or_the_same(store: Path) -> None:
@@ -165,7 +153,6 @@ def other_columns(store: Path) -> bytes:
 @pytest.mark.parametrize(
     ("content", "kind", "reason"),
     [
-        (lambda store: b"", UnreadableFile, SHARD),
         (lambda store: b"\xff\xff\xff\xff\x10\0\0\0" + b"\7" * 90, UnreadableFile, SHARD),
         (other_columns, UnreadableFile, "columns"),
         (lambda store: (store / "train-00001-of-00003.arrow").read_bytes(), BadAnnotation, "in its place"),
@@ -193,10 +180,8 @@ def change(row: pa.Table, column: str, value: object) -> pa.Table:
         ("world_to_camera", [float("nan")] * 32, BadAnnotation),
         ("world_to_camera", [1.0] * 32, ChangedFile),
         ("world_to_camera", None, BadAnnotation),
-        ("intrinsics", [None] * 18, BadAnnotation),
         ("frames", [], BadAnnotation),
         ("images", [b""], BadAnnotation),
-        ("picture_checksums", [1], BadAnnotation),
         ("size", None, ChangedFile),
         ("name", "other", BadAnnotation),
     ],
@@ -208,34 +193,20 @@ def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: o
     assert (caught.value.file, caught.value.sequence) == ("shard.arrow", "s")
 
 
-@pytest.mark.parametrize(
-    "change_image",
-    [
-        lambda image: b"",
-        lambda image: image[: len(image) // 2],
-        lambda image: encode(smooth_picture(0, True, size=SIZE + 1).image, "png"),
-        lambda image: encode(smooth_picture(0, True).mask, "png"),  # type: ignore[arg-type]
-        lambda image: b"GIF89a" + image,
-    ],
-)
-def test_bytes_that_are_not_the_picture_are_refused_with_their_place(change_image) -> None:
-    image = encode(smooth_picture(0, True).image, "png")
-    # The checksum is that of the wrong bytes, so that decoding them has to notice.
-    pictures = [EncodedPicture(image, None), EncodedPicture(change_image(image), None)]
-    sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "shard.arrow", "s")
-    sequence.read(0)
-    with pytest.raises(BadPicture) as caught:
-        sequence.read(1)
-    assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
-
-
-def test_pixels_that_decode_differently_from_what_was_written_are_refused() -> None:
-    picture = EncodedPicture(encode(smooth_picture(0, True).image, "jpeg"), None)
-    row = to_row(make_sequence("s", frames=2), [0, 1], [picture] * 2)
-    flipped = bytearray(picture.image)
-    flipped[-20] ^= 1
-    assert decode(bytes(flipped), 3, SIZE).shape == (3, SIZE, SIZE)
-    read = from_row(change(row, "images", [picture.image, bytes(flipped)]), "shard.arrow", "s").read
+def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
+    image = encode(smooth_picture(0, True).image, "jpeg")
+    # Where the checksum is that of the wrong bytes, decoding them has to notice.
+    for wrong in (image[: len(image) // 2], encode(smooth_picture(0, True, size=SIZE + 1).image, "png")):
+        pictures = [EncodedPicture(image, None), EncodedPicture(wrong, None)]
+        sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "shard.arrow", "s")
+        sequence.read(0)
+        with pytest.raises(BadPicture) as caught:
+            sequence.read(1)
+        assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
+    flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
+    assert decode(flipped, 3, SIZE).shape == (3, SIZE, SIZE)
+    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedPicture(image, None)] * 2)
+    read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
     with pytest.raises(BadPicture, match="no longer"):
         read(1)
@@ -248,12 +219,8 @@ FIRST = ("splits", "train", "shards", 0)
     ("place", "value", "kind"),
     [
         (["format"], 1, UnreadableFile),
-        (["format"], "1", BadAnnotation),
         (["settings"], {"image_size": [1]}, BadAnnotation),
-        (["splits"], None, BadAnnotation),
-        (["splits", "train"], [], BadAnnotation),
         (["splits", "train", "names"], ["s3"], BadAnnotation),
-        (["splits", "train", "names", 0], 3, BadAnnotation),
         (["splits", "train", "left_out"], {"x": "1"}, BadAnnotation),
         (["splits", "train", "refused"], [{}], BadAnnotation),
         ([*FIRST, "file"], "../secret.arrow", OutsidePath),

@@ -2,8 +2,8 @@ import hashlib
 import json
 import logging
 import pickle
-from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from packed_sequences import ListedSource, contents
@@ -30,18 +30,6 @@ def test_the_same_input_gives_the_same_bytes_in_one_process_and_in_two(tmp_path:
     two = make(ListedSource(NAMES[:4]), tmp_path / "two", workers=2)
     assert len(contents(one)) == 2 + 2 * 2
     assert contents(one) == contents(two)
-
-
-def test_the_manifest_holds_the_settings_and_the_checksum_and_the_size_of_every_shard(tmp_path: Path) -> None:
-    store = make(ListedSource(NAMES), tmp_path / "store")
-    assert json.loads((store / "plan.json").read_text())["settings"] == read_manifest(store).settings == SETTINGS
-    shards = read_manifest(store).splits["train"].shards
-    arrow = {path.name for path in store.glob("*.arrow")}
-    assert {shard.file for shard in shards} == arrow == {f"train-{number:05d}-of-00004.arrow" for number in range(4)}
-    for shard in shards:
-        content = (store / shard.file).read_bytes()
-        assert (shard.sha256, shard.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
-        assert shard.frames == 8
 
 
 def test_an_interrupted_run_continues_with_the_shards_that_are_missing(tmp_path: Path) -> None:
@@ -78,33 +66,38 @@ def test_an_interrupted_run_is_not_continued_with_other_data_or_settings(tmp_pat
         assert source.was_read == []
 
 
-def test_a_complete_store_is_left_as_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_complete_store_is_left_as_it_is_and_missing_or_shorter_shards_are_made_again(tmp_path: Path, caplog) -> None:
     out = make(ListedSource(NAMES), tmp_path / "store")
-    before = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert json.loads((out / "plan.json").read_text())["settings"] == read_manifest(out).settings == SETTINGS
+    shards = read_manifest(out).splits["train"].shards
+    arrow = {path.name for path in out.glob("*.arrow")}
+    assert {shard.file for shard in shards} == arrow == {f"train-{number:05d}-of-00004.arrow" for number in range(4)}
+    for shard in shards:
+        content = (out / shard.file).read_bytes()
+        assert (shard.sha256, shard.bytes) == (hashlib.sha256(content).hexdigest(), len(content))
+        assert shard.frames == 8
+    before, times = contents(out), {path: path.stat().st_mtime_ns for path in out.iterdir()}
     again = ListedSource(NAMES)
     with caplog.at_level(logging.INFO):
         make(again, out)
     assert "already holds" in caplog.text
     assert again.was_read == []
-    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == before
-
-
-def test_shards_that_are_missing_or_shorter_are_made_again(tmp_path: Path) -> None:
-    out = make(ListedSource(NAMES), tmp_path / "store")
-    before, (_, missing, shorter, _) = contents(out), sorted(out.glob("*.arrow"))
+    assert {path: path.stat().st_mtime_ns for path in out.iterdir()} == times
+    _, missing, shorter, _ = sorted(out.glob("*.arrow"))
     missing.unlink()
     shorter.write_bytes(shorter.read_bytes()[:-1])
-    again = ListedSource(NAMES)
     make(again, out)
     assert set(again.was_read) == {"s2", "s3", "s4", "s5"}
     assert contents(out) == before
 
 
-def test_a_folder_with_other_shards_in_it_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_shards_in_it_is_left_alone_and_another_codec_refused(tmp_path: Path) -> None:
     (tmp_path / "train-00000-of-00001.arrow").write_text("mine")
     with pytest.raises(DataError, match="other prepared sequences"):
         make(ListedSource(NAMES), tmp_path)
     assert list(contents(tmp_path)) == ["train-00000-of-00001.arrow"]
+    with pytest.raises(CompleteSplatError, match="png, jpeg"):
+        make(ListedSource(NAMES), tmp_path / "store", codec="webp")
 
 
 def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> None:
@@ -158,22 +151,13 @@ def test_sequences_of_one_chunk_stay_together_and_a_large_one_is_cut_evenly(chun
     assert [len(shard) for shard in shards] == lengths
 
 
-def test_too_little_space_is_noticed_before_anything_is_written(tmp_path: Path, monkeypatch) -> None:
-    usage = namedtuple("usage", ["total", "used", "free"])
-    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: usage(10**6, 0, 5000))
-    with pytest.raises(DataError, match=r"not enough space: about .* 32 frames of 8 sequences in 4 shards"):
-        make(ListedSource(NAMES), tmp_path / "store")
-    assert not list((tmp_path / "store").glob("*.arrow*"))
-
-
-def test_the_estimate_is_near_the_size_of_the_files(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_estimate_is_near_the_size_of_the_files_and_too_little_space_noticed(tmp_path, monkeypatch, caplog) -> None:
     with caplog.at_level(logging.INFO):
         store = make(ListedSource(NAMES, frames=40), tmp_path / "store", sequences_per_shard=8)
     amount = float(caplog.messages[0].removeprefix("about ").split(" kB for 320 frames")[0])
     actual = sum(path.stat().st_size for path in store.glob("*.arrow")) / 1000
     assert amount == pytest.approx(actual, rel=0.15)
-
-
-def test_another_codec_than_the_two_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CompleteSplatError, match="png, jpeg"):
-        make(ListedSource(NAMES), tmp_path / "store", codec="webp")
+    monkeypatch.setattr(writing.shutil, "disk_usage", lambda path: SimpleNamespace(free=5000))
+    with pytest.raises(DataError, match=r"not enough space: about .* 32 frames of 8 sequences in 4 shards"):
+        make(ListedSource(NAMES), tmp_path / "none")
+    assert not list((tmp_path / "none").glob("*.arrow*"))

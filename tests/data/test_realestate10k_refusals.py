@@ -1,9 +1,7 @@
 """Broken clips and files in both forms: refused with their place and running no code, by source and by data module."""
 
-import functools
 import json
 import logging
-import shutil
 import weakref
 import zipfile
 from collections.abc import Callable
@@ -19,12 +17,11 @@ from realestate10k_trees import (
     assert_refusal,
     chunk_entry,
     encode,
-    equal,
+    epoch,
     make_clip,
     module,
     write_chunk_form,
     write_text_form,
-    write_tree,
 )
 
 from completesplat.data.audit import check
@@ -32,7 +29,7 @@ from completesplat.data.pictures.crop import Square
 from completesplat.data.realestate10k import chunks, clips
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
 from completesplat.data.realestate10k.clips import TextClips
-from completesplat.data.realestate10k.module import RE10KDataModule, open_clips
+from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -45,9 +42,8 @@ from completesplat.data.validation import (
 from completesplat.errors import DataError
 
 BAD, INTACT = "bad", ("one", "two")
-# Four frames, so that each scene of four views shows all of them.
+
 CLIPS = [make_clip(key, frames=4) for key in (BAD, *INTACT)]
-SETTINGS = {"targets": 3, "max_gap": 30, "batch_size": 1, "evaluation_batch_size": 1, "max_bad_fraction": 10.0}
 TEXT, SECOND, CHUNK = f"{BAD}.txt", f"{BAD}/66000.jpg", "000000.torch"
 Damage = Callable[[Path], object]
 
@@ -58,13 +54,12 @@ def write(folder: Path, form: str = "chunks", changed: list[StoredClip] = CLIPS)
     return folder
 
 
-def assert_only_refusal(folder: Path, kind: type[DataError], file: str, frame: int | None, **settings: object) -> None:
-    """All clips of a tree are read whole, and one fault is found."""
-    split = "test" if folder.name == "test" else "train"
-    source = module(folder.parent, **SETTINGS, val_fraction=0.0, **settings).open(split)[split]
+def assert_only_refusal(folder: Path, kind: type[DataError], file: str, frame: int | None) -> None:
+    """All training clips are read whole, and one fault is found."""
+    source = module(folder.parent, val_fraction=0.0).open("train")["train"]
     assert source.refused == []
     source.names = [BAD, *INTACT]
-    (error,) = check({split: source}, workers=1, progress=False).refused
+    (error,) = check({"train": source}, workers=1, progress=False).refused
     assert_refusal(error, kind, folder / file, BAD, frame)
 
 
@@ -87,20 +82,13 @@ def first(count: int) -> Callable[[StoredClip], object]:
 # name: (change, kind, frame), in whichever form a clip is stored.
 BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int | None]] = {
     "nan_in_a_pose": (entry(2, 9, np.nan), BadAnnotation, 2),
-    "infinite_focal_length": (entry(3, 0, np.inf), BadAnnotation, 3),
     "reflection": (mirrored, BadCamera, 2),
     "sheared_rotation": (entry(2, 6, 1.01), BadCamera, 2),
-    "zero_pose": (entry(3, slice(6, 18), 0), BadCamera, 3),
     "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),
     "lens_distortion": (entry(2, 4, 0.1), BadCamera, 2),
     "one_frame": (first(1), TooFewFrames, None),
-    "no_frame": (first(0), TooFewFrames, None),
     "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadPicture, 2),
     "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadPicture, 0),
-    "gif_instead_of_the_first_picture": (
-        picture(0, lambda _: encode(np.zeros((18, 32, 3), dtype=np.uint8), "GIF")), BadPicture, 0,
-    ),
-    "bomb_of_51_megapixels_first": (picture(0, lambda _: encode(np.zeros((7200, 7100), bool), "PNG")), BadPicture, 0),
     "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadPicture, 2),
 }  # fmt: skip
 
@@ -138,17 +126,12 @@ def replaced(file: str, make: Callable[[Path], object]) -> Damage:
 
 # name: (damage, kind, file, frame)
 BAD_TEXTS: dict[str, tuple[Damage, type[DataError], str, int | None]] = {
-    "empty": (replaced(TEXT, Path.touch), TooFewFrames, TEXT, None),
     "a_picture": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].pictures[0])), UnreadableFile, TEXT, None),
     "a_folder": (replaced(TEXT, Path.mkdir), MissingFile, TEXT, None),
-    "a_ring_of_links": (replaced(TEXT, lambda path: path.symlink_to(path.name)), MissingFile, TEXT, None),
-    "column_too_few": (line_of(3, lambda columns: columns[:-1]), BadAnnotation, TEXT, 3),
     "column_too_many": (line_of(1, lambda columns: [*columns, "0"]), BadAnnotation, TEXT, 1),
     "letters": (line_of(2, lambda columns: [*columns[:5], "k1", *columns[6:]]), BadAnnotation, TEXT, 2),
-    "fraction_as_timestamp": (line_of(2, lambda columns: ["99000.5", *columns[1:]]), BadAnnotation, TEXT, 2),
     "timestamp_twice": (line_of(2, lambda columns: ["66000", *columns[1:]]), BadAnnotation, TEXT, 1),
     "no_picture": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
-    "dead_link": (replaced(SECOND, lambda path: path.symlink_to("none.jpg")), MissingFile, SECOND, 1),
 }
 
 
@@ -177,21 +160,14 @@ def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
     ("fields", "part"),
     [
         ({"cameras": torch.zeros(4, 17)}, "18 columns"),
-        ({"cameras": torch.zeros(4, 18, dtype=torch.int64)}, "18 columns of floats"),
         ({"cameras": [[0.5] * 18] * 4}, "18 columns"),
         ({"cameras": torch.zeros(4, 18).to_sparse()}, "18 columns"),
-        ({"cameras": torch.zeros(4, 18, device="meta")}, "18 columns"),
-        ({"cameras": torch.nn.Parameter(torch.zeros(4, 18))}, "18 columns"),
         ({"cameras": torch.zeros(3, 18)}, "4 images, 3 cameras and 4 timestamps"),
         ({"timestamps": torch.arange(4.0)}, "timestamps are not int64"),
-        ({"timestamps": torch.arange(4)[None]}, "timestamps are not int64"),
         ({"timestamps": large(10**12, dtype=torch.int64)}, "1000000000000 timestamps"),
         ({"timestamps": torch.tensor([0, 1, 2, 1])}, "another frame has its timestamp"),
-        ({"images": None}, "images are not a list"),
         ({"images": [torch.zeros(9)] * 4}, "images are not a list"),
-        ({"images": [torch.zeros(18, 32, dtype=torch.uint8)] * 4}, "images are not a list"),
         ({"images": [large(10**12)] * 4}, "images are not a list"),
-        ({"images": []}, "0 images, 4 cameras and 4 timestamps"),
     ],
 )
 def test_an_entry_of_another_type_or_shape_is_refused(tmp_path, fields, part):
@@ -211,23 +187,16 @@ class Runs:
         return self.call[0], self.call[1:]
 
 
-def hub(canary: Path) -> Runs:
-    (canary.parent / "hubconf.py").write_text(f"def run():\n    open({str(canary)!r}, 'w')\n")
-    return Runs(functools.partial(torch.hub.load, str(canary.parent), "run", source="local"))
-
-
 @pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("gadget", [lambda canary: Runs(exec, f"open({str(canary)!r}, 'w')"), hub])
-def test_a_chunk_runs_no_code(tmp_path, gadget, legacy):
-    path = tmp_path / CHUNK
-    torch.save(
-        [chunk_entry(CLIPS[0]) | {"url": gadget(tmp_path / "canary")}], path, _use_new_zipfile_serialization=not legacy
-    )
+def test_a_chunk_runs_no_code(tmp_path, legacy):
+    path, canary = tmp_path / CHUNK, tmp_path / "canary"
+    harmful = chunk_entry(CLIPS[0]) | {"url": Runs(exec, f"open({str(canary)!r}, 'w')")}
+    torch.save([harmful], path, _use_new_zipfile_serialization=not legacy)
     with pytest.raises(UnreadableFile):
         read_chunk(path)
-    assert not (tmp_path / "canary").exists()
+    assert not canary.exists()
     torch.load(path, weights_only=False)
-    assert (tmp_path / "canary").exists()
+    assert canary.exists()
 
 
 def saved(make: Callable[[dict[str, Any]], object], **options: Any) -> Damage:
@@ -258,15 +227,12 @@ BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
     "empty": (lambda path: path.write_bytes(b""), UnreadableFile),
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-500]), UnreadableFile),
     "flipped_bit_in_a_camera": (flipped(CLIPS[0].rows.tobytes()), UnreadableFile),
-    "flipped_bit_in_a_picture": (flipped(CLIPS[0].pictures[2]), UnreadableFile),
     "zip_of_something_else": (
         lambda path: zipfile.ZipFile(path, "w").writestr("readme.txt", "nothing"), UnreadableFile,
     ),
     "legacy_form": (saved(lambda entry: [entry], _use_new_zipfile_serialization=False), UnreadableFile),
     "bomb": (bomb, UnreadableFile),
-    "table_instead_of_a_list": (saved(lambda entry: {BAD: entry}), BadAnnotation),
     "list_of_tensors": (saved(lambda entry: list(entry["images"])), BadAnnotation),
-    "key_is_a_number": (saved(lambda entry: [entry | {"key": 7}]), BadAnnotation),
     "key_twice": (saved(lambda entry: [entry, entry]), BadAnnotation),
     "another_clip": (saved(lambda entry: [entry | {"key": "other"}]), BadAnnotation),
 }  # fmt: skip
@@ -279,39 +245,6 @@ def test_a_bad_chunk_is_refused(name, tmp_path):
     assert_only_refusal(tmp_path / "train", kind, CHUNK, None)
 
 
-@pytest.mark.parametrize("policy", ["raise", "skip"])
-@pytest.mark.parametrize("form", FORMS)
-def test_what_is_broken_is_raised_or_counted_and_never_gets_into_a_batch(form, policy, tmp_path):
-    """Of texts a picture is broken, of chunks a whole file."""
-    damage, kind, place, frame = {
-        "text": (lambda folder: (folder / SECOND).write_bytes(b"<html>"), BadPicture, SECOND, 1),
-        "chunks": (lambda folder: (folder / CHUNK).write_bytes(b""), UnreadableFile, CHUNK, None),
-    }[form]
-    intact = module(write_tree(tmp_path / "intact", form, CLIPS[:2], CLIPS), **SETTINGS)
-    damage(write(tmp_path / "train", form, [*CLIPS, make_clip("three", frames=4)]))
-    shutil.copytree(tmp_path / "train", tmp_path / "test")
-    settings = {**SETTINGS, "references_per_sequence": 2, "val_fraction": 0.0, "on_bad": policy}
-    data = module(tmp_path, **settings)
-    loaders = {"train": data.train_dataloader(), "test": data.test_dataloader()}
-    for split, loader in loaders.items():
-        if policy == "raise":
-            with pytest.raises(DataError) as caught:
-                list(loader)
-            refused = [caught.value]
-        else:
-            batches = list(loader)
-            assert BAD not in {name for batch in batches for name in batch.names}
-            if split == "train":
-                assert len(batches) == len(loader) == 6
-            else:
-                batches = [batch for batch in batches if "three" not in batch.names]
-                assert equal(batches, [batch for batch in intact.test_dataloader() if BAD not in batch.names])
-            refused = loader.refused
-            assert len(refused) >= (2 if split == "train" else 1)
-        for error in refused:
-            assert_refusal(error, kind, tmp_path / split / place, BAD, frame)
-
-
 def test_a_principal_point_outside_matters_to_its_own_crop_only(tmp_path):
     clip = make_clip(BAD, frames=4)
     clip.rows[:, 2] = 1.5
@@ -320,13 +253,6 @@ def test_a_principal_point_outside_matters_to_its_own_crop_only(tmp_path):
     with pytest.raises(BadCamera) as caught:
         module(tmp_path, crop="principal").open("train")["train"].read(BAD)
     assert_refusal(caught.value, BadCamera, folder / TEXT, BAD, 0)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_a_pose_within_the_tolerance_is_accepted(tmp_path, form):
-    clip = make_clip(BAD)
-    clip.rows[:, 6:9] *= 1 + 3e-4
-    assert open_clips(write(tmp_path, form, [clip])).clip(BAD).cameras.image_size == (18, 32)
 
 
 def test_a_missing_frame_may_be_a_png(tmp_path):
@@ -346,9 +272,8 @@ def test_a_folder_without_any_use_is_raised_under_either_policy(tmp_path, index,
     if index is not None:
         (tmp_path / "train/index.json").write_text(index)
     for policy in ("raise", "skip"):
-        with pytest.raises(DataError, match=str(tmp_path / "train")) as caught:
+        with pytest.raises(kind, match=str(tmp_path / "train")):
             module(tmp_path, on_bad=policy).setup("fit")
-        assert type(caught.value) is kind
 
 
 def test_entries_of_an_index_that_lead_elsewhere_are_refused(tmp_path, caplog):
@@ -388,21 +313,19 @@ def loads(monkeypatch):
 
 def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
     names, counts = loads
+    found = ChunkedClips(write(tmp_path / "few"))
+    for key in (BAD, *INTACT[:1], BAD, INTACT[1], BAD, INTACT[0]):
+        found.clip(key)
+    assert names == [f"{number:06}.torch" for number in (0, 1, 2, 1)]  # The chunk of the longest ago went.
+    del found
     for split in ("train", "test"):
         write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
     data = RE10KDataModule(str(tmp_path), image_size=8, batch_size=4, references_per_sequence=2, val_fraction=0.0)
     loader = data.train_dataloader()
-    loader.sampler.set_epoch(0)
-    assert sum(len(batch.names) for batch in loader) == 34
+    names.clear()
+    assert sum(len(batch.names) for batch in epoch(loader, 0)) == 34
     assert sorted(names) == [f"{i:06}.torch" for i in range(6)]
     assert names != sorted(names)
     list(data.val_dataloader())
     list(data.train_dataloader())
     assert max(counts) == 2
-
-
-def test_the_chunk_of_the_longest_ago_goes(tmp_path, loads):
-    found = ChunkedClips(write(tmp_path))
-    for key in (BAD, *INTACT[:1], BAD, INTACT[1], BAD, INTACT[0]):
-        found.clip(key)
-    assert loads[0] == [f"{number:06}.torch" for number in (0, 1, 2, 1)]

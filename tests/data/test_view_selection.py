@@ -1,5 +1,3 @@
-"""Which frames are drawn, and that a draw depends on nothing but seed, epoch and index."""
-
 import numpy as np
 import pytest
 
@@ -14,10 +12,12 @@ from completesplat.data.loading.view_selection import (
 
 def test_every_frame_becomes_the_reference_and_a_target_of_every_other():
     drawn = [training_views(4, 2, draws(0, 0, index)) for index in range(300)]
-    assert {(reference, target) for reference, targets in drawn for target in targets} == {
-        (i, j) for i in range(4) for j in range(4) if i != j
-    }
-    assert all(len({reference, *targets}) == 3 for reference, targets in drawn)
+    pairs = {(reference, target) for reference, targets in drawn for target in targets}
+    assert pairs == {(i, j) for i in range(4) for j in range(4) if i != j}
+    near = [nearby_views(30, 5, 1, 5, draws(0, 0, index)) for index in range(100)]
+    for views, count in ((drawn, 3), (near, 6)):
+        assert all(len({reference, *targets}) == count for reference, targets in views)
+    assert evaluation_views(5, None) == evaluation_views(5, 9) == (0, [1, 2, 3, 4])
 
 
 def test_short_sequences_repeat_targets_but_never_the_reference():
@@ -32,10 +32,6 @@ def test_a_draw_depends_on_seed_epoch_and_index_only():
     one, other = ([str(training_views(100, 4, draws(*key))) for key in keys] for _ in range(2))
     assert one == other
     assert len(set(one)) == 5
-
-
-def test_evaluation_takes_the_first_frame_and_all_others():
-    assert evaluation_views(5, None) == evaluation_views(5, 9) == (0, [1, 2, 3, 4])
 
 
 @pytest.mark.parametrize("frames", [24, 202])
@@ -58,11 +54,6 @@ def test_nearby_views_keep_both_gaps_and_reach_everything_that_does(frames, min_
     assert pairs <= expected
     assert {i for i, _ in pairs} == {i for i, _ in expected}
     assert len(pairs) > 0.95 * len(expected)
-
-
-def test_nearby_targets_are_distinct_where_there_are_enough():
-    drawn = [nearby_views(30, 5, 1, 5, draws(0, 0, index)) for index in range(100)]
-    assert all(len({reference, *targets}) == 6 for reference, targets in drawn)
 
 
 @pytest.mark.parametrize(("frames", "targets", "gap"), [(100, 3, 30), (20, 3, 30), (31, 30, 30), (300, 7, 150)])

@@ -2,9 +2,10 @@
 
 import gzip
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -66,13 +67,9 @@ class Shot:
         return np.repeat(grey[..., None], 3, axis=2)
 
     def intrinsics(self) -> dict[str, float]:
-        keys = {"fl_x": self.focal[0], "fl_y": self.focal[1], "cx": self.center[0], "cy": self.center[1]}
-        return {
-            **keys,
-            "w": self.width,
-            "h": self.height,
-            **{k: getattr(self, k) for k in ("k1", "k2", "k3", "p1", "p2")},
-        }
+        (fl_x, fl_y), (cx, cy) = self.focal, self.center
+        keys = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "w": self.width, "h": self.height}
+        return keys | {k: getattr(self, k) for k in ("k1", "k2", "k3", "p1", "p2")}
 
 
 def write_transforms(folder: Path, shot: Shot, suffix: str = ".png", **content: object) -> Path:
@@ -128,15 +125,6 @@ def reprojection_errors(category: Path, points: np.ndarray, kind: str = "image")
 
 
 @pytest.fixture
-def captures() -> SimpleNamespace:
+def captures() -> ModuleType:
     """The functions of this file."""
-    return SimpleNamespace(
-        POINTS=POINTS,
-        Shot=Shot,
-        annotations=annotations,
-        edit=edit,
-        opengl_poses=opengl_poses,
-        pixels_of=pixels_of,
-        reprojection_errors=reprojection_errors,
-        write_transforms=write_transforms,
-    )
+    return sys.modules[__name__]

@@ -1,6 +1,5 @@
-"""What is held out, in which order frames stand, and the lens model against another implementation."""
-
 import json
+from itertools import product
 
 import numpy as np
 import pytest
@@ -11,35 +10,27 @@ from completesplat.data.importing.capture import Lens
 from completesplat.data.importing.layout import Undistortion, _source_positions, held_out_frames
 
 
-def test_every_eighth_frame_is_held_out():
+def test_every_eighth_frame_is_held_out_and_two_at_least_are_on_either_side():
     assert sorted(held_out_frames(40, 8)) == [0, 8, 16, 24, 32]
+    for frames, hold_out in product(range(6, 40), (2, 3, 8, 1000)):
+        held_out = held_out_frames(frames, hold_out)
+        assert held_out <= set(range(frames))
+        assert min(len(held_out), frames - len(held_out)) >= 2
 
 
-@pytest.mark.parametrize("frames", range(6, 40))
-@pytest.mark.parametrize("hold_out", [2, 3, 8, 1000])
-def test_two_frames_at_least_are_on_either_side(frames, hold_out):
-    held_out = held_out_frames(frames, hold_out)
-    assert held_out <= set(range(frames))
-    assert min(len(held_out), frames - len(held_out)) >= 2
-
-
-def test_no_frame_that_is_tested_is_trained_on(captures, tmp_path):
-    path = captures.write_transforms(tmp_path / "in", captures.Shot())
-    category = import_capture(tmp_path / "out", "desk", path, hold_out=3, progress=False)
-    lists = json.loads((category / "set_lists/set_lists_imported.json").read_text())
-    numbers = {split: [entry[1] for entry in entries] for split, entries in lists.items()}
-    assert numbers == {"train": [1, 2, 4, 5, 7], "val": [0, 3, 6], "test": [0, 3, 6]}
-    written = {entry["frame_number"]: entry["image"]["path"] for entry in captures.annotations(category)}
-    assert all(written[number] == path for entries in lists.values() for _, number, path in entries)
-
-
-def test_frames_stand_in_the_order_of_the_numbers_in_their_names(captures, tmp_path):
+def test_frames_stand_in_the_order_of_their_numbers_and_none_that_is_tested_is_trained_on(captures, tmp_path):
     path = captures.write_transforms(tmp_path / "in", captures.Shot())
     (tmp_path / "in/images/r_3.png").rename(tmp_path / "in/images/r_10.png")
     captures.edit(path, lambda c: (c["frames"][3].update(file_path="images/r_10.png"), c["frames"].reverse()))
-    category = import_capture(tmp_path / "out", "desk", path, progress=False)
-    sources = [entry["meta"]["imported_from"] for entry in captures.annotations(category)]
-    assert sources == [f"r_{number}.png" for number in (0, 1, 2, 4, 5, 6, 7, 10)]
+    category = import_capture(tmp_path / "out", "desk", path, hold_out=3, progress=False)
+    entries = captures.annotations(category)
+    names = [f"r_{number}.png" for number in (0, 1, 2, 4, 5, 6, 7, 10)]
+    assert [entry["meta"]["imported_from"] for entry in entries] == names
+    lists = json.loads((category / "set_lists/set_lists_imported.json").read_text())
+    numbers = {split: [entry[1] for entry in entries] for split, entries in lists.items()}
+    assert numbers == {"train": [1, 2, 4, 5, 7], "val": [0, 3, 6], "test": [0, 3, 6]}
+    written = {entry["frame_number"]: entry["image"]["path"] for entry in entries}
+    assert all(written[number] == path for entries in lists.values() for _, number, path in entries)
 
 
 def test_the_lens_model_is_colmaps():

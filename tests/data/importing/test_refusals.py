@@ -1,6 +1,3 @@
-"""Captures that are refused: what is wrong, in which file, at which frame; nothing is left behind."""
-
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -29,12 +26,6 @@ def entry_of_pose(row, column, value):
     return change
 
 
-def scaled_pose(content):
-    matrix = np.array(content["frames"][3]["transform_matrix"])
-    matrix[:3, :3] *= 2
-    content["frames"][3]["transform_matrix"] = matrix.tolist()
-
-
 def without(*keys):
     return lambda content: [content.pop(key) for key in keys]
 
@@ -44,33 +35,23 @@ TRANSFORMS = {
     "five frames": (lambda c: c["frames"].__delitem__(slice(5, None)), TooFewFrames, "5 frames; .* at least 6"),
     "NaN in a pose": (entry_of_pose(0, 3, float("nan")), BadAnnotation, r"transforms\.json, frame 3: .* not finite"),
     "a sheared pose": (entry_of_pose(0, 0, 0.3), BadCamera, r"transforms\.json, frame 3: .* not orthonormal"),
-    "a scaled pose": (scaled_pose, BadCamera, r"transforms\.json, frame 3: transform_matrix scales by 2;"),
     "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
-    "hardly any picture": (
-        lambda c: [frame.update(file_path="images/x") for frame in c["frames"][:5]],
-        MissingFile,
-        r"transforms\.json: 5 of 8 frames have no picture, more than most_missing=0\.5: images/x,",
-    ),
     "a picture twice": (of_frame(2, file_path="./images/r_1"), BadAnnotation, "frame 2: the same picture as frame 1"),
     "a picture outside": (
         of_frame(2, file_path="../r_2.png"),
         OutsidePath,
         r"transforms\.json, frame 2: leads outside",
     ),
-    "no file path": (lambda c: c["frames"][2].pop("file_path"), BadAnnotation, "frame 2: no file_path"),
     "a missing mask": (of_frame(4, mask_path="m.png"), MissingFile, r"m\.png, frame 4: no such file"),
     "no focal length": (without("fl_x"), BadAnnotation, "frame 0: neither fl_x nor camera_angle_x"),
     "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
     "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
     "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
-    "half a pixel": (lambda c: c.update(w=210.5), BadAnnotation, "w must be a whole number"),
     "another size": (lambda c: c.update(h=151), BadPicture, r"r_0\.png, in, frame 0: has 150 x 210 .* says 151 x 210"),
     "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
     "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
     "a fourth coefficient": (lambda c: c.update(k4=0.1), BadCamera, "k4 = 0.1 has no meaning for camera model OPENCV"),
-    "a distorted pinhole": (lambda c: c.update(camera_model="PINHOLE", k1=0.1), BadCamera, "k1 = 0.1 has no meaning"),
     "a folded picture": (lambda c: c.update(k1=-4.0), BadCamera, r"r_0\.png, in, frame 0: distortion .* usable"),
-    "a missing point cloud": (lambda c: c.update(ply_file_path="x.ply"), MissingFile, r"x\.ply: no such file"),
     "a point cloud that is none": (
         lambda c: c.update(ply_file_path="transforms.json"),
         UnreadableFile,
@@ -88,9 +69,8 @@ def test_a_bad_transforms_file_is_refused(captures, tmp_path, change, kind, mess
 
 
 def test_points_that_are_not_finite_are_refused(tmp_path):
-    for value in (float("nan"), float("inf")):
-        with pytest.raises(BadAnnotation, match=r"x\.ply: points that are not finite"):
-            make_cloud([[0, 0, 0], [0, value, 1]], [[0, 0, 0]] * 2, tmp_path / "x.ply")
+    with pytest.raises(BadAnnotation, match=r"x\.ply: points that are not finite"):
+        make_cloud([[0, 0, 0], [0, float("nan"), 1]], [[0, 0, 0]] * 2, tmp_path / "x.ply")
 
 
 def turn(path):
@@ -105,15 +85,9 @@ def flip_a_bit(path):
     path.write_bytes(content)
 
 
-def flip_a_bit_of_transparency(path):
-    Image.open(path).convert("RGBA").save(path)
-    flip_a_bit(path)
-
-
 PICTURES = {
     "upside down by EXIF": (turn, r"EXIF orientation 3"),
     "damaged": (flip_a_bit, "cannot be decoded"),
-    "damaged, with alpha": (flip_a_bit_of_transparency, "cannot be decoded"),
     "of another size, with alpha": (lambda p: Image.new("RGBA", (150, 210)).save(p), "has 210 x 150 pixels"),
 }
 
@@ -131,14 +105,12 @@ def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
     ("settings", "message"),
     [
         ({}, "either transforms=FILE or colmap=FOLDER"),
-        ({"transforms": "a", "colmap": "b", "images": "c"}, "either transforms=FILE or colmap=FOLDER"),
         ({"transforms": "a", "images": "c"}, "colmap=FOLDER goes with images=FOLDER"),
         ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
         ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
         ({"transforms": "a", "most_missing": 1.5}, "most_missing=1.5: must lie between 0 and 1"),
         ({"transforms": "a", "category": None}, "category is needed: give category=NAME"),
         ({"transforms": "a", "category": "a/b"}, "category must be a name"),
-        ({"transforms": "a", "sequence": ""}, "sequence must be a name"),
         ({"transforms": "nowhere.json"}, r"nowhere\.json: no such file"),
         ({"colmap": "nowhere", "images": "c"}, "nowhere: no such folder"),
     ],
@@ -151,18 +123,13 @@ def test_settings_that_do_not_go_together_are_refused(tmp_path, settings, messag
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_is_there_is_left_alone(captures, tmp_path):
+def test_a_folder_that_is_there_is_left_alone_but_remains_of_an_interrupted_import_are_no_obstacle(captures, tmp_path):
     path = captures.write_transforms(tmp_path / "in", captures.Shot())
     (tmp_path / "out/desk").mkdir(parents=True)
     (tmp_path / "out/desk/notes.txt").write_text("mine")
     with pytest.raises(DataError, match=r"out/desk: is there already"):
         import_capture(tmp_path / "out", "desk", path, progress=False)
     assert [p.name for p in (tmp_path / "out/desk").iterdir()] == ["notes.txt"]
-
-
-def test_the_remains_of_an_interrupted_import_are_no_obstacle(captures, tmp_path):
-    path = captures.write_transforms(tmp_path / "in", captures.Shot())
-    (tmp_path / "out/.desk.unfinished/in/images").mkdir(parents=True)
-    category = import_capture(tmp_path / "out", "desk", path, progress=False)
-    assert len(captures.annotations(category)) == 8
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["desk"]
+    (tmp_path / "new/.desk.unfinished/in/images").mkdir(parents=True)
+    assert len(captures.annotations(import_capture(tmp_path / "new", "desk", path, progress=False))) == 8
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["desk"]
