@@ -49,7 +49,7 @@ demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, co
 	@echo "In $(TRAINED): data/ var/ diffusion/ (its weights/ are for predict weights=DIR), test_var/ and test/ with scores, held_out/"
 
 # Threads that wait at full speed, as GNU OpenMP's do by default, would keep the other test process off the cores.
-test: check ## Lint, types and the tests (CPU, under 6 minutes)
+test: check ## Lint, types and the tests (CPU, 4 minutes on two cores)
 	GOMP_SPINCOUNT=3000 $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
