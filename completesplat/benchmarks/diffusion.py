@@ -22,7 +22,7 @@ from torch.optim import Optimizer
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands import quieten
 from completesplat.commands.schema import Positive, Range
-from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError

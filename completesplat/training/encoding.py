@@ -29,7 +29,7 @@ from completesplat.data.latent_cache import (
     is_latent_cache,
     write_manifest,
 )
-from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import SequenceSource, spread_places

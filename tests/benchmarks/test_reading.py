@@ -12,7 +12,7 @@ import torch
 from packed_sequences import ListedSource
 
 from completesplat.benchmarks import reading
-from completesplat.benchmarks.data import RepeatedSource
+from completesplat.benchmarks.data_loading import RepeatedSource
 from completesplat.benchmarks.reading import (
     Counter,
     Epoch,

@@ -9,8 +9,8 @@ from plyfile import PlyData
 from realestate10k_trees import epoch, equal, same
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.co3d.selection import Filters, SeededSplit, SplitMembers, read_category
 from completesplat.data.co3d.source import object_placement
+from completesplat.data.co3d.splits import Filters, SeededSplit, SplitMembers, read_category
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET

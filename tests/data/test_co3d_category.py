@@ -21,8 +21,8 @@ from co3d_trees import (
 )
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
 from completesplat.data.co3d.source import from_depth_maps, upright_axes
+from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
 from completesplat.data.validation import BadCamera, OutsidePath
 from completesplat.errors import CompleteSplatError, DataError
 

@@ -7,7 +7,6 @@ from co3d_trees import OCTAHEDRON, depth_bits, look, orbit, splatter_image, writ
 from PIL import Image
 
 from completesplat.data.co3d.annotations import CO3DFrame, DepthMap, camera_from_viewpoint
-from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
 from completesplat.data.co3d.source import (
     from_cameras,
     from_depth_maps,
@@ -15,6 +14,7 @@ from completesplat.data.co3d.source import (
     object_placement,
     upright_axes,
 )
+from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.toy.objects import SUBSET
 from completesplat.data.validation import BadPicture, BadPlacement, MissingFile, UnreadableFile
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 from completesplat.data.audit import check
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.co3d.selection import Category, Filters, SeededSplit, read_category
+from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
 from completesplat.data.sequences import SPLITS
 from completesplat.data.validation import (
     BadAnnotation,

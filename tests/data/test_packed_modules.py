@@ -7,7 +7,7 @@ import torch
 from realestate10k_trees import equal, make_clip, write_tree
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.objects import SUBSET

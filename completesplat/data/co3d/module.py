@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from completesplat.data.co3d.selection import Filters, SeededSplit, read_category
 from completesplat.data.co3d.source import CO3DSource, ObjectFraming
-from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, training_views
 from completesplat.data.sequences import PosedSequence

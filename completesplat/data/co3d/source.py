@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
-from completesplat.data.co3d.selection import SplitMembers
+from completesplat.data.co3d.splits import SplitMembers
 from completesplat.data.pictures.crop import Square, principal_square, read_square
 from completesplat.data.pictures.files import decode, read_depth
 from completesplat.data.sequences import Picture, PosedSequence

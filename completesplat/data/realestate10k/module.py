@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from completesplat.data.loading.module import SceneDataModule
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
 from completesplat.data.loading.view_selection import evaluation_views_within, nearby_views
 from completesplat.data.pictures.crop import Square, principal_square

@@ -15,10 +15,10 @@ from completesplat.data.loading.scenes import Choice, SceneStore
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.pictures.crop import cut_square, principal_square
 from completesplat.data.sequences import PosedSequence
+from completesplat.data.toy.disk import FORMAT_VERSION
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
 from completesplat.data.toy.objects import CATEGORY
 from completesplat.data.toy.raytracing import trace
-from completesplat.data.toy.writing import FORMAT_VERSION
 from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject

@@ -10,9 +10,9 @@ import numpy as np
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
+from completesplat.data.toy.disk import in_processes, write_once
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
 from completesplat.data.toy.raytracing import Array
-from completesplat.data.toy.writing import in_processes, write_once
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
 TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from completesplat.data.toy.disk import in_processes, write_once
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
-from completesplat.data.toy.writing import in_processes, write_once
 
 ROOMS = "toy_rooms"
 LATEST_START = 9000
