@@ -6,7 +6,6 @@ scenes = model("photo.jpg", samples=4, seed=0)
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,17 +22,10 @@ from completesplat.diffusion.splitting import in_parts, joined
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.scene import Views
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
 
 TRUSTED_PACKAGES = ("completesplat.", "diffusers.")
-
-
-@dataclass(frozen=True)
-class Latents:
-    """Frozen encodings of a batch of images: a draw of the scaled latent, and the skip features."""
-
-    latent: Float[Tensor, "batch channel _ _"]
-    features: list[Tensor]
 
 
 class CompleteSplat(nn.Module):
@@ -47,7 +39,8 @@ class CompleteSplat(nn.Module):
         image_size: side of the square images, in pixels.
     """
 
-    latent_scale: Tensor
+    latent_mean: Tensor
+    latent_std: Tensor
     fov_degrees: Tensor
     depth_range: Tensor
     up: Tensor
@@ -78,7 +71,9 @@ class CompleteSplat(nn.Module):
         self.denoiser = _build(denoiser)
         self.sampler = _build(sampler)
         # Measured on the training set by the training stage; the last three serve photographs of unknown cameras.
-        self.register_buffer("latent_scale", torch.tensor(1.0))
+        channels = self.denoiser.latent_channels
+        self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
+        self.register_buffer("latent_std", torch.ones(channels, 1, 1))
         self.register_buffer("fov_degrees", torch.tensor(50.0))
         self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
         self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
@@ -90,10 +85,27 @@ class CompleteSplat(nn.Module):
         return self
 
     @torch.no_grad()
-    def encode(self, images: Float[Tensor, "batch 3 height width"]) -> Latents:
-        """Draw each image's scaled latent from the frozen posterior ("we also sample latent codes", supplement)."""
-        posterior, features = self.autoreconstructor.encoder(images)
-        return Latents(posterior.sample() * self.latent_scale, features)
+    def encode(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        views: Views | None = None,
+        depth_range: Float[Tensor, "batch 2"] | None = None,
+    ) -> Float[Tensor, "batch channel _ _"]:
+        """Draw each scene's latent from the frozen posterior ("we also sample latent codes", supplement), standardised.
+
+        Args:
+            images, views, depth_range: see `VariationalAutoReconstructor.posterior`.
+        """
+        return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
+
+    def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
+        """Mean and deviation of each of the latent's channels on the training set."""
+        self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
+        self.latent_std.copy_(torch.tensor(std)[:, None, None])
+
+    def standardised(self, latent: Float[Tensor, "batch channel _ _"]) -> Float[Tensor, "batch channel _ _"]:
+        """Latents as the denoiser knows them: of mean 0 and deviation 1 in each channel of the training set."""
+        return (latent - self.latent_mean) / self.latent_std
 
     @torch.no_grad()
     def generate(
@@ -148,7 +160,7 @@ class CompleteSplat(nn.Module):
         return joined(in_parts(draw, len(noise), batch))
 
     def _decode(self, latent: Tensor, skips: tuple[Any, ...], cameras: Cameras, depth_range: Tensor) -> Gaussians:
-        splatter_image = self.autoreconstructor.reconstructor(latent / self.latent_scale, *skips)
+        splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)
         gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
         return gaussians
 
@@ -166,7 +178,7 @@ class CompleteSplat(nn.Module):
             CompleteSplatError: not a readable image, or what `generate` refuses.
         """
         photograph = image if isinstance(image, Photograph) else self.read(image)
-        device = self.latent_scale.device
+        device = self.latent_std.device
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],
@@ -188,7 +200,7 @@ class CompleteSplat(nn.Module):
 
     def camera(self, photograph: Photograph) -> Cameras:
         """The camera that took a photograph, at the origin of the world."""
-        device = self.latent_scale.device
+        device = self.latent_std.device
         intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(device)
         return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
 

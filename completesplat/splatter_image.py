@@ -53,7 +53,10 @@ def independent_depths(
 def incremental_depths(
     raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
 ) -> Float[Tensor, "*batch layer height width"]:
-    """The first layer as `independent_depths`; each further one lies exp(raw) behind the last (Flash3D)."""
+    """The first layer as `independent_depths`; each further one lies exp(raw) behind the last (Flash3D).
+
+    The head starts it `Parameterization.layer_step` behind.
+    """
     first = independent_depths(raw[..., :1, :, :], near, far)
     steps = raw[..., 1:, :, :].clamp(-10, 6).exp()
     return torch.cat([first, steps], dim=-3).cumsum(dim=-3)
@@ -72,12 +75,17 @@ class Parameterization:
     Attributes:
         layers: M, Gaussians per pixel (2 in the paper).
         layer_depths: relation between the depths of one pixel's layers, a key of `LAYER_DEPTHS`.
+        first_depth: where in the depth range, as a share of it, Gaussians start. One half is the object's distance in
+            Splatter Image, whose range lies evenly around it.
+        layer_step: how far behind the last a layer starts with incremental depths, in scene units.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper does not state one; the clamp has no gradient outside, full gradient inside).
     """
 
     layers: int = 2
     layer_depths: str = "independent"
+    first_depth: float = 0.5
+    layer_step: float = 1.0
     smallest_scale: float = 1e-4
     largest_scale: float = 2.0
 
@@ -142,12 +150,19 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
     """
     assert head.bias is not None
     inputs = head.weight[0].numel()
+    first = math.log(parameterization.first_depth / (1 - parameterization.first_depth))
     row = 0
-    for group in [*GROUPS.values()] * parameterization.layers:
-        rows, row = slice(row, row + group.channels), row + group.channels
-        bound = math.sqrt(3 * _upstream_variance(group) / inputs)
-        nn.init.uniform_(head.weight[rows], -bound, bound)
-        nn.init.constant_(head.bias[rows], group.bias)
+    for layer in range(parameterization.layers):
+        depth = (
+            first
+            if layer == 0 or parameterization.layer_depths == "independent"
+            else math.log(parameterization.layer_step)
+        )
+        for name, group in GROUPS.items():
+            rows, row = slice(row, row + group.channels), row + group.channels
+            bound = math.sqrt(3 * _upstream_variance(group) / inputs)
+            nn.init.uniform_(head.weight[rows], -bound, bound)
+            nn.init.constant_(head.bias[rows], depth if name == "depth" else group.bias)
 
 
 def _upstream_variance(group: Group) -> float:

@@ -34,9 +34,9 @@ def test_nothing_in_the_tree_is_forgotten_here():
     assert all(compose_config(verb).out.startswith(f"outputs/{verb}/") for verb in VERBS)
 
 
-WHOLES = ["model", "experiment", "ablation", "evaluation"]
+WHOLES = ["model", "experiment", "ablation", "evaluation", "posterior", "objective"]
 # Options of other groups differ in one part of a run only, so that one configuration has one of each group.
-DELTAS = ["experiment", "ablation"]
+DELTAS = ["experiment", "ablation", "posterior", "objective"]
 
 
 def needed(group: str, option: str) -> list[str]:

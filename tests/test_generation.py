@@ -160,7 +160,7 @@ def test_files_that_are_damaged_missing_or_of_another_model_are_refused(folder):
     (folder / SUMS_FILE).unlink()
     path = folder / WEIGHTS_FILE
     content, weights = path.read_bytes(), load_file(path)
-    weights.pop("latent_scale")
+    weights.pop("latent_std")
     for damaged in (save(weights), content[:-1000]):
         path.write_bytes(damaged)
         with pytest.raises(WeightsError, match="cannot be loaded"):

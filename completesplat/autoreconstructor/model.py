@@ -7,9 +7,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder
-from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.scene import Views
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import TensorDataclass
 
@@ -35,6 +36,8 @@ class VariationalAutoReconstructor(nn.Module):
         gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
             more forward pass.
         pretrained: folder or hub id of a VAE in diffusers' layout to start from (`load_pretrained`); random if None.
+        view_encoder: (views, depth range) -> what other views of the scene add to the posterior's moments
+            (`view_encoders`); None: the paper's posterior, of the picture alone.
 
     Raises:
         WeightsError: the pretrained weights are missing, damaged or of another size.
@@ -48,19 +51,51 @@ class VariationalAutoReconstructor(nn.Module):
         variational: bool = True,
         pretrained: str | None = None,
         gradient_checkpointing: bool = False,
+        view_encoder: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.encoder = encoder
         self.reconstructor = reconstructor
         self.skip_dropout = skip_dropout
+        self.view_encoder = view_encoder
         self.variational = variational
         encoder.gradient_checkpointing = reconstructor.gradient_checkpointing = gradient_checkpointing
         if pretrained is not None:
             load_pretrained(encoder, reconstructor, pretrained)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
-        """Reconstruct from sRGB images in [0, 1]."""
-        posterior, features = self.encoder(images)
+    @property
+    def sees_views(self) -> bool:
+        """Whether the posterior takes in other views than the reference."""
+        return self.view_encoder is not None
+
+    def posterior(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        views: Views | None = None,
+        depth_range: Float[Tensor, "batch 2"] | None = None,
+    ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
+        """The posterior of latents, and the reference's features for the skips.
+
+        Args:
+            images: the reference pictures, sRGB in [0, 1].
+            views: all views that the posterior may see, the reference first and its frame as the world; without others
+                than the reference, and without an encoder of views, it is the paper's.
+        """
+        own, features = self.encoder(images)
+        if self.view_encoder is None or views is None or views.images.shape[1] < 2:
+            return own, features
+        assert depth_range is not None
+        mean, log_variance = self.view_encoder(views, depth_range).chunk(2, 1)
+        return from_moments(torch.cat([own.mean + mean, own.log_variance + log_variance], 1)), features
+
+    def forward(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        views: Views | None = None,
+        depth_range: Float[Tensor, "batch 2"] | None = None,
+    ) -> Reconstruction:
+        """Reconstruct from sRGB images in [0, 1]; in training also from `views` (see `posterior`)."""
+        posterior, features = self.posterior(images, views, depth_range)
         if not self.training:
             return Reconstruction(self.reconstructor(posterior.mode(), features), posterior)
         kept = (torch.rand(len(images), device=images.device) >= self.skip_dropout).float()

@@ -212,7 +212,7 @@ def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule
         device=training.module.device,
         progress=False,
     )
-    parts.latent_scale.fill_(store.scale)
+    parts.set_latent_moments(store.mean, store.std)
     parts.train()
     fill_cache(pictures)
     cached, fly = batches(data(latent_cache=str(folder))), batches(pictures)
@@ -289,7 +289,7 @@ def _built(model: CompleteSplat, sampler: Mapping[str, Any]) -> Sampler:
 
 def _draw(model: CompleteSplat, sampler: Sampler, pictures: int, **settings: Any) -> Gaussians:
     """Scenes of pictures of noise: what they show does not change the work."""
-    size, device = model.image_size, model.latent_scale.device
+    size, device = model.image_size, model.latent_std.device
     images = torch.rand(pictures, 3, size, size, generator=torch.Generator().manual_seed(0)).to(device)
     camera = Cameras(torch.eye(4, device=device), pinhole(model.fov_degrees.item(), size).to(device), (size, size))
     cameras = camera.map(lambda tensor: tensor.expand(pictures, *tensor.shape))
@@ -313,7 +313,7 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
     """
     if not limit:
         raise NotMeasured("compile_limit=0")
-    denoiser, device = model.denoiser, model.latent_scale.device
+    denoiser, device = model.denoiser, model.latent_std.device
     with torch.no_grad():
         conditioning = model.conditioning(torch.rand(batch, 3, model.image_size, model.image_size, device=device))
     latent = torch.randn(batch, denoiser.latent_channels, *conditioning.shape[-2:], device=device)

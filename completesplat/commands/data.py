@@ -85,6 +85,7 @@ def latents(
     conditioning: Any,
     out: Path,
     frames: Positive | None,
+    views: Positive,
     precision: Literal["float32", "float16"],
     batch_size: Positive,
 ) -> None:
@@ -105,8 +106,10 @@ def latents(
     data = instantiate(run_config.data, _convert_="all")
     data.prepare_data()
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    store = encode_training_set(autoreconstructor, data, out, frames, precision, conditioning, batch_size, device)
-    logger.info("scale of the latents: %.6g", store.scale)
+    store = encode_training_set(
+        autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, device
+    )
+    logger.info("deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
 def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`completesplat test evaluation=hidden_modes`: samples of what the reference view hides, against the known truth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -18,7 +19,7 @@ from completesplat.commands.trained import Trained
 from completesplat.data.hidden_modes import hidden_modes
 from completesplat.results.tables import Column, table
 from completesplat.results.wandb import log_modes
-from completesplat.studies.mode_benchmark import Measured, draw, measure, predictors, usable
+from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
 from completesplat.training.loggers import finished
 
 
@@ -64,28 +65,38 @@ def run(
     device = torch.device("cuda" if trainer["accelerator"] != "cpu" and torch.cuda.is_available() else "cpu")
     module.to(device).eval()
     samples = evaluation["samples"]
-    scenes = hidden_modes(data, evaluation["views"], evaluation["spread_views"])
-    count = len(scenes) if evaluation["scenes"] is None else min(evaluation["scenes"], len(scenes))
-    shown = track(usable(scenes, count), "Hidden modes", count, console=Console(stderr=True))
-    found = (scene if isinstance(scene, Exception) else scene.to(device) for scene in shown)
-    limits = evaluation["shown_scenes"], evaluation["shown_samples"]
-    measured = measure(predictors(module, samples, evaluation["batch"]), found, samples, evaluation["seed"], *limits)
+    scenes, skipped = usable(hidden_modes(data, evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
+    progress = partial(track, description="Hidden modes", console=Console(stderr=True))
+    measured = measure(
+        predictors(module, samples, evaluation["batch"]),
+        [scene.to(device) for scene in scenes],
+        samples,
+        evaluation["seed"],
+        evaluation["shown_scenes"],
+        evaluation["shown_samples"],
+        progress,
+    )
     results, calibration = measured.results(samples), measured.calibration()
     write_json(out / "hidden_modes.json", results)
     write_json(out / "calibration.json", calibration)
-    write_json(out / "protocol.json", protocol(tested, evaluation, module, data, measured))
+    write_json(out / "protocol.json", protocol(tested, evaluation, module, data, measured.names, skipped))
     draw(measured.shown["model"], results, calibration, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
         log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     Console(width=120).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
-    if measured.skipped:
-        print(f"{len(measured.skipped)} scenes skipped; the first: {measured.skipped[0]}")
+    if skipped:
+        print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 
 
 def protocol(
-    tested: Trained, evaluation: HiddenModesEvaluation, module: Any, data: Any, measured: Measured
+    tested: Trained,
+    evaluation: HiddenModesEvaluation,
+    module: Any,
+    data: Any,
+    scenes: Sequence[str],
+    skipped: Sequence[str],
 ) -> dict[str, Any]:
     """The statement of what was measured and how, with the names of the scenes."""
     return {
@@ -93,8 +104,8 @@ def protocol(
         "method": module.method,
         **data.describe(),
         "image_size": data.image_size,
-        "scenes": measured.names,
-        "skipped": measured.skipped,
+        "scenes": scenes,
+        "skipped": skipped,
         "samples": evaluation["samples"],
         "views": evaluation["views"],
         "spread_views": evaluation["spread_views"],

@@ -29,7 +29,7 @@ from completesplat.data.validation import (
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene
 
-HEADER: dict[str, str | int] = {"format": 2, "kind": "latent_cache"}
+HEADER: dict[str, str | int] = {"format": 3, "kind": "latent_cache"}
 ARRAYS = ("mean", "log_variance", "condition")
 
 
@@ -67,16 +67,18 @@ class Origin:
     settings: dict[str, Scalar]  # of the data module: what pictures and splits depend on
     image_size: int
     frames: int | None  # the largest number of frames of a sequence, evenly spaced; None: all
+    views: int  # other views that the posterior saw; 0: it sees the reference alone
     precision: str
 
 
 @dataclass(frozen=True)
 class LatentCacheManifest:
-    """A whole store; `sequences` are those of the training set, in its order; `scale` is 1 / std of a latent."""
+    """A whole store; `sequences` are those of the training set, in its order; `mean` and `std` are of a latent."""
 
     version: str
     origin: Origin
-    scale: float
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
     arrays: dict[str, Array]
     sequences: tuple[CachedSequence, ...]
 
@@ -88,7 +90,7 @@ class LatentCacheManifest:
             (shapes.get("mean") == shapes.get("log_variance"), "means and log-variances of different shapes"),
             (all(0 <= s.first <= rows - len(s.stored) for s in self.sequences), "rows outside of the arrays"),
             (len({s.name for s in self.sequences}) == len(self.sequences), "two sequences of one name"),
-            (self.scale > 0, f"scale must be above 0, not {self.scale}"),
+            (min(self.std) > 0, f"std must be above 0, not {self.std}"),
         ]:
             if not true:
                 raise BadAnnotation(reason)
@@ -170,7 +172,7 @@ def open_array(root: Path, array: Array) -> np.memmap:
 class LatentCache:
     """The latent cache of a training set, opened.
 
-    `scale` is 1 / standard deviation of a latent drawn from the posteriors, over all elements of all stored frames;
+    `mean` and `std` are those of each channel of latents drawn from the posteriors of all stored frames;
     `arrays` are memory-mapped, with one row for each picture.
 
     Raises:
@@ -183,7 +185,7 @@ class LatentCache:
         self.folder = folder
         self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the pictures again")
         self.origin = self.manifest.origin
-        self.scale = self.manifest.scale
+        self.mean, self.std = self.manifest.mean, self.manifest.std
         self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
         self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width

@@ -1,17 +1,48 @@
-"""What the denoiser predicts; the scheduler's `prediction_type` decides, in training as in sampling.
+"""The forward process and what the denoiser predicts; the scheduler's settings decide, in training as in sampling.
 
-In h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps (paper, Eq. 2), `epsilon` is eps (Eq. 3), `sample` is h, and
-`v_prediction` sqrt(alpha_bar_t) eps - sqrt(1 - alpha_bar_t) h (Salimans and Ho 2022, Section 4).
+A noisy latent is h_t = a h + b eps. Diffusion has a = sqrt(alpha_bar_t) and b = sqrt(1 - alpha_bar_t) (paper, Eq. 2),
+flow matching a = 1 - t and b = t (Lipman et al. 2023; Liu et al. 2023, "rectified flow"). The denoiser predicts
+
+- `epsilon`: eps (paper, Eq. 3)
+- `sample`: h
+- `v_prediction`: a eps - b h (Salimans and Ho 2022, Section 4)
+- `flow`: eps - h, the velocity of flow matching
 """
 
 from typing import Any
 
+import torch
+from diffusers import FlowMatchEulerDiscreteScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
+"""Of diffusion; flow matching has one."""
+
+
+def signal_and_noise(
+    scheduler: Any, timestep: Int[Tensor, "*batch"], like: Tensor
+) -> tuple[Float[Tensor, "*batch 1 1 1"], Float[Tensor, "*batch 1 1 1"]]:
+    """The factors a of the latent and b of the noise at a timestep, of the type and on the device of `like`."""
+    if is_flow(scheduler):
+        time = timestep.to(like)[..., None, None, None] / scheduler.config.num_train_timesteps
+        return 1 - time, time
+    alpha_bar: Tensor = scheduler.alphas_cumprod.to(like)[timestep][..., None, None, None]
+    return alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+
+
+def draw_timesteps(scheduler: Any, count: int, device: torch.device) -> Int[Tensor, " count"]:
+    """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
+
+    The latter favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
+    """
+    steps: int = scheduler.config.num_train_timesteps
+    if is_flow(scheduler):
+        middle: Tensor = torch.randn(count, device=device).sigmoid()
+        return (middle * steps).ceil().long()
+    return torch.randint(steps, (count,), device=device)
 
 
 def target(
@@ -26,12 +57,10 @@ def target(
         CompleteSplatError: the scheduler predicts something else.
     """
     kind = prediction_type(scheduler)
-    if kind == "epsilon":
-        return noise
-    if kind == "sample":
-        return latent
-    alpha_bar: Tensor = scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
-    return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * latent
+    if kind == "v_prediction":
+        signal, share = signal_and_noise(scheduler, timestep, latent)
+        return signal * noise - share * latent
+    return {"epsilon": noise, "sample": latent, "flow": noise - latent}[kind]
 
 
 def clean_estimate(
@@ -46,21 +75,27 @@ def clean_estimate(
         CompleteSplatError: the scheduler predicts something else.
     """
     kind = prediction_type(scheduler)
-    if kind == "sample":
-        return predicted
-    alpha_bar: Tensor = scheduler.alphas_cumprod.to(noisy_latent)[timestep]
-    signal, noise = alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
+    signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
     if kind == "epsilon":
         return (noisy_latent - noise * predicted) / signal
-    return signal * noisy_latent - noise * predicted
+    if kind == "v_prediction":
+        return signal * noisy_latent - noise * predicted
+    return noisy_latent - noise * predicted if kind == "flow" else predicted
+
+
+def is_flow(scheduler: Any) -> bool:
+    """Whether a scheduler draws along the straight lines of flow matching."""
+    return isinstance(scheduler, FlowMatchEulerDiscreteScheduler)
 
 
 def prediction_type(scheduler: Any) -> str:
-    """One of `PREDICTION_TYPES`.
+    """One of `PREDICTION_TYPES`, or "flow".
 
     Raises:
         CompleteSplatError: the scheduler has another one.
     """
+    if is_flow(scheduler):
+        return "flow"
     kind: str = scheduler.config.prediction_type
     if kind not in PREDICTION_TYPES:
         raise CompleteSplatError(

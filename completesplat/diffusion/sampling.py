@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from diffusers import DDIMScheduler
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from completesplat.diffusion.guidance import Denoise, guided_noise
-from completesplat.diffusion.objective import clean_estimate
+from completesplat.diffusion.objective import clean_estimate, draw_timesteps, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 
 OnStep = Callable[[int, int, Tensor], None]
@@ -60,10 +61,11 @@ class Sampler:
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)
-        latent: Tensor = noise * scheduler.init_noise_sigma
+        flow = is_flow(scheduler)
+        latent: Tensor = noise if flow else noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
             level = timestep.round().long()
-            inputs = scheduler.scale_model_input(latent, timestep)
+            inputs = latent if flow else scheduler.scale_model_input(latent, timestep)
             predicted = guided_noise(denoise, inputs, level.expand(len(noise)), conditioning, guidance_weight)
             if on_step is not None:
                 on_step(index, int(level), clean_estimate(scheduler, inputs, predicted, level))
@@ -79,14 +81,21 @@ class Sampler:
                 f"steps={steps}: DDIM's must divide {self.training_timesteps} (10, 20, 25, 40, 50, ...); "
                 "sampler=dpm20 takes any number"
             )
-        self.scheduler.set_timesteps(steps, device=device)
+        if is_flow(self.scheduler):  # diffusers' own would end at t = 1/1000 and waste a step from there
+            self.scheduler.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), device=device)
+        else:
+            self.scheduler.set_timesteps(steps, device=device)
+
+    def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
+        """Random noise levels to train at; see `objective.draw_timesteps`."""
+        return draw_timesteps(self.scheduler, count, device)
 
     def add_noise(
         self, latent: Float[Tensor, "batch channel height width"], noise: Tensor, timestep: Tensor
     ) -> Float[Tensor, "batch channel height width"]:
-        """The forward process h_t = sqrt(alpha_bar_t) h + sqrt(1 - alpha_bar_t) eps (paper, Eq. 2)."""
-        alpha_bar: Tensor = self.scheduler.alphas_cumprod.to(latent)[timestep].view(-1, 1, 1, 1)
-        return alpha_bar.sqrt() * latent + (1 - alpha_bar).sqrt() * noise
+        """The forward process h_t = a h + b eps (paper, Eq. 2; `objective.signal_and_noise`)."""
+        signal, share = signal_and_noise(self.scheduler, timestep, latent)
+        return signal * latent + share * noise
 
     @property
     def training_timesteps(self) -> int:
@@ -96,7 +105,14 @@ class Sampler:
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
-    """A sampler's configuration with the noise schedule and the prediction type of the one trained with."""
+    """A sampler's configuration with the noise schedule and the prediction type of the one trained with.
+
+    Raises:
+        CompleteSplatError: one of the two is of diffusion, the other of flow matching.
+    """
+    names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
+    if len({name.startswith("FlowMatch") for name in names}) > 1:
+        raise CompleteSplatError(f"sampler: {names[0]} cannot draw from a denoiser that was trained for {names[1]}")
     kept = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
     return {**sampler, "scheduler": {**sampler["scheduler"], **kept}}
 

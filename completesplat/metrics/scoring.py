@@ -13,14 +13,17 @@ from torch import Tensor
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError
+from completesplat.geometry.visibility import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
 from completesplat.metrics.images import Missing, object_only, psnr, ssim
+from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
 from completesplat.scene import SceneBatch, Views
 
 ImageMetric = Callable[[Tensor, Tensor], Tensor]
 Scores = dict[tuple[str, str, str], float]
 Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
+PROPER_REGIONS = ("full", "hidden")
 MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
@@ -96,7 +99,10 @@ class Evaluation:
         higher = HIGHER_IS_BETTER[self.criterion]
         self._add(BEST, name, images[best(by, higher)], truth)
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
-        self.drawn[name] = {"curve": expected_best_curve(by, higher), "diversity": diversity(images[:, 1:])}
+        proper, ranks = proper_scores(images[:, 1:], truth)
+        self.scores[MODEL][name] |= proper
+        curve = expected_best_curve(by, higher)
+        self.drawn[name] = {"curve": curve, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
         """One prediction of one scene, values in [0, 1]: means over the novel views."""
@@ -163,7 +169,39 @@ class Evaluation:
             curves = zip(*(self.drawn[name]["curve"] for name in names), strict=True)
             results[BEST]["curve"] = [sum(values) / len(values) for values in curves]
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
+            for region in PROPER_REGIONS:
+                known = [shares[region] for name in names if region in (shares := self.drawn[name]["ranks"])]
+                if known:
+                    mean = [sum(values) / len(known) for values in zip(*known, strict=True)]
+                    results[MEAN][f"ranks_{region}"] = mean
         return results
+
+
+def proper_scores(
+    images: Float[Tensor, "sample view 3 height width"], truth: Views
+) -> tuple[Scores, dict[str, list[float]]]:
+    """`energy` and `crps` of the novel views, and their rank histograms by region.
+
+    Of all pixels (`full`), and of those whose surface the reference does not show (`hidden`), where true depth tells.
+
+    Args:
+        truth: all views, the reference first.
+    """
+    novel, counted = truth[1:], {"full": torch.ones_like(truth.masks[1:, 0], dtype=torch.bool)}
+    if truth.depths is not None and truth.depths.shape[-2:] == images.shape[-2:]:
+        hidden, _ = hidden_from(truth.cameras[0], truth.depths[0], novel.cameras, truth.depths[1:])
+        counted |= {"hidden": hidden} if hidden.any() else {}
+    scores: Scores = {}
+    ranks = {}
+    for region, pixels in counted.items():
+        drawn = images.movedim(2, -1)[:, pixels].flatten(1).float()
+        true = novel.images.movedim(1, -1)[pixels].flatten().float()
+        scores[region, "novel", "energy"], scores[region, "novel", "crps"] = (
+            energy_score(drawn, true),
+            crps(drawn, true),
+        )
+        ranks[region] = rank_histogram(drawn, true).tolist()
+    return scores, ranks
 
 
 def _region(images: Tensor, truth: Views, region: str) -> Tensor:

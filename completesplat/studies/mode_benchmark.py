@@ -1,8 +1,7 @@
 """The benchmark of what the reference view hides: samples against all that could be there."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.export.pictures import to_bytes
@@ -28,48 +28,82 @@ from completesplat.metrics.mode_coverage import (
     scores,
     spread_and_error,
 )
+from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
 
 Renders = Float[Tensor, "sample view 3 height width"]
-Predictor = Callable[[SceneBatch, int], Renders]
-"""Gives renders of all targets, in [0, 1], for a scene (a batch of one) and a seed."""
+Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
+"""Gives renders of all targets, in [0, 1], for a scene, another scene (batches of one) and a seed."""
 
 
 def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
-    """`model`: as it is tested. `posterior_samples`, for a variational autoreconstructor: latents that are drawn.
+    """`model`: as it is tested; and the rungs below it, which show where modes are lost.
 
-    A model that draws nothing gives `samples` equal ones. Samples are computed and rendered `batch` at a time.
+    With a variational autoreconstructor: `posterior_mean`, and `posterior_samples`, latents that are drawn from what it
+    encodes of a scene; `other_scene`: latents drawn from another scene's encoding, with the picture and the skips of
+    this one. A posterior that sees views is given all targets (so that it knows the true mode); `reference_only` is its
+    mean without them. If the posterior's samples show the modes and the model's do not, stage 2 is at fault; if they do
+    not, stage 1 is. A model that draws nothing gives `samples` equal ones. Samples are computed and rendered `batch` at
+    a time.
     """
 
-    def model(scene: SceneBatch, seed: int) -> Renders:
+    def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
         if not module.draws_samples:
             image = _render(module, module.reconstruct(scene, seed=seed), scene)
             return image.expand(samples, *image.shape[1:])
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
         return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
 
-    found: dict[str, Predictor] = {"model": model}
-    if isinstance(getattr(module, "model", None), VariationalAutoReconstructor):
-        found["posterior_samples"] = partial(_posterior_samples, module, samples, batch)
+    own = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
+    if not isinstance(own, VariationalAutoReconstructor):
+        return {"model": model}
+    ladder = _Ladder(module, own, samples, batch)
+    found: dict[str, Predictor] = {
+        "model": model,
+        "posterior_mean": lambda scene, other, seed: ladder.mean(scene, own.sees_views),
+        "posterior_samples": lambda scene, other, seed: ladder.drawn(scene, scene, seed),
+        "other_scene": lambda scene, other, seed: ladder.drawn(scene, other, seed),
+    }
+    if own.sees_views:
+        found["reference_only"] = lambda scene, other, seed: ladder.mean(scene, False)
     return found
 
 
-def _posterior_samples(module: Any, samples: int, batch: int, scene: SceneBatch, seed: int) -> Renders:
-    model: VariationalAutoReconstructor = module.model
-    reference = scene.reference
-    posterior, features = model.encoder(reference.images * scene.visible if module.masked else reference.images)
-    # On the CPU, so that a seed means the same on every device.
-    noise = torch.randn(samples, *posterior.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
-    latents = posterior.mean + noise.to(posterior.mean) * posterior.std
+@dataclass(frozen=True)
+class _Ladder:
+    """Renders of what an autoreconstructor makes of latents."""
 
-    def rendered(part: Float[Tensor, "sample channel _ _"]) -> Renders:
-        count = len(part)
-        splatter_image = model.reconstructor(part, [feature.expand(count, -1, -1, -1) for feature in features])
-        cameras = reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
-        return _render(module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)
+    module: Any
+    model: VariationalAutoReconstructor
+    samples: int
+    batch: int
 
-    return torch.cat([rendered(part) for part in torch.split(latents, batch)])
+    def mean(self, scene: SceneBatch, with_views: bool) -> Renders:
+        image = self._rendered(self._posterior(scene, with_views).mean, scene)
+        return image.expand(self.samples, *image.shape[1:])
+
+    def drawn(self, scene: SceneBatch, encoded: SceneBatch, seed: int) -> Renders:
+        posterior = self._posterior(encoded, self.model.sees_views)
+        # On the CPU, so that a seed means the same on every device.
+        noise = torch.randn(self.samples, *posterior.mean.shape[1:], generator=torch.Generator().manual_seed(seed))
+        latents = posterior.mean + noise.to(posterior.mean) * posterior.std
+        return torch.cat([self._rendered(part, scene) for part in torch.split(latents, self.batch)])
+
+    def _posterior(self, scene: SceneBatch, with_views: bool) -> Posterior:
+        views = scene.all_views() if with_views else None
+        return self.model.posterior(self._seen(scene), views, scene.depth_range)[0]
+
+    def _seen(self, scene: SceneBatch) -> Float[Tensor, "1 3 _ _"]:
+        masked = getattr(self.module, "masked", False)
+        return scene.reference.images * scene.visible if masked else scene.reference.images
+
+    def _rendered(self, latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Renders:
+        count = len(latents)
+        _, features = self.model.encoder(self._seen(scene))
+        splatter_image = self.model.reconstructor(latents, [feature.expand(count, -1, -1, -1) for feature in features])
+        cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
+        return _render(self.module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)
 
 
 def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
@@ -95,18 +129,27 @@ class Shown:
 
 @dataclass
 class Measured:
-    """The measurements so far: scores by method and scene, sums of the calibration by method and region."""
+    """The measurements so far: scores by method and scene, sums of the calibration by method and region.
+
+    `energies` are the energy scores of the views that show the modes, of what the reference hides and of the rest.
+    """
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
+    energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
     shown: dict[str, list[Shown]] = field(default_factory=dict)
     names: list[str] = field(default_factory=list)
-    skipped: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Score the renders of the views that show the modes."""
         found = scores(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
         self.scores.setdefault(method, []).append(found)
+        unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
+        energies = self.energies.setdefault(method, {name: [] for name in REGIONS})
+        for name, region in zip(REGIONS, (unseen, ~unseen), strict=True):
+            if region.any():
+                true = in_region(truth[None], region)[0].flatten()
+                energies[name].append(energy_score(in_region(images, region).flatten(1), true))
 
     def add_calibration(self, method: str, renders: Renders, scene: HiddenModes) -> None:
         """Count the renders of all targets."""
@@ -134,7 +177,12 @@ class Measured:
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Means over the scenes by method."""
         counts = {"scenes": len(self.names), "samples": samples}
-        return {method: asdict(mean_scores(found)) | counts for method, found in self.scores.items()}
+        return {
+            method: asdict(mean_scores(found))
+            | {f"energy_{name}": sum(values) / max(1, len(values)) for name, values in self.energies[method].items()}
+            | counts
+            for method, found in self.scores.items()
+        }
 
     def calibration(self) -> dict[str, dict[str, Any]]:
         """Curves by method and region."""
@@ -151,56 +199,57 @@ def in_region(
 @torch.no_grad()
 def measure(
     predictors: Mapping[str, Predictor],
-    scenes: Iterator[HiddenModes | DataError],
+    scenes: Sequence[HiddenModes],
     samples: int,
     seed: int,
     shown_scenes: int,
     shown_samples: int,
+    progress: Callable[[Sequence[HiddenModes]], Iterable[HiddenModes]] = iter,
 ) -> Measured:
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
-    their mean.
-
-    Raises:
-        CompleteSplatError: no scene can be used.
+    their mean. The other scene that a predictor gets is the one before (before the first: the last).
     """
     measured = Measured()
-    for index, scene in enumerate(scenes):
-        if isinstance(scene, DataError):
-            measured.skipped.append(str(scene))
-            continue
+    for index, scene in enumerate(progress(scenes)):
         mean = mean_of(scene.truths, scene.probabilities)
         measured.add("true_sampler", draw_modes(scene.truths, scene.probabilities, samples, seed + index), scene)
         measured.add("mean_predictor", mean.expand(samples, *mean.shape), scene)
         for method, predict in predictors.items():
-            renders = predict(scene.scene, seed + index)
+            renders = predict(scene.scene, scenes[index - 1].scene, seed + index)
             own = renders[:, list(scene.views)]
             measured.add(method, own, scene)
             measured.add_calibration(method, renders, scene)
             if len(measured.names) < shown_scenes:
                 measured.show(method, own, scene, shown_samples)
         measured.names.append(scene.scene.names[0])
-    if not measured.names:
-        reason = measured.skipped[0] if measured.skipped else "there are none"
-        raise CompleteSplatError(f"no test scene can be used for hidden modes; the first: {reason}")
     return measured
 
 
-def usable(scenes: HiddenModeScenes, count: int | None) -> Iterator[HiddenModes | DataError]:
-    """The first scenes (all by default), or in the place of one that cannot be used the reason."""
+def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
+    """Of the first scenes (all by default) those that can be used, and why the others cannot.
+
+    Raises:
+        CompleteSplatError: none can.
+    """
+    found, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:
-            yield scenes[index]
+            found.append(scenes[index])
         except DataError as error:
-            yield error
+            skipped.append(str(error))
+    if not found:
+        reason = skipped[0] if skipped else "there are none"
+        raise CompleteSplatError(f"no test scene can be used for hidden modes; the first: {reason}")
+    return found, skipped
 
 
 SIDE, GAP, CHARTS = 1.0, 0.06, 10.0
 """Side of a picture, space between pictures and width of the charts, in inches."""
 BEST = {"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0}
 COLORS = {"hidden": "C3", "visible": "C0"}
-STYLES = ("o-", "s--")
+STYLES = ("o-", "s--", "^:", "v-.", "d-")
 LOWEST = EDGES[0].item() / 2  # where variances and errors below the first edge are drawn
 
 

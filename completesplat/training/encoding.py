@@ -11,14 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Shaped
 from rich.progress import track
-from torch import Tensor, nn
+from torch import nn
 
 from completesplat import __version__
-from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.latent_cache import (
     Array,
     ArrayWriter,
@@ -30,21 +28,19 @@ from completesplat.data.latent_cache import (
     write_manifest,
 )
 from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.scenes import SceneStore
+from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
 from completesplat.data.sequences import SequenceSource, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.scene import CachedScene
+from completesplat.scene import SceneBatch
+from completesplat.tensors import stack
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Rows = dict[str, Shaped[np.ndarray, "picture _ _ _"]]
 
 logger = logging.getLogger(__name__)
-
-
-def latent_draw(batch: CachedScene, scale: Tensor | float) -> Float[Tensor, "batch channel height width"]:
-    """One draw of each scaled latent: the same noise as `CompleteSplat.encode` draws."""
-    return Posterior(batch.mean, batch.log_variance).sample() * scale
 
 
 def fingerprint(module: nn.Module) -> str:
@@ -54,6 +50,12 @@ def fingerprint(module: nn.Module) -> str:
         digest.update(f"{name} {value.dtype} {tuple(value.shape)} ".encode())
         digest.update(value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy())
     return digest.hexdigest()
+
+
+def posterior_fingerprint(autoreconstructor: VariationalAutoReconstructor) -> str:
+    """Of all weights that latents depend on."""
+    encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
+    return fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
 
 
 def check_cache(
@@ -70,7 +72,7 @@ def check_cache(
     `WeightsError`: made with another autoreconstructor or conditioning; `DataError`: of other data, or its latents
     have another shape than this autoreconstructor's.
     """
-    if store.origin.encoder != fingerprint(autoreconstructor.encoder):
+    if store.origin.encoder != posterior_fingerprint(autoreconstructor):
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
     store.must_be_of(source)
     device = next(autoreconstructor.parameters()).device
@@ -91,39 +93,45 @@ def features_fingerprint(conditioning: nn.Module | None) -> str | None:
 
 @torch.no_grad()
 def encoded(
-    pictures: UInt8[Tensor, "picture 3 size size"],
-    encoder: Encoder,
+    scenes: SceneBatch,
+    autoreconstructor: VariationalAutoReconstructor,
     conditioning: nn.Module | None,
     precision: torch.dtype,
     device: torch.device | str,
 ) -> Rows:
-    """The rows "mean", "log_variance" and "condition" of these pictures, by frozen networks."""
-    # Divided as everywhere: torch multiplies by 1 / 255 on a GPU.
-    images = torch.from_numpy(np.divide(pictures.numpy(), 255, dtype=np.float32)).to(device)
-    posterior, _ = encoder(images)
+    """The rows "mean", "log_variance" and "condition" of these scenes' references, by frozen networks."""
+    scenes = scenes.to(device)
+    images = scenes.reference.images
+    views = scenes.all_views() if autoreconstructor.sees_views else None
+    posterior, _ = autoreconstructor.posterior(images, views, scenes.depth_range)
     made = {"mean": posterior.mean, "log_variance": posterior.log_variance}
     if conditioning is not None:
         made["condition"] = conditioning(images)
     stored = {name: value.to(precision).cpu().numpy() for name, value in made.items()}
-    return {"condition": pictures.numpy(), **stored} if conditioning is None else stored
+    pictures = (images * 255).round().to(torch.uint8).cpu().numpy()
+    return {"condition": pictures, **stored} if conditioning is None else stored
 
 
 class Moments:
-    """Sums over all elements of what was encoded, in float64, for the deviation of a draw."""
+    """Sums over all elements of each channel of what was encoded, in float64, for mean and deviation of a draw."""
 
     def __init__(self) -> None:
         self.count, self.total, self.squares = 0, 0.0, 0.0
 
-    def add(self, mean: Float[np.ndarray, "*any"], log_variance: Float[np.ndarray, "*any"]) -> None:
-        """Some more elements."""
+    def add(
+        self, mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
+    ) -> None:
+        """Some more rows."""
         mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
-        self.count += mean.size
-        self.total += float(mean.sum())
-        self.squares += float((np.square(mean) + variance).sum())
+        self.count += mean[:, 0].size
+        self.total = self.total + mean.sum((0, 2, 3))
+        self.squares = self.squares + (np.square(mean) + variance).sum((0, 2, 3))
 
-    def scale(self) -> float:
-        """1 / std, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
-        return float((self.squares / self.count - (self.total / self.count) ** 2) ** -0.5)
+    def results(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Mean and deviation, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
+        mean = np.asarray(self.total) / self.count
+        std = np.sqrt(np.asarray(self.squares) / self.count - np.square(mean))
+        return tuple(mean.tolist()), tuple(std.tolist())
 
 
 def encode_training_set(
@@ -131,6 +139,7 @@ def encode_training_set(
     data: SceneDataModule,
     out: Path,
     frames: int | None = None,
+    views: int = 7,
     precision: str = "float32",
     conditioning: nn.Module | None = None,
     batch_size: int = 64,
@@ -143,19 +152,16 @@ def encode_training_set(
 
     Args:
         frames: the largest number of frames of a sequence, evenly spaced; None: all.
+        views: other views, evenly spread over the sequence, that a posterior which sees views is given.
         precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
             first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
         conditioning: frozen, images -> features, which are stored; None: the pictures are.
 
     `DataError`: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
     """
-    if precision not in PRECISIONS or (frames is not None and frames < 1) or batch_size < 1:
-        raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, 1 <= frames and 1 <= batch_size")
-    source = data.source("train")
-    if not isinstance(source, PackedSource):
-        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
-        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
-    origin = _origin(autoreconstructor, data, conditioning, frames, precision)
+    views = views if autoreconstructor.sees_views else 0
+    source = _packed(data)
+    origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
     if is_latent_cache(out):
         store = LatentCache(out)
         if store.origin != origin:
@@ -164,37 +170,48 @@ def encode_training_set(
         return store
     out.mkdir(parents=True, exist_ok=True)
     features = None if conditioning is None else conditioning.to(device).eval()
-    encoder = autoreconstructor.to(device).eval().encoder
-    encode = partial(encoded, encoder=encoder, conditioning=features, precision=PRECISIONS[precision], device=device)
-    blank = encode(torch.zeros(1, 3, data.image_size, data.image_size, dtype=torch.uint8))
+    frozen = autoreconstructor.to(device).eval()
+    encode = partial(
+        encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
+    )
+    first = next(_scenes(source, 1, views, [], False)).scene
+    blank = encode(stack([first]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
-    pictures = _pictures(source, frames, sequences, progress)
-    arrays, scale = _write_arrays(out, encode, blank, pictures, batch_size)
-    write_manifest(out, LatentCacheManifest(__version__, origin, scale, arrays, tuple(sequences)))
+    scenes = _scenes(source, frames, views, sequences, progress)
+    arrays, moments = _write_arrays(out, encode, blank, scenes, batch_size)
+    write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
     return LatentCache(out)
 
 
-class FrameToEncode(NamedTuple):
-    """A picture that is to be encoded, and the frame that it is of."""
+def _packed(data: SceneDataModule) -> PackedSource:
+    source = data.source("train")
+    if not isinstance(source, PackedSource):
+        advice = "run `completesplat data prepare` first, then give overrides=['data.root=STORE']"
+        raise DataError(f"the latent cache is made from packed data: {advice}", str(data.root))
+    return source
 
-    image: UInt8[Tensor, "3 size size"]
-    sequence: str
+
+class FrameToEncode(NamedTuple):
+    """A scene whose reference is to be encoded, and the number of its frame."""
+
+    scene: SceneBatch
     number: int
 
 
-def _pictures(
-    source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
+def _scenes(
+    source: PackedSource, frames: int | None, views: int, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[FrameToEncode]:
-    """All pictures in the order of their rows; `sequences` gets an entry for each sequence that they are of."""
-    rows = 0
+    """All references in the order of their rows; `sequences` gets an entry for each sequence that they are of."""
+    rows, store = 0, SceneStore(source, source.names, cache=False)
     for name in track(source.names, "encoding sequences", disable=not progress):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
         sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))
         rows += len(places)
         for place in places:
-            yield FrameToEncode(sequence.read(place).image, name, sequence.frames[place])
+            scene = store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
+            yield FrameToEncode(scene, sequence.frames[place])
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
@@ -206,22 +223,22 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 
 
 def _write_arrays(
-    out: Path, encode: Callable[[Tensor], Rows], blank: Rows, pictures: Iterator[FrameToEncode], batch_size: int
-) -> tuple[dict[str, Array], float]:
-    """Rows like those of `blank` for all pictures; what was written, and the scale."""
+    out: Path, encode: Callable[[SceneBatch], Rows], blank: Rows, scenes: Iterator[FrameToEncode], batch_size: int
+) -> tuple[dict[str, Array], Moments]:
+    """Rows like those of `blank` for all scenes; what was written, and its moments."""
     moments = Moments()
     with ExitStack() as files:
         writers = {
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in blank.items()
         }
-        while batch := list(islice(pictures, batch_size)):
-            rows = encode(torch.stack([picture.image for picture in batch]))
+        while batch := list(islice(scenes, batch_size)):
+            rows = encode(stack([one.scene for one in batch]))
             _refuse_not_finite(rows, batch)
             moments.add(rows["mean"], rows["log_variance"])
             for name, writer in writers.items():
                 writer.append(rows[name])
-    return {name: writer.described() for name, writer in writers.items()}, moments.scale()
+    return {name: writer.described() for name, writer in writers.items()}, moments
 
 
 def _origin(
@@ -229,25 +246,33 @@ def _origin(
     data: SceneDataModule,
     conditioning: nn.Module | None,
     frames: int | None,
+    views: int,
     precision: str,
 ) -> Origin:
+    if (
+        precision not in PRECISIONS
+        or (frames is not None and frames < 1)
+        or (autoreconstructor.sees_views and views < 1)
+    ):
+        raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, frames and views of 1 or more")
     if conditioning is not None and not conditioning.frozen:
         raise CompleteSplatError("a conditioning that is trained needs pictures, not features: leave conditioning out")
     return Origin(
-        fingerprint(autoreconstructor.encoder),
+        posterior_fingerprint(autoreconstructor),
         features_fingerprint(conditioning),
         data.source("train").fingerprint(),
         data.packed_settings(),
         data.image_size,
         frames,
+        views,
         precision,
     )
 
 
-def _refuse_not_finite(rows: Rows, pictures: list[FrameToEncode]) -> None:
+def _refuse_not_finite(rows: Rows, scenes: list[FrameToEncode]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():
-            bad = pictures[int(finite.argmin())]
+            bad = scenes[int(finite.argmin())]
             limits = " in float16: try precision=float32" if values.dtype == np.float16 else ""
-            raise DataError(f"its {name} is not finite{limits}", None, bad.sequence, bad.number)
+            raise DataError(f"its {name} is not finite{limits}", None, str(bad.scene.names), bad.number)

@@ -7,7 +7,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.autoreconstructor.skips import allowed_skip_weight
+from completesplat.data.latent_cache import LatentCache
 from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -15,7 +17,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
 from completesplat.training.checkpoints import load_part
-from completesplat.training.encoding import check_cache, latent_draw
+from completesplat.training.encoding import check_cache
 from completesplat.training.scene_module import SceneModule, prepare_network
 
 LOSS_BUCKETS = 4
@@ -34,7 +36,9 @@ class LatentDiffusion(SceneModule):
             them, and what was measured.
         unconditional_probability: how often phi_ref is zeroed, for guidance (0.2 in the paper).
         skip_weight, guidance_weight: settings of the samples drawn in validation and test.
-        scale_batches: training batches on which the latents' scale is measured.
+        scale_batches: training batches on which the latents' mean and deviation are measured.
+        noise_draws: times that a latent is taken in a step, each time with a noise and a noise level of its own: more
+            steps of the denoiser for one of the encoders.
         channels_last, compile: of the denoiser, see `prepare_network`.
         **rendering_and_optimization: see `SceneModule`.
 
@@ -54,6 +58,7 @@ class LatentDiffusion(SceneModule):
         skip_weight: float = 1.0,
         guidance_weight: float = 0.0,
         scale_batches: int = 50,
+        noise_draws: int = 1,
         channels_last: bool = False,
         compile: bool = False,
         **rendering_and_optimization: Any,
@@ -67,6 +72,7 @@ class LatentDiffusion(SceneModule):
         self.skip_weight = allowed_skip_weight(skip_weight)
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
+        self.noise_draws = noise_draws
         if autoreconstructor_checkpoint is not None and checkpoint is not None:
             raise WeightsError("model.checkpoint holds stage 1 as well: set model.autoreconstructor_checkpoint=null")
         if autoreconstructor_checkpoint is not None:
@@ -81,6 +87,7 @@ class LatentDiffusion(SceneModule):
 
         Raises:
             WeightsError: frozen parts have no weights.
+            CompleteSplatError: a posterior that sees views gets none.
         """
         if self.checkpoint is None and self.trainer.ckpt_path is None:
             self._refuse_random_parts()
@@ -88,11 +95,11 @@ class LatentDiffusion(SceneModule):
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
         if data.latent_cache is not None:
             check_cache(data.cached_latents, parts.autoreconstructor, data.source("train"), parts.conditioning)
-        if parts.latent_scale != 1:  # a continued run keeps what it measured
+        elif parts.autoreconstructor.sees_views and data.targets < 1:
+            raise CompleteSplatError("latents of the reference alone hold nothing hidden: set data.targets (to 5, say)")
+        if (parts.latent_std != 1).any():  # a continued run keeps what it measured
             return
-        self._measure_latents(
-            data.train_dataloader(), data.cached_latents.scale if data.latent_cache is not None else None
-        )
+        self._measure_latents(data.train_dataloader(), data.cached_latents if data.latent_cache is not None else None)
         camera = data.typical_camera()
         parts.fov_degrees.fill_(camera.fov_degrees)
         parts.depth_range.copy_(torch.tensor(camera.depth_range))
@@ -110,11 +117,11 @@ class LatentDiffusion(SceneModule):
             )
 
     @torch.no_grad()
-    def _measure_latents(self, loader: Any, scale: float | None) -> None:
-        """Set the factor that gives latents unit standard deviation over all elements, and log what they are like.
+    def _measure_latents(self, loader: Any, cache: LatentCache | None) -> None:
+        """Measure mean and deviation of each of the latent's channels, with which the denoiser's are standardised.
 
-        The paper does not say how its latents are scaled; the factor is measured and stored with the weights. A cache
-        knows its exact value, `scale`.
+        The paper does not say how its latents are scaled; what is measured is stored with the weights. A cache
+        knows exact values.
         """
         drawn = []
         for _, batch in zip(range(self.scale_batches), loader, strict=False):
@@ -126,13 +133,13 @@ class LatentDiffusion(SceneModule):
                 )
             drawn.append(latent.double().cpu())
         latents = torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)
-        deviation = latents.std(correction=0).item()
-        if not deviation > 0:
+        mean, deviation = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
+        if not (deviation > 0).all():
             raise CompleteSplatError("the latents do not vary: no training pictures, or an encoder that ignores them")
-        self.completesplat.latent_scale.fill_(scale or 1 / deviation)
-        values = {"latent_scale": scale or 1 / deviation, "latents/std": deviation}
-        values |= {f"latents/mean_{i}": mean for i, mean in enumerate(latents.mean((0, 2, 3)).tolist())}
-        values |= {f"latents/std_{i}": std for i, std in enumerate(latents.std((0, 2, 3), correction=0).tolist())}
+        moments = (mean.tolist(), deviation.tolist()) if cache is None else (cache.mean, cache.std)
+        self.completesplat.set_latent_moments(*moments)
+        names = ("mean", "std")
+        values = {f"latents/{n}_{i}": x for n, each in zip(names, moments, strict=True) for i, x in enumerate(each)}
         for logger in self.trainer.loggers:
             logger.log_metrics(values, step=self.trainer.global_step)
 
@@ -145,18 +152,20 @@ class LatentDiffusion(SceneModule):
         """
         parts = self.completesplat
         if isinstance(batch, SceneBatch):
-            latent = parts.encode(batch.reference.images).latent
+            views = batch.all_views() if parts.autoreconstructor.sees_views else None
+            latent = parts.encode(batch.reference.images, views, batch.depth_range)
             return latent, parts.conditioning(batch.reference.images * batch.visible)
-        latent = latent_draw(batch, parts.latent_scale)
+        latent = parts.standardised(Posterior(batch.mean, batch.log_variance).sample())
         return latent, batch.condition if parts.conditioning.frozen else parts.conditioning(batch.condition)
 
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
         latent, conditioning = self.inputs(batch)
+        latent, conditioning = (x.repeat(self.noise_draws, 1, 1, 1) for x in (latent, conditioning))
         kept = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * kept[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # like the latent's, it would depend on its memory layout
-        timestep = torch.randint(parts.sampler.training_timesteps, (len(latent),), device=self.device)
+        timestep = parts.sampler.draw_timesteps(len(latent), self.device)
         noisy = parts.sampler.add_noise(latent, noise, timestep)
         predicted = parts.denoiser(
             noisy.contiguous(memory_format=self.memory_format),
@@ -199,7 +208,7 @@ def losses_by_timestep(
     errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"], timesteps: int
 ) -> dict[str, float]:
     """Mean loss of the samples in each of four equal ranges of timesteps; ranges without samples are left out."""
-    buckets = timestep * LOSS_BUCKETS // timesteps
+    buckets = timestep.clamp(max=timesteps - 1) * LOSS_BUCKETS // timesteps
     return {f"train/loss_t{i}": errors[buckets == i].mean().item() for i in sorted(set(buckets.tolist()))}
 
 

@@ -1,5 +1,6 @@
 """Stage 1: a reconstruction model trained from posed images alone (paper, Section 3.2)."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
 from completesplat.training.checkpoints import load_part
 from completesplat.training.scene_module import SceneModule, prepare_network
@@ -48,8 +50,13 @@ class ReconstructionModule(SceneModule):
         prepare_network(model, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Refuse a latent cache: this stage trains what would encode it."""
-        if getattr(self.trainer.datamodule, "latent_cache", None) is not None:  # type: ignore[attr-defined]
+        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior."""
+        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+        if self.sees_views and data.targets < 2:
+            raise CompleteSplatError(
+                "posterior=views needs targets to see and others to predict: data.targets of 2 or more"
+            )
+        if getattr(data, "latent_cache", None) is not None:
             raise CompleteSplatError(
                 "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
             )
@@ -59,14 +66,28 @@ class ReconstructionModule(SceneModule):
         """The reconstruction model's class."""
         return type(self.model).__name__
 
-    def forward(self, scenes: SceneBatch) -> Reconstruction:
-        """Splatter Images, and posteriors if the model has any, from the reference images alone."""
+    @property
+    def sees_views(self) -> bool:
+        """Whether the model's posterior sees other views than the reference; baselines have none."""
+        return getattr(self.model, "sees_views", False)
+
+    def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
+        """Splatter Images, and posteriors if the model has any.
+
+        Args:
+            others: so many of the targets are seen by the posterior besides the reference picture.
+        """
         images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
-        reconstruction: Reconstruction = self.model(images.contiguous(memory_format=self.memory_format))
+        images = images.contiguous(memory_format=self.memory_format)
+        seen = (scenes.all_views()[:, : 1 + others], scenes.depth_range) if others else ()
+        reconstruction: Reconstruction = self.model(images, *seen)
         return reconstruction
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        reconstruction = self(scenes)
+        """A posterior that sees views is given a random number of the targets, more often many than few, never all."""
+        targets = scenes.targets.images.shape[1]
+        others = int(torch.randint(targets, (2,)).max()) if self.sees_views else 0
+        reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
@@ -74,6 +95,22 @@ class ReconstructionModule(SceneModule):
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
         return total
+
+    def validation_step(self, scenes: SceneBatch, index: int) -> None:
+        """From the reference picture alone; and, with a posterior that sees views, as that encodes every other target.
+
+        The second, `val/psnr_posterior`, is of the targets between, which it has not seen: what a perfect stage 2 could
+        reach.
+        """
+        super().validation_step(scenes, index)
+        if not self.sees_views or scenes.targets.images.shape[1] < 2:
+            return
+        seen = replace(scenes, targets=scenes.targets[:, ::2])
+        others = replace(scenes, targets=scenes.targets[:, 1::2])
+        splatter_image = self(seen, seen.targets.images.shape[1]).splatter_image
+        images = self.render(splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range), others).clamp(0, 1)
+        values = psnr(images[:, 1:].flatten(0, 1), others.targets.images.flatten(0, 1))
+        self.log("val/psnr_posterior", values.mean(), prog_bar=True, batch_size=len(images))
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Gaussians from the posterior's mode: nothing is drawn, so the seed has no effect."""

@@ -46,7 +46,7 @@ class ReconstructorOnly(ReconstructionModule):
         if self.trainer.world_size > 1:
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
 
-    def forward(self, scenes: SceneBatch) -> Reconstruction:
+    def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
         """Splatter Images of training pictures from their own codes; in evaluation, of any picture from new ones."""
         if not self.training:
             return Reconstruction(self.model(self.infer_codes(scenes, seed=0)), None)

@@ -5,17 +5,26 @@ import pytest
 from support import refused, strict_json
 
 FEW = [f"evaluation.{few}" for few in ("samples=3", "batch=2", "views=1", "spread_views=2", "shown_samples=2")]
-FIGURES = {"coverage", "total_variation", "sharpness", "rejected", "scenes", "samples"}
+FIGURES = {
+    "coverage",
+    "total_variation",
+    "sharpness",
+    "rejected",
+    "scenes",
+    "samples",
+    "energy_hidden",
+    "energy_visible",
+}
+METHODS = {"model", "posterior_mean", "posterior_samples", "other_scene"}
 
 
 @pytest.mark.parametrize("stage", ["diffusion", pytest.param("var", marks=pytest.mark.slow)])
 def test_every_method_is_scored(command, pipeline, tmp_path, stage):
-    methods = {"model"} if stage == "diffusion" else {"model", "posterior_samples"}
     given = ["evaluation=hidden_modes", f"ckpt={getattr(pipeline, stage) / 'checkpoints/last.ckpt'}", *FEW]
     finished = command("test", *given, f"out={tmp_path / 'out'}")
     assert finished.status == 0, finished.err
     results = strict_json(tmp_path / "out/hidden_modes.json")
-    assert set(results) == methods | {"mean_predictor", "true_sampler"}
+    assert set(results) == METHODS | {"mean_predictor", "true_sampler"}
     for method, found in results.items():
         assert set(found) == FIGURES
         assert (found["scenes"], found["samples"]) == (1, 3)
@@ -25,7 +34,7 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage):
     assert (true["sharpness"], true["rejected"]) == (0, 0)
     assert true["coverage"] <= 0.75  # three draws of four modes
     calibration = strict_json(tmp_path / "out/calibration.json")
-    assert set(calibration) == methods
+    assert set(calibration) == METHODS
     for found in calibration.values():
         # Two spread views, one of which may be the one from behind.
         assert found["hidden"]["pixels"] + found["visible"]["pixels"] in (2 * 32**2, 3 * 32**2)

@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError
 
 NOISE = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
 DDIM = NOISE | {"clip_sample": False, "set_alpha_to_one": True, "timestep_spacing": "trailing"}
-NAMES = sorted(path.stem for path in (conf_folder() / "sampler").glob("[!_]*.yaml"))
+NAMES = sorted(p.stem for p in (conf_folder() / "sampler").glob("[!_]*.yaml") if not p.stem.startswith("flow"))
 MEAN, STD = 0.7, 0.5
 
 

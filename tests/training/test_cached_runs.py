@@ -50,10 +50,10 @@ def test_losses_are_those_of_training_from_pictures(fit, latent_cache, tmp_path)
     pandas.testing.assert_frame_equal(pictures, cached, rtol=1e-4, atol=0)
 
 
-def test_the_scale_is_the_caches_and_near_the_one_that_is_measured(fit, pipeline, latent_cache, tmp_path):
+def test_the_latents_moments_are_the_caches_and_near_those_that_are_measured(fit, pipeline, latent_cache, tmp_path):
     runs = fit(tmp_path / "run", "stage 1", f"data.latent_cache={latent_cache}"), pipeline.diffusion
-    (exact,), (measured,) = (logged(run, "^latent_scale")["latent_scale"] for run in runs)
-    assert exact == pytest.approx(LatentCache(latent_cache).scale)
+    exact, measured = (logged(run, "^latents/std_").iloc[0].tolist() for run in runs)
+    assert exact == pytest.approx(LatentCache(latent_cache).std)
     assert exact == pytest.approx(measured, rel=0.1)
 
 

@@ -20,7 +20,7 @@ from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
 from completesplat.tensors import stack
-from completesplat.training.encoding import Moments, check_cache, encode_training_set, fingerprint, latent_draw
+from completesplat.training.encoding import Moments, check_cache, encode_training_set, fingerprint
 
 
 @pytest.fixture(scope="module")
@@ -70,30 +70,35 @@ def test_half_precision_needs_half_the_space_and_rounds_as_it_says(root, cache, 
         exact, rounded = cache.arrays[name], half.arrays[name]
         assert 2 * rounded.nbytes == exact.nbytes
         assert (np.abs(rounded.astype(np.float64) - exact) <= 2.0**-11 * np.abs(exact) + 1e-7).all()
-    assert half.scale == pytest.approx(cache.scale, rel=1e-3)
+    assert half.std == pytest.approx(cache.std, rel=1e-3)
 
 
 @pytest.mark.parametrize(("magnitude", "variance", "shift"), [(0.0, 4.0, 0.0), (3.0, 1e-3, 0.0), (0.5, 0.25, 7.0)])
-def test_the_scale_is_that_of_a_mixture_of_two_equal_gaussians(magnitude, variance, shift):
+def test_moments_are_those_of_a_mixture_of_two_equal_gaussians_in_each_channel(magnitude, variance, shift):
     """h = shift +- magnitude + sqrt(variance) * noise has variance magnitude^2 + variance."""
     moments = Moments()
-    signs = np.ones((10, 2, 3, 3), np.float32) * np.array([1, -1], np.float32)[None, :, None, None]
+    signs = np.ones((10, 2, 3, 3), np.float32) * np.resize(np.float32([1, -1]), 10)[:, None, None, None]
     log_variance = np.full_like(signs, np.log(variance))
     for part in (slice(0, 3), slice(3, 10)):
-        moments.add(shift + magnitude * signs[part], log_variance[part])
-    assert moments.scale() == pytest.approx((magnitude**2 + variance) ** -0.5, rel=1e-5)
+        values = shift + magnitude * signs[part]
+        values[:, 1] *= 2
+        moments.add(values, log_variance[part])
+    mean, std = moments.results()
+    assert mean == pytest.approx((shift, 2 * shift), abs=1e-6)
+    assert std == pytest.approx([(factor * magnitude**2 + variance) ** 0.5 for factor in (1, 4)], rel=1e-5)
 
 
 def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
     model = tiny_generator()
-    model.latent_scale.fill_(0.7)
+    model.set_latent_moments([0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8])
     data = rooms(sound_rooms(tmp_path / "root", image_size=32), image_size=32)
     store = encode_training_set(model.autoreconstructor, data, tmp_path / "cache", progress=False)
     batch: CachedScene = stack([store.scene(name, 2) for name in store.sequences])
     torch.manual_seed(5)
-    on_the_fly = model.encode(batch.condition).latent
+    on_the_fly = model.encode(batch.condition)
     torch.manual_seed(5)
-    torch.testing.assert_close(latent_draw(batch, model.latent_scale), on_the_fly, rtol=1e-4, atol=1e-5)
+    drawn = model.standardised(Posterior(batch.mean, batch.log_variance).sample())
+    torch.testing.assert_close(drawn, on_the_fly, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("value", "precision"), [(float("nan"), "float32"), (1e30, "float16")])

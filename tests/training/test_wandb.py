@@ -25,7 +25,7 @@ LOGGED = [
     ("image", FIT, "pictures"),
     ("number", (STAGE1,), "train/mse train/ssim train/kl latent/bits latent/bits_* latent/active_channels"),
     ("number", (STAGE2,), "train/loss_t* samples/psnr samples/psnr_of_mean samples/diversity"),
-    ("number", (STAGE2,), "latent_scale latents/std latents/std_* latents/mean_*"),
+    ("number", (STAGE2,), "latents/std_* latents/mean_*"),
     ("image", (STAGE2,), "samples denoising"),
     ("number", TESTED, "test/model/* test/mean_image/* test/copy_reference/*"),
     ("number", (TEST,), "test/best_of_k/* test/mean_of_k/*"),

@@ -9,7 +9,7 @@ from completesplat.data.co3d.source import CO3DSource, ObjectFraming
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
-from completesplat.data.loading.view_selection import evaluation_views, training_views
+from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError
 
@@ -31,6 +31,8 @@ class CO3DDataModule(SceneDataModule):
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
         validation_targets: the same of a validation scene; None: as many as of a test scene.
+        spread_targets: targets of training evenly spread around the reference (the sequence taken as a ring), in random
+            order, for a posterior that sees them; else random ones.
         depth_before, depth_after: the depth range around the object's centre, where the object's half size is 0.57
             (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full pictures).
         **settings: of `SceneDataModule`.
@@ -51,6 +53,7 @@ class CO3DDataModule(SceneDataModule):
         most_training_sequences: int | None = None,
         evaluation_targets: int | None = None,
         validation_targets: int | None = None,
+        spread_targets: bool = False,
         depth_before: float = 1.5,
         depth_after: float = 4.0,
         **settings: Any,
@@ -64,6 +67,7 @@ class CO3DDataModule(SceneDataModule):
         self.seeded = SeededSplit(val_fraction, test_fraction, split_seed)
         self.filters = Filters(min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences)
         self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
+        self.spread_targets = spread_targets
         self.evaluation_targets = evaluation_targets
         self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 
@@ -100,8 +104,8 @@ class CO3DDataModule(SceneDataModule):
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
-        """A random reference and random targets."""
-        return training_views(frames, self.targets, rng)
+        """A random reference and random targets, or targets all around."""
+        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """The first frame as reference, others as targets."""

@@ -17,6 +17,22 @@ def training_views(frames: int, targets: int, rng: np.random.Generator) -> tuple
     return int(order[0]), np.resize(order[1:], targets).tolist()
 
 
+def spread_around(frames: int, reference: int, count: int) -> list[int]:
+    """`count` other frames, evenly spread over a sequence that is taken as a ring, from the one after the reference on.
+
+    They repeat where the sequence has fewer others.
+    """
+    steps = 1 + (np.arange(count) + 0.5) * (frames - 1) / max(count, 1)
+    places: list[int] = ((reference + np.floor(steps).astype(int).clip(1, frames - 1)) % frames).tolist()
+    return places
+
+
+def spread_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
+    """A random reference and `targets` frames all around it (`spread_around`), in random order."""
+    reference = int(rng.integers(frames))
+    return reference, rng.permutation(spread_around(frames, reference, targets)).tolist()
+
+
 def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
     """The first frame as reference; all others as targets, or at most `targets` of them, evenly spaced."""
     others = np.arange(1, frames)

@@ -1,12 +1,19 @@
 """Procedural scenes, ray-traced and written to disk in the layouts of the real data sets."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from completesplat.data.toy.objects import write_objects
 from completesplat.data.toy.rooms import write_rooms
 from completesplat.errors import DataError
 
-KINDS = {"objects": write_objects, "rooms": write_rooms}
+KINDS: dict[str, Callable[..., Path]] = {
+    "objects": write_objects,
+    "minis": partial(write_objects, category="toy_minis"),
+    "marked_minis": partial(write_objects, category="toy_marked_minis"),
+    "rooms": write_rooms,
+}
 
 
 def write(

@@ -16,8 +16,8 @@ from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.pictures.crop import cut_square, principal_square
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.disk import FORMAT_VERSION
-from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, draw_scene, render_frame
-from completesplat.data.toy.objects import CATEGORY
+from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame
+from completesplat.data.toy.objects import DRAW
 from completesplat.data.toy.raytracing import trace
 from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
@@ -63,17 +63,17 @@ Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "
 
 
 class ToyHiddenModes:
-    """The scenes of a store, the toy objects in `root`, with all their modes; see `KnowsHiddenModes.hidden_modes`.
+    """The scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
 
-    Of what `choose` gives for a sequence the reference counts.
+    `folder` is that of their category, one of `DRAW`. Of what `choose` gives for a sequence the reference counts.
 
     Raises:
-        DataError: `root` holds no complete set that was written by this version.
+        DataError: `folder` holds no complete set that was written by this version.
     """
 
     def __init__(
         self,
-        root: Path,
+        folder: Path,
         store: SceneStore,
         choose: Callable[[PosedSequence], Choice],
         image_size: int,
@@ -85,7 +85,7 @@ class ToyHiddenModes:
         self.image_size = image_size
         self.views = views
         self.spread_views = spread_views
-        self.folder = root / CATEGORY
+        self.folder = folder
         description = self.folder / "toy.json"
         if not description.is_file():
             raise DataError("no toy.json: hidden modes need toy objects as they were written", str(self.folder))
@@ -117,14 +117,13 @@ class ToyHiddenModes:
         if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
             raise self._other_set(name)
         hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
-        colors = tuple(PATCH_COLORS)
-        # `draw_scene` chooses among the colours uniformly, whatever else is in the scene.
-        chances = torch.full((len(colors),), 1 / len(colors))
-        return HiddenModes(scene, views, truths, region, chances, torch.stack(hidden), colors, true_mode)
+        chances = torch.tensor(toy.chances, dtype=torch.float32)
+        return HiddenModes(scene, views, truths, region, chances, torch.stack(hidden), tuple(PATCH_COLORS), true_mode)
 
     def _drawn_again(self, name: str) -> ToyScene:
         number, _, family = name.partition("_")
-        scene = draw_scene(np.random.default_rng([self.seed, int(number)]), self.frames) if number.isdigit() else None
+        draw = DRAW[self.folder.name]
+        scene = draw(np.random.default_rng([self.seed, int(number)]), self.frames) if number.isdigit() else None
         if scene is None or scene.family != family:
             raise self._other_set(name)
         return scene

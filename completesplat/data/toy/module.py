@@ -8,7 +8,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.objects import CATEGORY, SUBSET, write_objects
+from completesplat.data.toy.objects import SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
 
 
@@ -17,8 +17,9 @@ class ToyObjectsDataModule(CO3DDataModule):
 
     Scenes that are already there are taken as they are, however many they are.
 
-    `scenes`, `frames` and `data_seed` are of what to make; the others are settings of `CO3DDataModule`. `depth_before`
-    is closer than there, as in `conf/data/toy_objects.yaml`: a model knows the depth range that it was trained with.
+    `category` is a key of `DRAW`; `scenes`, `frames` and `data_seed` are of what to make; the others are settings of
+    `CO3DDataModule`. `depth_before` is closer than there, as in `conf/data/toy_objects.yaml`: a model knows the depth
+    range that it was trained with.
     """
 
     def __init__(
@@ -27,22 +28,24 @@ class ToyObjectsDataModule(CO3DDataModule):
         scenes: int = 400,
         frames: int = 24,
         data_seed: int = 0,
+        category: str = "toy_objects",
         subset: str | None = SUBSET,
         depth_before: float = 1.0,
         **reading: Any,
     ) -> None:
-        super().__init__(root, CATEGORY, subset, depth_before=depth_before, **reading)
+        super().__init__(root, category, subset, depth_before=depth_before, **reading)
         self.scenes = scenes
         self.frames = frames
         self.data_seed = data_seed
 
     def describe(self) -> dict[str, str | None]:
-        return super().describe() | {"data_set": CATEGORY}
+        return super().describe() | {"data_set": self.category}
 
     def prepare_data(self) -> None:
         """Write the scenes unless a complete set is there (its description is written last)."""
-        if not is_packed(self.root) and not (self.root / CATEGORY / "toy.json").is_file():
-            write_objects(self.root, self.scenes, self.frames, self.image_size, self.data_seed)
+        if not is_packed(self.root) and not (self.root / self.category / "toy.json").is_file():
+            numbers = self.scenes, self.frames, self.image_size, self.data_seed
+            write_objects(self.root, *numbers, category=self.category)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
         """The test scenes with every colour that the patch on the back could have had; see `KnowsHiddenModes`.
@@ -52,7 +55,7 @@ class ToyObjectsDataModule(CO3DDataModule):
         """
         store = self.store("test")
         choose = partial(self.evaluation_views, split="test")
-        return ToyHiddenModes(self.root, store, choose, self.image_size, views, spread_views)
+        return ToyHiddenModes(self.root / self.category, store, choose, self.image_size, views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):

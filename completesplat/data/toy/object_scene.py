@@ -122,7 +122,7 @@ def plain(shade: Array) -> Look:
     return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
 
 
-def _ball(center: Point, half_sizes: object, look: Look, axes: Array | None = None) -> Part:
+def ball(center: Point, half_sizes: object, look: Look, axes: Array | None = None) -> Part:
     sizes = np.broadcast_to(np.asarray(half_sizes, dtype=np.float64), 3)
     return Part(ELLIPSOID, np.array(center, dtype=np.float64), sizes, np.eye(3) if axes is None else axes, 0.0, *look)
 
@@ -144,20 +144,18 @@ def bear(rng: np.random.Generator) -> Blueprint:
     top = tall + 0.7 * skull
     ear = rng.uniform(0.08, 0.13)
     parts = [
-        _ball((0, 0, 0), (wide, tall, deep), fur),
-        _ball((0, -0.04, 0.09), (0.72 * wide, 0.74 * tall, 0.82 * deep), light),
-        _ball((0, top, 0.04), skull, (fur[0], np.array([PLAIN, 0.0, 0.0]))),
-        _ball((0, top - 0.28 * skull, 0.04 + 0.85 * skull), (0.48 * skull, 0.36 * skull, 0.4 * skull), light),
-        _ball((0, top - 0.16 * skull, 0.04 + 1.22 * skull), 0.15 * skull, plain(DARK)),
+        ball((0, 0, 0), (wide, tall, deep), fur),
+        ball((0, -0.04, 0.09), (0.72 * wide, 0.74 * tall, 0.82 * deep), light),
+        ball((0, top, 0.04), skull, (fur[0], np.array([PLAIN, 0.0, 0.0]))),
+        ball((0, top - 0.28 * skull, 0.04 + 0.85 * skull), (0.48 * skull, 0.36 * skull, 0.4 * skull), light),
+        ball((0, top - 0.16 * skull, 0.04 + 1.22 * skull), 0.15 * skull, plain(DARK)),
     ]
     for side in (-1, 1):
         parts += [
-            _ball((side * 0.38 * skull, top + 0.25 * skull, 0.04 + 0.87 * skull), 0.14 * skull, plain(DARK)),
-            _ball((side * 0.75 * skull, top + 0.75 * skull, 0.02), (ear, ear, 0.6 * ear), paint.detail()),
+            ball((side * 0.38 * skull, top + 0.25 * skull, 0.04 + 0.87 * skull), 0.14 * skull, plain(DARK)),
+            ball((side * 0.75 * skull, top + 0.75 * skull, 0.02), (ear, ear, 0.6 * ear), paint.detail()),
             _arm(side, wide, tall, rng, paint),
-            _ball(
-                (side * 0.62 * wide, -0.85 * tall, 0.75 * deep), (0.13, 0.13, rng.uniform(0.2, 0.28)), paint.detail()
-            ),
+            ball((side * 0.62 * wide, -0.85 * tall, 0.75 * deep), (0.13, 0.13, rng.uniform(0.2, 0.28)), paint.detail()),
         ]
     return Blueprint("bear", tuple(parts), patched_part=0, patch_heights=(-0.45, 0.55))
 
@@ -168,7 +166,7 @@ def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _
     length = rng.uniform(0.2, 0.27)
     shoulder = np.array([side * 0.88 * wide, 0.42 * tall, 0.05])
     center = shoulder - axes @ np.array([0, 0.8 * length, 0])
-    return _ball((center[0], center[1], center[2]), (0.1, length, 0.1), paint.detail(), axes)
+    return ball((center[0], center[1], center[2]), (0.1, length, 0.1), paint.detail(), axes)
 
 
 def hydrant(rng: np.random.Generator) -> Blueprint:
@@ -182,7 +180,7 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
         _frustum((0, 0, 0), radius, half, coat, taper=rng.uniform(-0.15, 0.0)),
         _frustum((0, -half, 0), 1.4 * radius, 0.05, ring),
         _frustum((0, half, 0), 1.2 * radius, 0.045, ring),
-        _ball((0, half + 0.02, 0), (1.02 * radius, rng.uniform(0.8, 1.1) * radius, 1.02 * radius), paint.body()),
+        ball((0, half + 0.02, 0), (1.02 * radius, rng.uniform(0.8, 1.1) * radius, 1.02 * radius), paint.body()),
         _frustum((0, half + 0.95 * radius, 0), 0.3 * radius, 0.3 * radius, paint.detail(), taper=-0.15),
         _frustum((0, 0.6 * outlets, radius + 0.4 * reach), 0.6 * radius, reach, coat, axis="z"),
         _frustum((0, 0.6 * outlets, radius + 1.5 * reach), 0.66 * radius, 0.35 * reach, paint.detail(), axis="z"),
@@ -213,10 +211,14 @@ UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class ToyScene:
-    """A scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world."""
+    """A scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world.
+
+    `chances` are the probabilities of `PATCH_COLORS`, given all but the patch.
+    """
 
     family: str
     patch_color: str
+    chances: Array
     geometry: Geometry
     surroundings: Surroundings
     patch: Patch
@@ -232,22 +234,42 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     """A random scene seen by `frames` cameras, one full turn; the patch faces away from the first of them."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
     yaw = rng.uniform(0, 2 * np.pi)
-    cameras = _orbit(rng, frames, start=yaw + rng.uniform(-0.8, 0.8))
+    cameras = orbit(rng, frames, start=yaw + rng.uniform(-0.8, 0.8))
     away = cameras[0, :3, 3] * np.array([-1, 0, -1])
+    chances = np.full(len(PATCH_COLORS), 1 / len(PATCH_COLORS))
     name = str(rng.choice(list(PATCH_COLORS)))
-    facing, heights = away / np.linalg.norm(away), np.array(blueprint.patch_heights)
-    patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights)
-    surroundings = _surroundings(rng)
+    patch = patch_of(blueprint, away / np.linalg.norm(away), name)
+    return placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, chances)
+
+
+def patch_of(blueprint: Blueprint, facing: Array, color_name: str) -> Patch:
+    """The hidden patch, on the side of a horizontal direction."""
+    return Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[color_name]), np.array(blueprint.patch_heights))
+
+
+def placed(
+    rng: np.random.Generator,
+    blueprint: Blueprint,
+    yaw: float,
+    cameras: Array,
+    surroundings: Surroundings,
+    patch: Patch,
+    patch_color: str,
+    chances: Array,
+) -> ToyScene:
+    """The scene of an object that is turned by `yaw`, centred, and scaled to `OBJECT_HALF_SIZE`."""
     parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3)) for part in blueprint.parts)
     points, point_colors = _surface(rng, parts, surroundings, patch)
     center = points.mean(axis=0)
     scale = OBJECT_HALF_SIZE / np.abs(points - center).max()
     points = scale * (points - center)
+    ground = -np.inf if surroundings.plain else float(points[:, 1].min())
     return ToyScene(
         family=blueprint.family,
-        patch_color=name,
+        patch_color=patch_color,
+        chances=chances,
         geometry=geometry(tuple(part.moved(np.eye(3), -center, scale) for part in parts)),
-        surroundings=surroundings._replace(ground=float(points[:, 1].min())),
+        surroundings=surroundings._replace(ground=ground),
         patch=patch,
         points=points,
         point_colors=point_colors,
@@ -280,7 +302,7 @@ def _camera_rays(fov_degrees: float, size: int) -> Array:
     return units.reshape(size * size, SAMPLES**2, 3)
 
 
-def _orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
+def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
     """`camera_to_world` of evenly spaced, jittered cameras that look about at the object's centre."""
     azimuth = start + 2 * np.pi * (np.arange(frames) + rng.uniform(-0.25, 0.25, frames)) / frames
     azimuth[0] = start
@@ -306,6 +328,7 @@ def _surroundings(rng: np.random.Generator) -> Surroundings:
         dome_radius=DOME_RADIUS,
         hue=hue,
         turn=rng.uniform(0, 2 * np.pi),
+        plain=False,
         light=np.array([level * np.sin(azimuth), height * 0.9, level * np.cos(azimuth)]),
         ambient=rng.uniform(0.5, 0.65),
     )

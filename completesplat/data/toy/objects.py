@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,19 +12,27 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from completesplat.data.toy.disk import in_processes, write_once
+from completesplat.data.toy.mini_scene import draw_mini
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
 from completesplat.data.toy.raytracing import Array
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
 TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
 FRAMES_PER_SECOND = 10.0
-CATEGORY = "toy_objects"
+DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
+    "toy_objects": draw_scene,
+    "toy_minis": draw_mini,
+    "toy_marked_minis": partial(draw_mini, marked=True),
+}
+"""Categories, and what draws their scenes: (random generator, number of frames) -> scene."""
 SUBSET = "fewview_train"
 
 Annotations = tuple[str, list[dict[str, Any]], dict[str, Any]]
 
 
-def _write_frame(category: Path, name: str, scene: ToyScene, frame: int, size: int, split: str) -> dict[str, Any]:
+def _write_frame(
+    folder: Path, category: str, name: str, scene: ToyScene, frame: int, size: int, split: str
+) -> dict[str, Any]:
     stem = f"frame{frame + 1:06d}"
     files = {
         "image": f"{name}/images/{stem}.jpg",
@@ -33,12 +42,12 @@ def _write_frame(category: Path, name: str, scene: ToyScene, frame: int, size: i
     }
     image, coverage, depth = render_frame(scene, frame, size)
     picture, mask = _to_bytes(image), _to_bytes(coverage)
-    Image.fromarray(picture).save(category / files["image"], quality=95, subsampling=0)
-    Image.fromarray(mask).save(category / files["mask"])
+    Image.fromarray(picture).save(folder / files["image"], quality=95, subsampling=0)
+    Image.fromarray(mask).save(folder / files["mask"])
     # A 16-bit picture whose bits are float16, in units of `scale_adjustment`: this is how CO3D stores depth.
-    Image.fromarray(depth.astype(np.float16).view(np.uint16)).save(category / files["depth"])
-    Image.fromarray(np.full_like(mask, 255)).save(category / files["depth_mask"])
-    paths = {key: f"{CATEGORY}/{path}" for key, path in files.items()}
+    Image.fromarray(depth.astype(np.float16).view(np.uint16)).save(folder / files["depth"])
+    Image.fromarray(np.full_like(mask, 255)).save(folder / files["depth_mask"])
+    paths = {key: f"{category}/{path}" for key, path in files.items()}
     return {
         "sequence_name": name,
         "frame_number": frame,
@@ -78,24 +87,31 @@ def _write_point_cloud(path: Path, scene: ToyScene) -> None:
 
 
 def write_objects(
-    out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
+    out: Path,
+    scenes: int,
+    frames: int,
+    size: int,
+    seed: int,
+    workers: int | None = None,
+    progress: bool = True,
+    category: str = "toy_objects",
 ) -> Path:
     """Write `scenes` sequences of `frames` square pictures with masks, depth, point clouds and annotations.
 
     The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
     family and the colour of the patch on the back. See `write_once`, which takes the numbers; `workers` are processes
-    (by default one a core). Returns the category's folder, `out`/toy_objects.
+    (by default one a core). Returns the folder of the category (a key of `DRAW`).
 
     Raises:
         DataError: a number that is too small, or a category folder with other content.
     """
 
-    def fill(category: Path) -> None:
-        write = partial(_write_scene, category, frames, size, seed)
-        written = in_processes(write, _splits(scenes), workers, "Rendering toy objects", progress)
-        _write_lists(category, list(written))
+    def fill(folder: Path) -> None:
+        write = partial(_write_scene, folder, category, frames, size, seed)
+        written = in_processes(write, _splits(scenes), workers, f"Rendering {category}", progress)
+        _write_lists(folder, list(written))
 
-    return write_once(out / CATEGORY, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
+    return write_once(out / category, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
 
 
 def _splits(scenes: int) -> list[str]:
@@ -105,18 +121,18 @@ def _splits(scenes: int) -> list[str]:
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
-def _write_scene(category: Path, frames: int, size: int, seed: int, index: int, split: str) -> Annotations:
+def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, index: int, split: str) -> Annotations:
     """One sequence, from a random generator of its own; returns its split and annotations."""
-    scene = draw_scene(np.random.default_rng([seed, index]), frames)
+    scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     name = f"{index:05d}_{scene.family}"
     for folder in ("images", "masks", "depths", "depth_masks"):
-        (category / name / folder).mkdir(parents=True)
-    annotations = [_write_frame(category, name, scene, frame, size, split) for frame in range(frames)]
-    _write_point_cloud(category / name / "pointcloud.ply", scene)
+        (root / name / folder).mkdir(parents=True)
+    annotations = [_write_frame(root, category, name, scene, frame, size, split) for frame in range(frames)]
+    _write_point_cloud(root / name / "pointcloud.ply", scene)
     hidden = {"family": scene.family, "patch_color": scene.patch_color}
-    (category / name / "toy.json").write_text(json.dumps(hidden) + "\n")
-    cloud = {"path": f"{CATEGORY}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": len(scene.points)}
-    sequence = {"sequence_name": name, "category": CATEGORY, "video": None, "point_cloud": cloud}
+    (root / name / "toy.json").write_text(json.dumps(hidden) + "\n")
+    cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": len(scene.points)}
+    sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud}
     return split, annotations, sequence | {"viewpoint_quality_score": 1.0}
 
 

@@ -35,7 +35,7 @@ class Surroundings(NamedTuple):
     """Ground plane at height `ground` (two colours, pattern), dome (palette) and light.
 
     The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase: a law shared by all scenes,
-    so that what lies behind a camera can partly be inferred from what lies in front of it.
+    so that what lies behind a camera can partly be inferred from what lies in front of it. A `plain` dome is grey.
     """
 
     ground: float
@@ -44,6 +44,7 @@ class Surroundings(NamedTuple):
     dome_radius: float
     hue: float
     turn: float
+    plain: bool
     light: Array
     ambient: float
 
@@ -213,6 +214,8 @@ def _ground_color(around, x, z):
 
 @inlined
 def _dome_color(around, x, y, z):
+    if around.plain:
+        return 0.5, 0.5, 0.5
     cos_turn, sin_turn = math.cos(around.turn), math.sin(around.turn)
     level = math.sqrt(x * x + z * z) + 1e-12
     sin, cos = (x * cos_turn - z * sin_turn) / level, (z * cos_turn + x * sin_turn) / level

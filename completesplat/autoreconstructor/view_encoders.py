@@ -1,0 +1,164 @@
+"""What the other views of a scene add to the posterior of its reference picture: q(h | reference, other views).
+
+The paper's posterior sees the reference picture alone, so that a latent cannot say what the picture hides. An encoder
+of views moves its moments by what the other views show; its last layer starts at zero, so that training starts from the
+paper's posterior. Skips always come from the reference picture. Other works that encode more than what they generate
+from: LN3Diff and GaussianAnything (6 and 8 views with Pluecker rays), TRELLIS (features of many renders).
+"""
+
+from collections.abc import Sequence
+
+import torch
+from diffusers.models.autoencoders import vae
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, rays_through
+from completesplat.scene import Views
+
+
+class PlaneSweep(nn.Module):
+    """Colours that the other views show along each of the reference's rays, at depths even in disparity.
+
+    A small network looks at a colour, the cosine between the two rays and the distance; a softmax over the views (which
+    learns which of them see the point) averages its features, so that the views' order and number do not matter. The
+    planes' features of a pixel and its own colour go through Stable Diffusion's encoder. All this starts at its second
+    level, at half the picture's resolution, which the latent's is not above: a quarter of the time.
+
+    Args:
+        planes: depths along each ray, from near to far.
+        features: of each plane.
+        channels, layers_per_block, latent_channels, norm_groups: of the encoder; levels as the autoreconstructor's.
+    """
+
+    def __init__(
+        self,
+        planes: int = 12,
+        features: int = 8,
+        channels: Sequence[int] = (128, 256, 512, 512),
+        layers_per_block: int = 2,
+        latent_channels: int = 4,
+        norm_groups: int = 32,
+    ) -> None:
+        super().__init__()
+        self.planes = planes
+        self.look = nn.Sequential(nn.Linear(5, 3 * features), nn.SiLU(), nn.Linear(3 * features, features + 1))
+        inputs = 3 + planes * features
+        self.network = _encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
+        _zero(self.network.conv_out)
+
+    def forward(
+        self, views: Views, depth_range: Float[Tensor, "batch 2"]
+    ) -> Float[Tensor, "batch moment latent_height latent_width"]:
+        """Views, the reference first and its frame as the world -> what to add to the moments."""
+        with torch.autocast(views.images.device.type, enabled=False):
+            found, seen = sweep(views, depth_range, self.planes)
+        looked = self.look(found)
+        hidden = torch.finfo(torch.float32).min * (~seen).float()
+        shares = (looked[..., :1].float() + hidden[..., None]).softmax(1) * seen.any(1, keepdim=True)[..., None]
+        features = (looked[..., 1:] * shares).sum(1)
+        planes = features.permute(0, 1, 4, 2, 3).flatten(1, 2)
+        own = nn.functional.avg_pool2d(views.images[:, 0], 2)
+        moments: Tensor = self.network(torch.cat([own * 2 - 1, planes], 1))
+        return moments.float()
+
+
+def sweep(
+    views: Views, depth_range: Float[Tensor, "batch 2"], planes: int
+) -> tuple[Float[Tensor, "batch other plane _ _ 5"], Bool[Tensor, "batch other plane _ _"]]:
+    """What the other views show at points along the rays between each four pixels of the reference.
+
+    Returns:
+        Colour (-1 to 1), cosine between the two rays, and distance over the far depth; which points lie in the picture.
+    """
+    reference, others = views[:, 0], views[:, 1:]
+    near, far = depth_range[:, :1], depth_range[:, 1:]
+    share = torch.linspace(0, 1, planes, device=near.device)
+    depth = 1 / (1 / near + share * (1 / far - 1 / near))
+    batch, count, _, height, width = others.images.shape
+    corners = pixel_centers(height // 2, width // 2, near.device).flatten(0, 1) * 2
+    rays = rays_through(reference.cameras.intrinsics, corners).view(batch, height // 2, width // 2, 3)
+    points = depth[:, :, None, None, None] * rays[:, None]
+    flat = points.flatten(1, 3)[:, None]
+    pixels, ahead = project(others.cameras, flat)
+    grid = (pixels / pixels.new_tensor([width, height]) * 2 - 1).clamp(-2, 2).nan_to_num(2)
+    sampled = nn.functional.grid_sample(others.images.flatten(0, 1), grid.flatten(0, 1)[:, None], align_corners=False)
+    colors = sampled.view(batch, count, 3, -1).mT * 2 - 1
+    offsets = flat - others.cameras.centers[:, :, None]
+    distance = offsets.norm(dim=-1, keepdim=True)
+    cosine = (nn.functional.normalize(flat, dim=-1) * offsets / distance.clamp(min=1e-6)).sum(-1, keepdim=True)
+    found = torch.cat([colors, cosine, distance / far[:, :, None, None]], -1)
+    seen = (grid.abs() <= 1).all(-1) & (ahead > 0.01 * near[:, :, None])
+    shape = batch, count, planes, height // 2, width // 2
+    return found.view(*shape, 5), seen.view(shape)
+
+
+class CrossAttention(nn.Module):
+    """The reference's tokens attend to those of all views, which are pictures with Pluecker rays.
+
+    Args:
+        width, blocks, heads: of the transformer.
+        channels, layers_per_block, latent_channels, norm_groups: of the encoder that makes tokens; levels as the
+            autoreconstructor's.
+    """
+
+    def __init__(
+        self,
+        width: int = 256,
+        blocks: int = 4,
+        heads: int = 8,
+        channels: Sequence[int] = (128, 256, 512, 512),
+        layers_per_block: int = 2,
+        latent_channels: int = 4,
+        norm_groups: int = 32,
+    ) -> None:
+        super().__init__()
+        self.network = _encoder(9, width, channels, layers_per_block, norm_groups)
+        layer = nn.TransformerDecoderLayer(
+            width, heads, 4 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
+        )
+        self.blocks = nn.TransformerDecoder(layer, blocks, nn.LayerNorm(width))
+        self.out = nn.Linear(width, 2 * latent_channels)
+        _zero(self.out)
+
+    def forward(
+        self, views: Views, depth_range: Float[Tensor, "batch 2"]
+    ) -> Float[Tensor, "batch moment latent_height latent_width"]:
+        """Views, the reference first and its frame as the world -> what to add to the moments."""
+        batch, count = views.images.shape[:2]
+        rays = pluecker(views.cameras) / depth_range[:, 1:, None, None, None].sqrt()
+        maps = self.network(torch.cat([views.images * 2 - 1, rays], 2).flatten(0, 1))
+        tokens = maps.flatten(2).mT.reshape(batch, count, -1, maps.shape[1])
+        moments: Tensor = self.out(self.blocks(tokens[:, 0], tokens.flatten(1, 2))).mT
+        return moments.reshape(batch, -1, *maps.shape[-2:]).float()
+
+
+def pluecker(cameras: Cameras) -> Float[Tensor, "*batch 6 height width"]:
+    """Unit directions and moments (origin x direction) of all pixels' rays in the cameras' world."""
+    with torch.autocast(cameras.intrinsics.device.type, enabled=False):
+        rotation = cameras.camera_to_world[..., :3, :3]
+        directions = nn.functional.normalize(
+            torch.einsum("...ij,...hwj->...hwi", rotation, pixel_rays(cameras)), dim=-1
+        )
+        origins = cameras.centers[..., None, None, :].expand_as(directions)
+        return torch.cat([directions, torch.linalg.cross(origins, directions)], -1).movedim(-1, -3)
+
+
+def _encoder(
+    inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
+) -> vae.Encoder:
+    return vae.Encoder(
+        in_channels=inputs,
+        out_channels=outputs,
+        down_block_types=("DownEncoderBlock2D",) * len(channels),
+        block_out_channels=tuple(channels),
+        layers_per_block=layers_per_block,
+        norm_num_groups=norm_groups,
+        double_z=False,
+    )
+
+
+@torch.no_grad()
+def _zero(layer: nn.Module) -> None:
+    for parameter in layer.parameters():
+        parameter.zero_()

@@ -1,0 +1,52 @@
+"""Minis: an ellipsoid with a nose on plain grey, the smallest scenes of which it is known what their back could be.
+
+The patch lies opposite the nose, so that a picture of the nose tells where it is and not which of four colours it has.
+On marked minis the nose is light or dark, which decides how probable each colour is: a model that learns how often the
+colours occur, and not when, is found out.
+"""
+
+import numpy as np
+
+from completesplat.data.toy.object_scene import (
+    PATCH_COLORS,
+    Blueprint,
+    ToyScene,
+    ball,
+    color,
+    orbit,
+    patch_of,
+    placed,
+    plain,
+)
+from completesplat.data.toy.raytracing import Surroundings
+
+EVEN = np.full(len(PATCH_COLORS), 0.25)
+LIGHT, DARK = np.full(3, 0.97), np.full(3, 0.05)
+CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
+"""Of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
+
+FROM_THE_FRONT = 0.35
+"""The first camera sees the nose from an azimuth that differs by at most this (radians): it never sees the patch."""
+
+
+def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
+    """A random mini seen by `frames` cameras, one full turn that starts in front of the nose."""
+    mark = str(rng.choice(list(CHANCES))) if marked else "light"
+    chances = CHANCES[mark] if marked else EVEN
+    half_sizes = rng.uniform(0.36, 0.55, size=3)
+    body = plain(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
+    nose = ball((0, 0, half_sizes[2]), 0.13, plain(LIGHT if mark == "light" else DARK))
+    blueprint = Blueprint("mini", (ball((0, 0, 0), half_sizes, body), nose), patched_part=0, patch_heights=(-0.85, 0.4))
+    yaw = rng.uniform(0, 2 * np.pi)
+    cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    name = str(rng.choice(list(PATCH_COLORS), p=chances))
+    patch = patch_of(blueprint, -np.array([np.sin(yaw), 0, np.cos(yaw)]), name)
+    return placed(rng, blueprint, yaw, cameras, _grey(rng), patch, name, chances)
+
+
+def _grey(rng: np.random.Generator) -> Surroundings:
+    """No ground, a plain dome, a light from above."""
+    azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 0.9)
+    level = np.sqrt(1 - height**2)
+    light = np.array([level * np.sin(azimuth), height, level * np.cos(azimuth)])
+    return Surroundings(-np.inf, np.zeros((2, 3)), np.zeros(3), 3.5, 0.0, 0.0, True, light, rng.uniform(0.6, 0.7))

@@ -1,0 +1,116 @@
+"""Posteriors that see other views: at step 0 the paper's; poses matter, order does not."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.autoreconstructor.reconstructor import Reconstructor
+from completesplat.autoreconstructor.view_encoders import CrossAttention, PlaneSweep, pluecker, sweep
+from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
+from completesplat.scene import Views
+from completesplat.splatter_image import Parameterization
+
+SIZE, VIEWS = 16, 4
+SIZES = {"channels": (8, 8), "layers_per_block": 1, "norm_groups": 4}
+DEPTHS = torch.tensor([[1.0, 4.0]])
+ENCODERS = {
+    "plane_sweep": lambda: PlaneSweep(planes=3, features=4, **SIZES),
+    "cross_attention": lambda: CrossAttention(width=16, blocks=1, heads=2, **SIZES),
+}
+
+
+def orbit(count=VIEWS):
+    angles = torch.linspace(0, 1.2, count)
+    eyes = 2.5 * torch.stack([angles.sin(), torch.zeros(count), -angles.cos()], -1)
+    poses = look_at(eyes, torch.zeros(count, 3), torch.tensor([0.0, -1.0, 0.0]))
+    cameras = Cameras(poses, pinhole(40.0, SIZE).expand(count, 3, 3), (SIZE, SIZE))
+    return cameras.relative_to(cameras[:1])[None]
+
+
+def views():
+    images = torch.rand(1, VIEWS, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    return Views(images, orbit(), torch.ones(1, VIEWS, 1, SIZE, SIZE))
+
+
+@pytest.fixture(params=ENCODERS)
+def model(request):
+    torch.manual_seed(0)
+    reconstructor = Reconstructor(Parameterization(), **SIZES)
+    return VariationalAutoReconstructor(Encoder(**SIZES), reconstructor, view_encoder=ENCODERS[request.param]()).eval()
+
+
+def trained(model):
+    """As after some training: nothing is zero any more."""
+    with torch.no_grad():
+        for parameter in model.view_encoder.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape))
+    return model
+
+
+@torch.no_grad()
+def mean(model, seen):
+    return model.posterior(seen.images[:, 0], seen, DEPTHS)[0].mean
+
+
+def test_at_step_0_the_posterior_is_the_papers(model):
+    seen = views()
+    own, _ = model.encoder(seen.images[:, 0])
+    found, _ = model.posterior(seen.images[:, 0], seen, DEPTHS)
+    assert torch.equal(found.mean, own.mean)
+    assert torch.equal(found.log_variance, own.log_variance)
+
+
+def test_the_encoder_of_views_learns_from_step_0_on(model):
+    seen = views()
+    model.posterior(seen.images[:, 0], seen, DEPTHS)[0].mean.square().sum().backward()
+    assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in model.view_encoder.parameters())
+
+
+def test_what_another_view_shows_moves_the_posterior(model):
+    seen = views()
+    changed = replace(seen, images=torch.cat([seen.images[:, :3], 1 - seen.images[:, 3:]], 1))
+    model = trained(model)
+    assert not torch.allclose(mean(model, seen), mean(model, changed), atol=1e-4)
+
+
+def test_poses_matter_and_the_order_of_the_views_does_not(model):
+    seen, model = views(), trained(model)
+    order = [0, 3, 1, 2]
+    torch.testing.assert_close(mean(model, seen[:, order]), mean(model, seen), atol=1e-4, rtol=1e-4)
+    shuffled = replace(seen, cameras=seen.cameras[:, order])
+    assert not torch.allclose(mean(model, shuffled), mean(model, seen), atol=1e-4)
+
+
+def test_with_the_reference_alone_the_posterior_is_the_pictures(model):
+    seen, model = views(), trained(model)
+    own, _ = model.encoder(seen.images[:, 0])
+    assert torch.equal(mean(model, seen[:, :1]), own.mean)
+
+
+def test_a_sweep_finds_the_colours_of_points_where_other_views_see_them():
+    """Pictures whose colours are their own pixels' coordinates."""
+    seen = views()
+    columns = (torch.arange(SIZE) + 0.5).expand(SIZE, SIZE) / SIZE
+    seen = replace(
+        seen, images=torch.stack([columns, columns.T, torch.zeros_like(columns)]).expand(1, VIEWS, 3, -1, -1)
+    )
+    found, inside = sweep(seen, DEPTHS, planes=3)
+    # The middle plane lies at the harmonic mean of near and far, 1.6; its point (3, 4) between pixels 6 and 7, 8 and 9.
+    ray = torch.tensor([(7 - SIZE / 2), (9 - SIZE / 2), seen.cameras.intrinsics[0, 0, 0, 0]])
+    point = 1.6 * ray / ray[2]
+    places, _ = project(seen.cameras[0, 1:], point.expand(VIEWS - 1, 1, 3))
+    for other, place in enumerate(places[:, 0]):
+        if inside[0, other, 1, 4, 3] and (place > 1).all() and (place < SIZE - 1).all():
+            torch.testing.assert_close(found[0, other, 1, 4, 3, :2], place / SIZE * 2 - 1, atol=1e-4, rtol=1e-4)
+    assert inside[0, :, 1, 4, 3].any()
+    assert found[..., 3].abs().max() <= 1 + 1e-5
+
+
+def test_rays_in_pluecker_coordinates_contain_their_origin():
+    rays = pluecker(orbit())
+    directions, moments = rays[0, 2, :3, 4, 7], rays[0, 2, 3:, 4, 7]
+    torch.testing.assert_close(directions.norm(), torch.tensor(1.0))
+    torch.testing.assert_close(torch.linalg.cross(orbit().centers[0, 2], directions), moments)

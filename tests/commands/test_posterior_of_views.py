@@ -1,0 +1,112 @@
+"""`posterior=views` through both stages: trained, cached, tested, and completed from one picture."""
+
+import csv
+
+import pytest
+from conftest import made
+from support import SMALL, refused, strict_json
+
+LADDER = {"model", "posterior_mean", "posterior_samples", "other_scene", "mean_predictor", "true_sampler"}
+SCORES = {
+    "coverage",
+    "total_variation",
+    "sharpness",
+    "rejected",
+    "energy_hidden",
+    "energy_visible",
+    "scenes",
+    "samples",
+}
+SIZES = [
+    *SMALL,
+    "data.targets=2",
+    "autoreconstructor.encoder.channels=[8,16]",
+    "autoreconstructor.encoder.norm_groups=4",
+]
+
+
+@pytest.fixture(scope="module")
+def runs(built_once):
+    def train(folder):
+        made(folder / "data", "data", "toy", "kind=minis", "scenes=4", "frames=8", "size=32", "workers=1")
+        fit = ["fit", f"data.root={folder / 'data'}", *SIZES]
+        made(folder / "var", *fit, "experiment=toy_minis_var")
+        stage1 = f"model.autoreconstructor_checkpoint={folder / 'var/checkpoints/last.ckpt'}"
+        stage2 = ["experiment=toy_minis_diffusion", stage1, "sampler.steps=2", "conditioning.channels=[8,16]"]
+        made(folder / "diffusion", *fit, *stage2)
+
+    return built_once("minis", train)
+
+
+def column(run, name):
+    rows = csv.DictReader((run / "metrics.csv").open())
+    return [float(row[name]) for row in rows if row.get(name)]
+
+
+def test_validation_tells_what_a_perfect_second_stage_could_reach(runs):
+    assert column(runs / "var", "val/psnr_posterior")
+    assert column(runs / "var", "val/psnr_novel")
+
+
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_hidden_modes_have_every_rung_of_the_ladder(runs, stage, command, tmp_path):
+    settings = ["evaluation=hidden_modes", "evaluation.samples=2", "trainer.accelerator=cpu", f"out={tmp_path / 'out'}"]
+    assert command("test", f"ckpt={runs / stage / 'checkpoints/last.ckpt'}", *settings).status == 0
+    results = strict_json(tmp_path / "out/hidden_modes.json")
+    assert set(results) == LADDER | {"reference_only"}
+    assert all(set(row) == SCORES for row in results.values())
+    # Of what all modes share the mean is certain; of the patch it is nobody.
+    assert results["mean_predictor"]["energy_visible"] == pytest.approx(0, abs=0.02)
+    assert results["mean_predictor"]["energy_hidden"] > 0.02
+
+
+def test_a_test_of_several_samples_has_proper_scores_of_what_is_hidden(runs, command, tmp_path):
+    settings = ["evaluation.scoring.samples=2", "trainer.accelerator=cpu", f"out={tmp_path / 'out'}"]
+    assert command("test", f"ckpt={runs / 'diffusion/checkpoints/last.ckpt'}", *settings).status == 0
+    results = strict_json(tmp_path / "out/metrics.json")
+    for region in ("full", "hidden"):
+        assert results["model"][region]["novel"]["energy"] > 0
+        assert results["model"][region]["novel"]["crps"] > 0
+        assert sum(results["mean_of_k"][f"ranks_{region}"]) == pytest.approx(1)
+
+
+def test_the_cache_holds_latents_of_views_and_trains(runs, command, tmp_path):
+    store, cache = tmp_path / "store", tmp_path / "cache"
+    given = ["data=toy_minis", f"data.root={runs / 'data'}", "data.image_size=32", "data.evaluation_targets=2"]
+    assert command("data", "prepare", *given, "workers=1", f"out={store}").status == 0
+    stage1 = runs / "var/checkpoints/last.ckpt"
+    override = f"overrides=['data.root={store}']"
+    assert command("data", "latents", f"ckpt={stage1}", override, "views=3", f"out={cache}").status == 0
+    assert strict_json(cache / "manifest.json")["origin"]["views"] == 3
+    fit = ["fit", f"data.root={store}", *SIZES, "experiment=toy_minis_diffusion", "sampler.steps=2"]
+    fit += [
+        f"model.autoreconstructor_checkpoint={stage1}",
+        "conditioning.channels=[8,16]",
+        f"data.latent_cache={cache}",
+    ]
+    assert command(*fit, f"out={tmp_path / 'run'}", "test=false").status == 0
+
+
+def test_one_picture_is_completed(runs, command, tmp_path):
+    picture = sorted(runs.glob("data/*/*/images/*.jpg"))[0]
+    given = [
+        f"image={picture}",
+        f"weights={runs / 'diffusion/weights'}",
+        "samples=2",
+        f"out={tmp_path / 'out'}",
+        "video=false",
+    ]
+    assert command("predict", *given).status == 0
+    assert len(list((tmp_path / "out").rglob("*.ply"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("experiment", "targets", "reason"),
+    [("toy_minis_var", 1, "data.targets of 2 or more"), ("toy_minis_diffusion", 0, "set data.targets")],
+)
+def test_too_few_views_for_the_posterior_are_refused(runs, experiment, targets, reason, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    stage1 = f"model.autoreconstructor_checkpoint={runs / 'var/checkpoints/last.ckpt'}"
+    second = [stage1, "conditioning.channels=[8,16]"] if "diffusion" in experiment else []
+    given = [f"experiment={experiment}", f"data.root={runs / 'data'}", *SIZES, f"data.targets={targets}", *second]
+    assert reason in refused("fit", *given)
