@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 from diffusers.models.autoencoders import vae
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, rays_through
@@ -20,21 +20,19 @@ from completesplat.scene import Views
 class PlaneSweep(nn.Module):
     """Colours that the other views show along each of the reference's rays, at depths even in disparity.
 
-    A small network looks at a colour, the cosine between the two rays and the distance; a softmax over the views (which
-    learns which of them see the point) averages its features, so that the views' order and number do not matter. The
-    planes' features of a pixel and its own colour go through Stable Diffusion's encoder. All this starts at its second
-    level, at half the picture's resolution, which the latent's is not above: a quarter of the time.
+    At each depth there are two: of views that look along the ray, as the reference does, and of views that look against
+    it, which see the backs of things. Both are means over the views, weighted by how much they do so: the views' order
+    and number do not matter. With the reference's own colours they go through Stable Diffusion's encoder. All this
+    starts at its second level, at half the picture's resolution, which the latent's is not above.
 
     Args:
         planes: depths along each ray, from near to far.
-        features: of each plane.
         channels, layers_per_block, latent_channels, norm_groups: of the encoder; levels as the autoreconstructor's.
     """
 
     def __init__(
         self,
         planes: int = 12,
-        features: int = 8,
         channels: Sequence[int] = (128, 256, 512, 512),
         layers_per_block: int = 2,
         latent_channels: int = 4,
@@ -42,8 +40,7 @@ class PlaneSweep(nn.Module):
     ) -> None:
         super().__init__()
         self.planes = planes
-        self.look = nn.Sequential(nn.Linear(5, 3 * features), nn.SiLU(), nn.Linear(3 * features, features + 1))
-        inputs = 3 + planes * features
+        inputs = 3 + planes * 2 * 4
         self.network = _encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
         _zero(self.network.conv_out)
 
@@ -52,24 +49,24 @@ class PlaneSweep(nn.Module):
     ) -> Float[Tensor, "batch moment latent_height latent_width"]:
         """Views, the reference first and its frame as the world -> what to add to the moments."""
         with torch.autocast(views.images.device.type, enabled=False):
-            found, seen = sweep(views, depth_range, self.planes)
-        looked = self.look(found)
-        hidden = torch.finfo(torch.float32).min * (~seen).float()
-        shares = (looked[..., :1].float() + hidden[..., None]).softmax(1) * seen.any(1, keepdim=True)[..., None]
-        features = (looked[..., 1:] * shares).sum(1)
-        planes = features.permute(0, 1, 4, 2, 3).flatten(1, 2)
+            found = sweep(views, depth_range, self.planes)
         own = nn.functional.avg_pool2d(views.images[:, 0], 2)
-        moments: Tensor = self.network(torch.cat([own * 2 - 1, planes], 1))
+        moments: Tensor = self.network(torch.cat([own * 2 - 1, found.flatten(1, 3)], 1))
         return moments.float()
+
+
+SHARPNESS = 4.0
+"""Of the weights: a view at a right angle to another counts exp(-4) as much."""
 
 
 def sweep(
     views: Views, depth_range: Float[Tensor, "batch 2"], planes: int
-) -> tuple[Float[Tensor, "batch other plane _ _ 5"], Bool[Tensor, "batch other plane _ _"]]:
+) -> Float[Tensor, "batch plane side value height width"]:
     """What the other views show at points along the rays between each four pixels of the reference.
 
     Returns:
-        Colour (-1 to 1), cosine between the two rays, and distance over the far depth; which points lie in the picture.
+        Of views that look along the ray and of those that look against it: colour (-1 to 1; 0 where no view sees the
+        point), and the mean cosine between its ray and theirs.
     """
     reference, others = views[:, 0], views[:, 1:]
     near, far = depth_range[:, :1], depth_range[:, 1:]
@@ -77,20 +74,20 @@ def sweep(
     depth = 1 / (1 / near + share * (1 / far - 1 / near))
     batch, count, _, height, width = others.images.shape
     corners = pixel_centers(height // 2, width // 2, near.device).flatten(0, 1) * 2
-    rays = rays_through(reference.cameras.intrinsics, corners).view(batch, height // 2, width // 2, 3)
-    points = depth[:, :, None, None, None] * rays[:, None]
-    flat = points.flatten(1, 3)[:, None]
+    rays = rays_through(reference.cameras.intrinsics, corners)
+    flat = (depth[:, :, None, None] * rays[:, None]).flatten(1, 2)[:, None]
     pixels, ahead = project(others.cameras, flat)
     grid = (pixels / pixels.new_tensor([width, height]) * 2 - 1).clamp(-2, 2).nan_to_num(2)
     sampled = nn.functional.grid_sample(others.images.flatten(0, 1), grid.flatten(0, 1)[:, None], align_corners=False)
     colors = sampled.view(batch, count, 3, -1).mT * 2 - 1
-    offsets = flat - others.cameras.centers[:, :, None]
-    distance = offsets.norm(dim=-1, keepdim=True)
-    cosine = (nn.functional.normalize(flat, dim=-1) * offsets / distance.clamp(min=1e-6)).sum(-1, keepdim=True)
-    found = torch.cat([colors, cosine, distance / far[:, :, None, None]], -1)
-    seen = (grid.abs() <= 1).all(-1) & (ahead > 0.01 * near[:, :, None])
-    shape = batch, count, planes, height // 2, width // 2
-    return found.view(*shape, 5), seen.view(shape)
+    toward = nn.functional.normalize(flat - others.cameras.centers[:, :, None], dim=-1)
+    cosine = (nn.functional.normalize(flat, dim=-1) * toward).sum(-1, keepdim=True)
+    seen = ((grid.abs() <= 1).all(-1) & (ahead > 0.01 * near[:, :, None]))[..., None]
+    hidden = torch.finfo(torch.float32).min * (~seen).float()
+    values = torch.cat([colors, cosine], -1)
+    sides = [(values * (sign * SHARPNESS * cosine + hidden).softmax(1)).sum(1) for sign in (1, -1)]
+    found = torch.stack(sides, -2) * seen.any(1)[..., None]
+    return found.view(batch, planes, height // 2, width // 2, 2, 4).permute(0, 1, 4, 5, 2, 3)
 
 
 class CrossAttention(nn.Module):

@@ -86,7 +86,7 @@ class ReconstructionModule(SceneModule):
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
         """A posterior that sees views is given a random number of the targets, more often many than few, never all."""
         targets = scenes.targets.images.shape[1]
-        others = int(torch.randint(targets, (2,)).max()) if self.sees_views else 0
+        others = int(torch.randint(1, targets, (2,)).max()) if self.sees_views else 0
         reconstruction = self(scenes, others)
         with torch.autocast(self.device.type, enabled=False):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

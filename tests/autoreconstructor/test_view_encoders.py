@@ -17,7 +17,7 @@ SIZE, VIEWS = 16, 4
 SIZES = {"channels": (8, 8), "layers_per_block": 1, "norm_groups": 4}
 DEPTHS = torch.tensor([[1.0, 4.0]])
 ENCODERS = {
-    "plane_sweep": lambda: PlaneSweep(planes=3, features=4, **SIZES),
+    "plane_sweep": lambda: PlaneSweep(planes=3, **SIZES),
     "cross_attention": lambda: CrossAttention(width=16, blocks=1, heads=2, **SIZES),
 }
 
@@ -91,22 +91,34 @@ def test_with_the_reference_alone_the_posterior_is_the_pictures(model):
 
 
 def test_a_sweep_finds_the_colours_of_points_where_other_views_see_them():
-    """Pictures whose colours are their own pixels' coordinates."""
-    seen = views()
+    """One other picture, whose colours are its own pixels' coordinates: it is all that either side sees."""
+    seen = views()[:, [0, 1]]
     columns = (torch.arange(SIZE) + 0.5).expand(SIZE, SIZE) / SIZE
-    seen = replace(
-        seen, images=torch.stack([columns, columns.T, torch.zeros_like(columns)]).expand(1, VIEWS, 3, -1, -1)
-    )
-    found, inside = sweep(seen, DEPTHS, planes=3)
+    seen = replace(seen, images=torch.stack([columns, columns.T, torch.zeros_like(columns)]).expand(1, 2, 3, -1, -1))
+    found = sweep(seen, DEPTHS, planes=3)
     # The middle plane lies at the harmonic mean of near and far, 1.6; its point (3, 4) between pixels 6 and 7, 8 and 9.
     ray = torch.tensor([(7 - SIZE / 2), (9 - SIZE / 2), seen.cameras.intrinsics[0, 0, 0, 0]])
     point = 1.6 * ray / ray[2]
-    places, _ = project(seen.cameras[0, 1:], point.expand(VIEWS - 1, 1, 3))
-    for other, place in enumerate(places[:, 0]):
-        if inside[0, other, 1, 4, 3] and (place > 1).all() and (place < SIZE - 1).all():
-            torch.testing.assert_close(found[0, other, 1, 4, 3, :2], place / SIZE * 2 - 1, atol=1e-4, rtol=1e-4)
-    assert inside[0, :, 1, 4, 3].any()
-    assert found[..., 3].abs().max() <= 1 + 1e-5
+    (place,), _ = project(seen.cameras[0, 1], point[None])
+    assert ((place > 1) & (place < SIZE - 1)).all()
+    toward = point - seen.cameras.centers[0, 1]
+    cosine = torch.nn.functional.cosine_similarity(point, toward, dim=0)
+    for side in (0, 1):
+        torch.testing.assert_close(found[0, 1, side, :2, 4, 3], place / SIZE * 2 - 1, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(found[0, 1, side, 3, 4, 3], cosine, atol=1e-4, rtol=1e-4)
+
+
+def test_the_sides_of_a_sweep_are_of_views_along_the_ray_and_against_it():
+    reference = Cameras(torch.eye(4), pinhole(40.0, SIZE), (SIZE, SIZE))
+    eyes = torch.tensor([[0.0, 0, -0.2], [0, 0, 5.0]])
+    others = look_at(eyes, torch.tensor([0.0, 0, 2.5]).expand(2, 3), torch.tensor([0.0, -1.0, 0.0]))
+    poses = torch.cat([reference.world_to_camera[None], others])[None]
+    cameras = Cameras(poses, reference.intrinsics.expand(1, 3, 3, 3), (SIZE, SIZE))
+    images = torch.tensor([0.5, 0.0, 1.0])[None, :, None, None, None].expand(1, 3, 3, SIZE, SIZE)
+    found = sweep(Views(images, cameras, torch.ones(1, 3, 1, SIZE, SIZE)), DEPTHS, planes=3)
+    along, against = found[0, 1, :, 0, SIZE // 4, SIZE // 4]
+    assert along < -0.99
+    assert against > 0.99
 
 
 def test_rays_in_pluecker_coordinates_contain_their_origin():
