@@ -38,6 +38,7 @@ class HiddenModesEvaluation(TypedDict):
 
 
 FORMATS = {"method": "", **dict.fromkeys(("coverage", "total_variation", "sharpness", "rejected"), ".3f")}
+FORMATS |= dict.fromkeys(("energy_hidden", "energy_visible"), ".4f")
 FORMATS |= {"scenes": "d", "samples": "d"}
 COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in FORMATS.items()]
 
@@ -85,7 +86,7 @@ def run(
     with finished(loggers):
         log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    Console(width=120).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
+    Console(width=140).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 

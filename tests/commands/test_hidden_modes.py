@@ -29,6 +29,7 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage):
         assert set(found) == FIGURES
         assert (found["scenes"], found["samples"]) == (1, 3)
         assert method in finished.out
+        assert f"{found['energy_hidden']:.4f}" in finished.out
     mean, true = results["mean_predictor"], results["true_sampler"]
     assert (mean["coverage"], mean["total_variation"], mean["rejected"]) == (0, 1, 1)
     assert (true["sharpness"], true["rejected"]) == (0, 0)
