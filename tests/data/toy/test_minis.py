@@ -20,20 +20,24 @@ def nose_is_dark(scene):
     return bool(np.median(grey) < 0.2)
 
 
+@pytest.fixture(scope="module")
+def marked():
+    return [draw_mini(np.random.default_rng([1, i]), 2, marked=True) for i in range(240)]
+
+
 @pytest.mark.parametrize("mark", CHANCES)
-def test_colours_of_marked_minis_come_as_often_as_the_nose_says(mark):
-    scenes = [draw_mini(np.random.default_rng([1, i]), 2, marked=True) for i in range(400)]
-    own = [scene for scene in scenes if np.array_equal(scene.chances, CHANCES[mark])]
-    assert 150 < len(own) < 250
+def test_colours_of_marked_minis_come_as_often_as_the_nose_says(mark, marked):
+    own = [scene for scene in marked if np.array_equal(scene.chances, CHANCES[mark])]
+    assert 80 < len(own) < 160
     assert all(nose_is_dark(scene) == (mark == "dark") for scene in own[:20])
     found = Counter(scene.patch_color for scene in own)
     shares = np.array([found[name] / len(own) for name in PATCH_COLORS])
-    # Three standard deviations of a share of 200 draws are 0.1.
-    np.testing.assert_allclose(shares, CHANCES[mark], atol=0.1)
+    # Three standard deviations of a share of 120 draws are 0.13.
+    np.testing.assert_allclose(shares, CHANCES[mark], atol=0.13)
 
 
 def test_the_front_does_not_tell_the_colour_and_the_back_does():
-    for i in range(20):
+    for i in range(5):
         scene = draw_mini(np.random.default_rng([2, i]), 24)
         pictures = [
             [render_frame(other, frame, 32)[0] for frame in (0, 12)]
