@@ -19,6 +19,21 @@ def recompute(block: nn.Module, *inputs: Any) -> Any:
     return block(*inputs)
 
 
+def vae_encoder(
+    inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
+) -> vae.Encoder:
+    """The network of Stable Diffusion's VAE encoder; its resolution halves between the levels."""
+    return vae.Encoder(
+        in_channels=inputs,
+        out_channels=outputs,
+        down_block_types=("DownEncoderBlock2D",) * len(channels),
+        block_out_channels=tuple(channels),
+        layers_per_block=layers_per_block,
+        norm_num_groups=norm_groups,
+        double_z=False,
+    )
+
+
 class Encoder(nn.Module):
     """Image -> posterior over latents at 1 / 2^(levels - 1) of the resolution, and one feature map per level.
 
@@ -42,15 +57,7 @@ class Encoder(nn.Module):
         in_channels: int = 3,
     ) -> None:
         super().__init__()
-        self.network = vae.Encoder(
-            in_channels=in_channels,
-            out_channels=latent_channels,
-            down_block_types=("DownEncoderBlock2D",) * len(channels),
-            block_out_channels=tuple(channels),
-            layers_per_block=layers_per_block,
-            norm_num_groups=norm_groups,
-            double_z=True,
-        )
+        self.network = vae_encoder(in_channels, 2 * latent_channels, channels, layers_per_block, norm_groups)
         self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
         self.gradient_checkpointing = False
 

@@ -9,10 +9,10 @@ from: LN3Diff and GaussianAnything (6 and 8 views with Pluecker rays), TRELLIS (
 from collections.abc import Sequence
 
 import torch
-from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.encoder import vae_encoder
 from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, rays_through
 from completesplat.scene import Views
 
@@ -41,7 +41,7 @@ class PlaneSweep(nn.Module):
         super().__init__()
         self.planes = planes
         inputs = 3 + planes * 2 * 4
-        self.network = _encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
+        self.network = vae_encoder(inputs, 2 * latent_channels, channels[1:], layers_per_block, norm_groups)
         _zero(self.network.conv_out)
 
     def forward(
@@ -56,7 +56,7 @@ class PlaneSweep(nn.Module):
 
 
 SHARPNESS = 4.0
-"""Of the weights: a view at a right angle to another counts exp(-4) as much."""
+"""Of the weights: a view at a right angle to the ray counts exp(-4) of one along it."""
 
 
 def sweep(
@@ -110,7 +110,7 @@ class CrossAttention(nn.Module):
         norm_groups: int = 32,
     ) -> None:
         super().__init__()
-        self.network = _encoder(9, width, channels, layers_per_block, norm_groups)
+        self.network = vae_encoder(9, width, channels, layers_per_block, norm_groups)
         layer = nn.TransformerDecoderLayer(
             width, heads, 4 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
         )
@@ -139,20 +139,6 @@ def pluecker(cameras: Cameras) -> Float[Tensor, "*batch 6 height width"]:
         )
         origins = cameras.centers[..., None, None, :].expand_as(directions)
         return torch.cat([directions, torch.linalg.cross(origins, directions)], -1).movedim(-1, -3)
-
-
-def _encoder(
-    inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
-) -> vae.Encoder:
-    return vae.Encoder(
-        in_channels=inputs,
-        out_channels=outputs,
-        down_block_types=("DownEncoderBlock2D",) * len(channels),
-        block_out_channels=tuple(channels),
-        layers_per_block=layers_per_block,
-        norm_num_groups=norm_groups,
-        double_z=False,
-    )
 
 
 @torch.no_grad()

@@ -6,11 +6,10 @@
 from collections.abc import Sequence
 
 import torch
-from diffusers.models.autoencoders import vae
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.encoder import Encoder
+from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
 from completesplat.autoreconstructor.pretrained import load_pretrained_encoder
 from completesplat.errors import WeightsError
 
@@ -48,15 +47,7 @@ class LearnedConditioning(nn.Module):
     ) -> None:
         super().__init__()
         self.out_channels = out_channels
-        self.network = vae.Encoder(
-            in_channels=3,
-            out_channels=out_channels,
-            down_block_types=("DownEncoderBlock2D",) * len(channels),
-            block_out_channels=tuple(channels),
-            layers_per_block=layers_per_block,
-            norm_num_groups=norm_groups,
-            double_z=False,
-        )
+        self.network = vae_encoder(3, out_channels, channels, layers_per_block, norm_groups)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
         """Features of sRGB images in [0, 1], at the latent's resolution."""
