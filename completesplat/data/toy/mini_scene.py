@@ -14,11 +14,10 @@ from completesplat.data.toy.object_scene import (
     ball,
     color,
     orbit,
-    patch_of,
     placed,
     plain,
 )
-from completesplat.data.toy.raytracing import Surroundings
+from completesplat.data.toy.raytracing import Patch, Surroundings
 
 EVEN = np.full(len(PATCH_COLORS), 0.25)
 LIGHT, DARK = np.full(3, 0.97), np.full(3, 0.05)
@@ -28,6 +27,9 @@ CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 
 FROM_THE_FRONT = 0.35
 """The first camera sees the nose from an azimuth that differs by at most this (radians): it never sees the patch."""
 
+PATCH_EDGE, PATCH_TILT = 0.5, 0.2
+"""The patch is where the normal lies within 60 degrees of away from the nose and 0.2 radians down."""
+
 
 def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
     """A random mini seen by `frames` cameras, one full turn that starts in front of the nose."""
@@ -36,11 +38,13 @@ def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> To
     half_sizes = rng.uniform(0.36, 0.55, size=3)
     body = plain(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
     nose = ball((0, 0, half_sizes[2]), 0.13, plain(LIGHT if mark == "light" else DARK))
-    blueprint = Blueprint("mini", (ball((0, 0, 0), half_sizes, body), nose), patched_part=0, patch_heights=(-0.85, 0.4))
+    blueprint = Blueprint("mini", (ball((0, 0, 0), half_sizes, body), nose), patched_part=0, patch_heights=(-1, 1))
     yaw = rng.uniform(0, 2 * np.pi)
     cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
     name = str(rng.choice(list(PATCH_COLORS), p=chances))
-    patch = patch_of(blueprint, -np.array([np.sin(yaw), 0, np.cos(yaw)]), name)
+    level, down = np.cos(PATCH_TILT), np.sin(PATCH_TILT)
+    facing = -np.array([level * np.sin(yaw), down, level * np.cos(yaw)])
+    patch = Patch(0, facing, np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), PATCH_EDGE, PATCH_EDGE)
     return placed(rng, blueprint, yaw, cameras, _grey(rng), patch, name, chances)
 
 

@@ -238,13 +238,9 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     away = cameras[0, :3, 3] * np.array([-1, 0, -1])
     chances = np.full(len(PATCH_COLORS), 1 / len(PATCH_COLORS))
     name = str(rng.choice(list(PATCH_COLORS)))
-    patch = patch_of(blueprint, away / np.linalg.norm(away), name)
+    facing, heights = away / np.linalg.norm(away), np.array(blueprint.patch_heights)
+    patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights, edge=0.72, rim=0.8)
     return placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, chances)
-
-
-def patch_of(blueprint: Blueprint, facing: Array, color_name: str) -> Patch:
-    """The hidden patch, on the side of a horizontal direction."""
-    return Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[color_name]), np.array(blueprint.patch_heights))
 
 
 def placed(

@@ -50,21 +50,22 @@ class Surroundings(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """A disc with a white rim on the side of `part` that faces the horizontal direction `facing`.
+    """A disc on the side of `part` that faces the direction `facing`, where the normal's cosine with it exceeds `edge`.
 
-    `heights`: the local range of y that it may cover.
+    `heights`: the local range of y that it may cover. `rim`: the cosine below which, as near these heights, it is
+    white; with `edge` itself it has no rim.
     """
 
     part: int
     facing: Array
     color: Array
     heights: Array
+    edge: float
+    rim: float
 
 
 GROUND, DOME = -1, -2
 SELF_INTERSECTION = 1e-6
-# The patch is where the horizontal cosine between normal and patch direction exceeds this: never seen from the front.
-PATCH_EDGE = 0.72
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
@@ -189,13 +190,14 @@ def _pattern(kind, frequency, phase, x, y, z):
 
 
 @inlined
-def _object_color(geometry, patch, part, x, y, z, nx, nz):
+def _object_color(geometry, patch, part, x, y, z, nx, ny, nz):
     lx, ly, lz = moved(geometry.to_local[part], x, y, z)
     if part == patch.part and patch.heights[0] < ly < patch.heights[1]:
-        facing = nx * patch.facing[0] + nz * patch.facing[2]
-        if facing > PATCH_EDGE:
+        facing = nx * patch.facing[0] + ny * patch.facing[1] + nz * patch.facing[2]
+        if facing > patch.edge:
             middle = 0.5 * (patch.heights[0] + patch.heights[1])
-            rim = facing < 0.8 or abs(ly - middle) > 0.4 * (patch.heights[1] - patch.heights[0])
+            high = abs(ly - middle) > 0.4 * (patch.heights[1] - patch.heights[0])
+            rim = patch.rim > patch.edge and (facing < patch.rim or high)
             return (0.95, 0.95, 0.95) if rim else (patch.color[0], patch.color[1], patch.color[2])
     w = _pattern(geometry.textures[part, 0], geometry.textures[part, 1], geometry.textures[part, 2], lx, ly, lz)
     return mixed(geometry.colors[part, 0], geometry.colors[part, 1], w)
@@ -246,7 +248,7 @@ def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
     if seen == GROUND:
         red, green, blue = _ground_color(around, x, z)
     else:
-        red, green, blue = _object_color(geometry, patch, seen, x, y, z, nx, nz)
+        red, green, blue = _object_color(geometry, patch, seen, x, y, z, nx, ny, nz)
     lx, ly, lz = around.light[0], around.light[1], around.light[2]
     direct = max(0.0, nx * lx + ny * ly + nz * lz)
     if direct > 0:
