@@ -109,9 +109,10 @@ def fixed_scenes(data: Any, count: int, views: int = 1) -> list[SceneBatch]:
 class Pictures(DrawsFixedScenes):
     """What the first target of each scene looks like, and what its Gaussians are like; see `DrawsFixedScenes`.
 
-    `folder/step_000500.png` has a row for each scene (`scene_panels`). All loggers get `gaussians/opacity_p10`, `_p50`,
-    `_p90`, the same of all `distributions`, and what the latent carries of a model that has a posterior
-    (`latent_bits`). Weights & Biases gets the picture and histograms too.
+    `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/layers_000500.png` the layers of its
+    Splatter Image (`layer_maps`). All loggers get `gaussians/opacity_p10`, `_p50`, `_p90`, the same of all
+    `distributions`, what the layers hold on the object (`layer_figures`), and what the latent carries of a model that
+    has a posterior (`latent_bits`). Weights & Biases gets the pictures and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: int = 1000, scenes: int = 4) -> None:
@@ -124,15 +125,22 @@ class Pictures(DrawsFixedScenes):
             posterior = module(batch).posterior if isinstance(module, ReconstructionModule) else None
         with torch.autocast(module.device.type, enabled=False):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
-        rows = [[SheetCell(image) for image in images] for images in zip(*panels.values(), strict=True)]
-        picture = picture_sheet(list(panels), rows)
-        picture.save(self.folder / f"step_{trainer.global_step:06}.png")
+        pictures = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
+        for kind, picture in pictures.items():
+            picture.save(self.folder / f"{kind}_{trainer.global_step:06}.png")
 
         values = distributions(gaussians)
         scalars = {f"gaussians/{name}": value for name, value in percentiles(values).items()}
+        scalars |= layer_figures(gaussians, batch)
         if posterior is not None:
             scalars |= latent_bits(posterior)
-        log_drawings(trainer, scalars, {"pictures": picture}, {f"histograms/{name}": of for name, of in values.items()})
+        shown = {"pictures": pictures["step"], "layers": pictures["layers"]}
+        log_drawings(trainer, scalars, shown, {f"histograms/{name}": of for name, of in values.items()})
+
+
+def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
+    """A column for each panel, a row for each scene."""
+    return picture_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
 
 
 def scene_panels(
@@ -163,6 +171,40 @@ def scene_panels(
         part = gaussians[:, layer * pixels : (layer + 1) * pixels]
         panels[f"layer {layer + 1}"] = seen(part).over(background)
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
+
+
+def layers_of(gaussians: Gaussians, scenes: SceneBatch) -> Gaussians:
+    """The Gaussians of a Splatter Image [batch], by layer and the reference's pixel: [batch layer height width]."""
+    size = scenes.reference.images.shape[-2:]
+    return gaussians.map(lambda tensor: tensor.unflatten(1, (-1, *size)))
+
+
+def layer_maps(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, Float[Tensor, "batch 3 height width"]]:
+    """Input, and the depth (one scale for all layers of a scene), opacity and colour of each layer, by its pixels."""
+    layers = layers_of(gaussians, scenes)
+    depths = torch.stack([color_depth(depth)[0] for depth in layers.means[..., 2].unsqueeze(2)])
+    panels = {"input": scenes.reference.images}
+    for layer in range(depths.shape[1]):
+        panels[f"depth {layer + 1}"] = depths[:, layer]
+        panels[f"opacity {layer + 1}"] = layers.opacities[:, layer, None].expand(-1, 3, -1, -1)
+        panels[f"colour {layer + 1}"] = layers.colors[:, layer].movedim(-1, 1)
+    return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
+
+
+def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
+    """Of each layer on the object: mean opacity, and mean distance behind the first layer.
+
+    `layers/opacity_1` and so on; `layers/behind_2` and so on, in scene units along the reference's optical axis. A
+    layer whose opacity goes to zero is dead: it shows nothing of what is hidden.
+    """
+    layers, on_object = layers_of(gaussians, scenes), scenes.reference.masks[:, 0]
+    found = {}
+    for layer in range(layers.opacities.shape[1]):
+        behind = layers.means[:, layer, ..., 2] - layers.means[:, 0, ..., 2]
+        values = {"opacity": layers.opacities[:, layer]} | ({"behind": behind} if layer else {})
+        for name, value in values.items():
+            found[f"layers/{name}_{layer + 1}"] = ((value * on_object).sum() / on_object.sum().clamp(min=1)).item()
+    return found
 
 
 def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]]:

@@ -15,7 +15,15 @@ from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
-from completesplat.training.fixed_scenes import distributions, fixed_scenes, latent_bits, percentiles, scene_panels
+from completesplat.training.fixed_scenes import (
+    distributions,
+    fixed_scenes,
+    latent_bits,
+    layer_figures,
+    layer_maps,
+    percentiles,
+    scene_panels,
+)
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
@@ -83,6 +91,25 @@ def test_distributions_are_of_all_values():
     assert percentiles({"depth": shuffled}) == {"depth_p10": 10, "depth_p50": 50, "depth_p90": 90}
 
 
+def test_maps_and_figures_of_the_layers_are_those_of_the_reference_s_pixels():
+    scenes = scene_batch(batch=2)
+    masks = (torch.rand(2, 1, SIZE, SIZE) < 0.5).float()
+    scenes = replace(scenes, reference=replace(scenes.reference, masks=masks))
+    gaussians = two_layers(scenes)
+    opacities = torch.rand(2, 2, SIZE, SIZE)
+    gaussians = replace(gaussians, opacities=opacities.flatten(1) * 0.9)
+    figures = layer_figures(gaussians, scenes)
+    assert figures["layers/behind_2"] == pytest.approx(2)  # depths of 1 and 3
+    for layer in (0, 1):
+        mean = 0.9 * opacities[:, layer][masks[:, 0] > 0].mean()
+        assert figures[f"layers/opacity_{layer + 1}"] == pytest.approx(mean.item())
+    maps = layer_maps(gaussians, scenes)
+    assert list(maps) == ["input", *(f"{name} {n}" for n in (1, 2) for name in ("depth", "opacity", "colour"))]
+    assert torch.equal(maps["opacity 2"][:, 1], 0.9 * opacities[:, 1])
+    assert (maps["colour 2"] == torch.eye(3)[2][:, None, None]).all()  # blue
+    assert (maps["depth 1"].mean(1) > maps["depth 2"].mean(1)).all()
+
+
 def test_the_bits_of_the_channels_are_those_of_the_posterior():
     means = torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]  # 0.05^2 / 2 nats are 0.0018 bits
     posterior = Posterior(means, torch.zeros(3, 4, 5, 6))
@@ -113,10 +140,12 @@ def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
 def test_a_run_leaves_pictures_and_rows(pipeline, stage):
     run = getattr(pipeline, stage)
-    (path,) = (run / "pictures").iterdir()
-    assert path.name == "step_000002.png"
-    # One validation scene in eight panels.
-    assert cells(Image.open(path), 32, 32).shape[:2] == (1, 8)
+    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "layers_000002.png"}
+    # One validation scene in eight panels, and its picture with three maps of either layer.
+    assert cells(Image.open(run / "pictures/step_000002.png"), 32, 32).shape[:2] == (1, 8)
+    assert cells(Image.open(run / "pictures/layers_000002.png"), 32, 32).shape[:2] == (1, 7)
+    layers = {column for column in pandas.read_csv(run / "metrics.csv") if column.startswith("layers/")}
+    assert layers == {"layers/opacity_1", "layers/opacity_2", "layers/behind_2"}
     table = pandas.read_csv(run / "metrics.csv")
     (row,) = table[["step", *(c for c in table if c.startswith("gaussians/"))]].dropna().to_dict("records")
     assert row["step"] == 1
