@@ -176,7 +176,7 @@ def scene_panels(
 def layers_of(gaussians: Gaussians, scenes: SceneBatch) -> Gaussians:
     """The Gaussians of a Splatter Image [batch], by layer and the reference's pixel: [batch layer height width]."""
     size = scenes.reference.images.shape[-2:]
-    return gaussians.map(lambda tensor: tensor.unflatten(1, (-1, *size)))
+    return gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))
 
 
 def layer_maps(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, Float[Tensor, "batch 3 height width"]]:
