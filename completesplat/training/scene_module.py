@@ -150,10 +150,14 @@ class SceneModule(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
 
+    def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
+        """Of the targets' views, in dB."""
+        images, truth = self.render(gaussians, scenes).clamp(0, 1)[:, 1:], scenes.targets.images
+        return psnr(images.flatten(0, 1), truth.flatten(0, 1)).view(images.shape[:2])
+
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
-        images = self.render(self.reconstruct(scenes, seed=index), scenes).clamp(0, 1)
-        values = psnr(images[:, 1:].flatten(0, 1), scenes.targets.images.flatten(0, 1))
-        self.log("val/psnr_novel", values.mean(), prog_bar=True, batch_size=len(images))
+        values = self.novel_psnr(self.reconstruct(scenes, seed=index), scenes)
+        self.log("val/psnr_novel", values.mean(), prog_bar=True, batch_size=len(values))
 
     def on_test_start(self) -> None:
         self.evaluation.reset()

@@ -46,6 +46,7 @@ def column(run, name):
 def test_validation_tells_what_a_perfect_second_stage_could_reach(runs):
     assert column(runs / "var", "val/psnr_posterior")
     assert column(runs / "var", "val/psnr_novel")
+    assert column(runs / "var", "val/posterior_gain")
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
