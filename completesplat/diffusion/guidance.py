@@ -8,6 +8,8 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 
+Latents = Float[Tensor, "batch channel height width"]
+Features = Float[Tensor, "batch feature height width"]
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(noisy latent, timestep, conditioning) -> predicted noise."""
 
@@ -23,12 +25,8 @@ def check_guidance_weight(weight: float) -> None:
 
 
 def guided_noise(
-    denoise: Denoise,
-    noisy_latent: Float[Tensor, "batch channel height width"],
-    timestep: Int[Tensor, " batch"],
-    conditioning: Float[Tensor, "batch features height width"],
-    weight: float,
-) -> Float[Tensor, "batch channel height width"]:
+    denoise: Denoise, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features, weight: float
+) -> Latents:
     """eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
     The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as
