@@ -15,11 +15,7 @@ Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def check_guidance_weight(weight: float) -> None:
-    """Refuse a weight that is no share of the unconditional prediction.
-
-    Raises:
-        CompleteSplatError: it lies outside of [0, 1].
-    """
+    """Refuse a weight outside of [0, 1], which is no share of the unconditional prediction (`CompleteSplatError`)."""
     if not 0 <= weight <= 1:
         raise CompleteSplatError(f"guidance_weight={weight:g}: must lie between 0 and 1")
 
@@ -29,12 +25,9 @@ def guided_noise(
 ) -> Latents:
     """eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
-    The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as
-    it is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice
-    the batch.
-
-    Raises:
-        CompleteSplatError: w outside of [0, 1].
+    The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as it
+    is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice the
+    batch. `CompleteSplatError`: w outside of [0, 1].
     """
     check_guidance_weight(weight)
     if weight == 0:

@@ -36,8 +36,7 @@ def signal_and_noise(
 def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
     """The right prediction for a latent and the noise that was added to it.
 
-    Raises:
-        CompleteSplatError: the scheduler predicts something else.
+    `CompleteSplatError`: the scheduler predicts something else.
     """
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
@@ -47,11 +46,7 @@ def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor
 
 
 def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
-    """The latent h that a prediction stands for.
-
-    Raises:
-        CompleteSplatError: the scheduler predicts something else.
-    """
+    """The latent h that a prediction stands for. `CompleteSplatError`: the scheduler predicts something else."""
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
     if kind == "epsilon":
@@ -67,11 +62,7 @@ def is_flow(scheduler: Any) -> bool:
 
 
 def prediction_type(scheduler: Any) -> str:
-    """One of `PREDICTION_TYPES`, or "flow".
-
-    Raises:
-        CompleteSplatError: the scheduler has another one.
-    """
+    """One of `PREDICTION_TYPES`, or "flow". `CompleteSplatError`: the scheduler has another one."""
     if is_flow(scheduler):
         return "flow"
     kind: str = scheduler.config.prediction_type

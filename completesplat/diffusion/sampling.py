@@ -53,11 +53,8 @@ class Sampler:
 
         A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
         single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them with what the
-        prediction says about the clean latent.
-
-        Raises:
-            CompleteSplatError: a guidance weight outside of [0, 1], or a number of steps that the scheduler cannot
-                make.
+        prediction says about the clean latent. `CompleteSplatError`: a guidance weight outside of [0, 1], or a number
+        of steps that the scheduler cannot make.
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)
@@ -111,8 +108,7 @@ class Sampler:
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
     """A sampler's configuration with the noise schedule and the prediction type of the one trained with.
 
-    Raises:
-        CompleteSplatError: one of the two is of diffusion, the other of flow matching.
+    `CompleteSplatError`: one of the two is of diffusion, the other of flow matching.
     """
     names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
     if len({name.startswith("FlowMatch") for name in names}) > 1:
@@ -126,8 +122,7 @@ def draw_noise(
 ) -> Float[Tensor, "latent _ _ _"]:
     """Noise of this shape for several samples of each image, those of one image next to each other.
 
-    Args:
-        seed: of all noise, or one for each image.
+    `seed` is that of all noise, or there is one for each image.
     """
     if isinstance(seed, int):
         return torch.randn((images * samples, *shape), generator=torch.Generator().manual_seed(seed))

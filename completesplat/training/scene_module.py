@@ -25,16 +25,15 @@ from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 
 Result = TypeVar("Result")
+Renders = Float[Tensor, "batch view 3 height width"]
 
 
-def copy_reference(scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
+def copy_reference(scenes: SceneBatch) -> Renders:
     """The reference image for every view. A model that does not beat this and `repeat_image` has learned nothing."""
     return scenes.reference.images[:, None].expand_as(scenes.all_views().images)
 
 
-def repeat_image(
-    image: Float[Tensor, "3 height width"], scenes: SceneBatch
-) -> Float[Tensor, "batch view 3 height width"]:
+def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> Renders:
     """One image for every view: with the training set's mean image, the best constant prediction of the MSE."""
     return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
 
@@ -146,7 +145,7 @@ class SceneModule(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, everywhere)
 
-    def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
+    def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Renders:
         """The reference view and all targets, in full precision even where the network runs in less."""
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
