@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat import tensors
 from completesplat.geometry.cameras import transform_points
 from completesplat.geometry.rotations import (
     matrix_to_quaternion,
@@ -61,5 +62,4 @@ class Gaussians(TensorDataclass):
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
     """All Gaussians of the sets (of equal batch shape) in one."""
-    axis = sets[0].opacities.ndim - 1
-    return Gaussians(*(torch.cat(tensors, dim=axis) for tensors in zip(*(vars(s).values() for s in sets), strict=True)))
+    return tensors.concatenate(sets, axis=sets[0].opacities.ndim - 1)

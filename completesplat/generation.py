@@ -18,11 +18,12 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.pictures.photograph import Photograph, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
-from completesplat.diffusion.splitting import in_parts, joined
+from completesplat.diffusion.splitting import in_parts
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.scene import Views
+from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
 
 TRUSTED_PACKAGES = ("completesplat.", "diffusers.")
@@ -54,19 +55,16 @@ class CompleteSplat(nn.Module):
         image_size: int,
     ) -> None:
         super().__init__()
-        autoreconstructor = dict(autoreconstructor)
-        if "pretrained" in autoreconstructor:  # its weights are a trained stage's: Stable Diffusion's are not needed
-            autoreconstructor["pretrained"] = None
-        self.architecture: dict[str, Any] = {
-            "autoreconstructor": autoreconstructor,
-            # Its weights are saved with the others: what training started from is not needed again.
-            "conditioning": dict(conditioning) | ({"pretrained": None} if "pretrained" in conditioning else {}),
-            "denoiser": dict(denoiser),
-            "sampler": dict(sampler),
-            "image_size": image_size,
+        parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
+        # Weights that training starts from are not needed again: all are saved together.
+        saved = {
+            name: {key: None if key == "pretrained" else value for key, value in part.items()}
+            for name, part in parts.items()
         }
+        self.architecture: dict[str, Any] = {**saved, "sampler": dict(sampler), "image_size": image_size}
         self.image_size = image_size
-        self.autoreconstructor = _build(autoreconstructor).requires_grad_(False)
+        # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
+        self.autoreconstructor = _build(saved["autoreconstructor"]).requires_grad_(False)
         self.conditioning = _build(conditioning)
         self.denoiser = _build(denoiser)
         self.sampler = _build(sampler)
@@ -157,7 +155,7 @@ class CompleteSplat(nn.Module):
             shown = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent))
             return decode(self.sampler(self.denoiser, noise[part], conditioning[own], guidance_weight, steps, shown))
 
-        return joined(in_parts(draw, len(noise), batch))
+        return concatenate(in_parts(draw, len(noise), batch))
 
     def _decode(self, latent: Tensor, skips: tuple[Any, ...], cameras: Cameras, depth_range: Tensor) -> Gaussians:
         splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)

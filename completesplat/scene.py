@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras
-from completesplat.tensors import TensorDataclass
+from completesplat.tensors import TensorDataclass, concatenate
 
 
 @dataclass(frozen=True)
@@ -49,16 +48,11 @@ class SceneBatch(TensorDataclass):
 
     def all_views(self) -> Views:
         """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
-        one, many, axis = self.reference, self.targets, self.depth_range.ndim - 1
-
-        def prepend(first: Tensor, others: Tensor) -> Tensor:
-            return torch.cat([first.unsqueeze(axis), others], dim=axis)
-
-        world_to_camera = prepend(one.cameras.world_to_camera, many.cameras.world_to_camera)
-        intrinsics = prepend(one.cameras.intrinsics, many.cameras.intrinsics)
-        depths = None if one.depths is None or many.depths is None else prepend(one.depths, many.depths)
-        cameras = Cameras(world_to_camera, intrinsics, one.cameras.image_size)
-        return Views(prepend(one.images, many.images), cameras, prepend(one.masks, many.masks), depths)
+        axis = self.depth_range.ndim - 1
+        parts = [self.reference.map(lambda tensor: tensor.unsqueeze(axis)), self.targets]
+        if any(part.depths is None for part in parts):
+            parts = [replace(part, depths=None) for part in parts]
+        return concatenate(parts, axis)
 
 
 @dataclass(frozen=True)

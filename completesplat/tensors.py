@@ -65,6 +65,18 @@ def stack(items: Sequence[T]) -> T:
     return replace(items[0], **merged)
 
 
+def concatenate(items: Sequence[T], axis: int = 0) -> T:
+    """One dataclass of all items' tensors, joined along an axis that they have; static values are the first's."""
+
+    def join(values: list[Any]) -> Any:
+        if isinstance(values[0], Tensor):
+            return torch.cat(values, dim=axis)
+        return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
+
+    joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
+    return replace(items[0], **joined)
+
+
 def _merge(values: list[Any]) -> Any:
     first = values[0]
     if isinstance(first, Tensor):

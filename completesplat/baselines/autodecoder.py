@@ -14,6 +14,7 @@ from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.errors import CompleteSplatError
 from completesplat.splatter_image import SplatterImage
 
+Codes = Float[Tensor, "batch channel latent_height latent_width"]
 INITIAL_STD = 0.01
 """Of new codes, as in DeepSDF (Section 4.3)."""
 
@@ -40,10 +41,9 @@ class AutoDecoder(nn.Module):
             raise CompleteSplatError(f"image_size={image_size}: must be a multiple of {factor}")
         self.reconstructor = reconstructor
         self.shape = (reconstructor.post_quant_conv.in_channels, image_size // factor, image_size // factor)
-        self._rows: dict[tuple[str, int], int] = {}
         self.make_room(rows)
 
-    def forward(self, codes: Float[Tensor, "batch channel latent_height latent_width"]) -> SplatterImage:
+    def forward(self, codes: Codes) -> SplatterImage:
         """Reconstruct from codes."""
         image: SplatterImage = self.reconstructor(codes, ())
         return image
@@ -52,20 +52,18 @@ class AutoDecoder(nn.Module):
         """A new table for this number of pictures, all rows of it free."""
         device = self.reconstructor.post_quant_conv.weight.device
         self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape).to(device))
-        self._rows = {}
+        self._rows: dict[tuple[str, int], int] = {}
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
         if (codes := state_dict.get(f"{prefix}codes")) is not None and len(codes) != len(self.codes):
             self.make_room(len(codes))
         super()._load_from_state_dict(state_dict, prefix, *others)
 
-    def codes_of(
-        self, names: Sequence[str], frames: Int64[Tensor, " batch"]
-    ) -> Float[Tensor, "batch channel latent_height latent_width"]:
+    def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
         """The codes of pictures, given by sequence and place therein; `CompleteSplatError` where the table is full."""
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
-    def new_codes(self, count: int, seed: int) -> Float[Tensor, "batch channel latent_height latent_width"]:
+    def new_codes(self, count: int, seed: int) -> Codes:
         """Random codes, of no picture yet."""
         generator = torch.Generator().manual_seed(seed)
         return INITIAL_STD * torch.randn(count, *self.shape, generator=generator).to(self.codes.device)
@@ -84,12 +82,7 @@ class AutoDecoder(nn.Module):
         self._rows = {(name, frame): row for row, (name, frame) in enumerate(state)}
 
 
-def optimize_codes(
-    codes: Float[Tensor, "batch channel latent_height latent_width"],
-    loss: Callable[[Tensor], Float[Tensor, ""]],
-    steps: int,
-    rate: float,
-) -> Float[Tensor, "batch channel latent_height latent_width"]:
+def optimize_codes(codes: Codes, loss: Callable[[Tensor], Float[Tensor, ""]], steps: int, rate: float) -> Codes:
     """Minimise a loss of the codes alone by Adam, whose rate falls to a tenth halfway (DeepSDF's `reconstruct.py`).
 
     Works also where autograd is off, as in `torch.inference_mode()`. No other gradients are computed or left behind.

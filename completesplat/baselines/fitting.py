@@ -88,11 +88,6 @@ def initial_gaussians(
     )
 
 
-def scene_extent(depth_range: Float[Tensor, "batch 2"]) -> float:
-    """Half of the mean depth range, in scene units: the spread of the initial Gaussians (3DGS: that of the cameras)."""
-    return (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
-
-
 def fit_gaussians(
     views: Views,
     depth_range: Float[Tensor, "batch 2"],
@@ -108,7 +103,7 @@ def fit_gaussians(
     """
     with torch.inference_mode(False), torch.enable_grad():
         raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
-        optimizer = _optimizer(raw, settings, scene_extent(depth_range))
+        optimizer = _optimizer(raw, settings, depth_range)
         positions = optimizer.param_groups[0]
         decay = POSITION_DECAY ** (1 / max(settings.steps, 1))
         for step in range(settings.steps):
@@ -123,8 +118,10 @@ def fit_gaussians(
         return raw.gaussians().detach()
 
 
-def _optimizer(raw: RawGaussians, settings: FittingSettings, extent: float) -> torch.optim.Adam:
+def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor) -> torch.optim.Adam:
     """Adam with 3DGS's epsilon (`gaussian_model.py`), beside which the gradients of single Gaussians are not small."""
+    # Half of the mean depth range, the spread of the initial Gaussians (3DGS: that of the cameras).
+    extent = (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
     rates = {name: settings.other_rates * rate for name, rate in RATES.items()}
     rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}
     groups = [{"params": [getattr(raw, name).requires_grad_()], "lr": rate} for name, rate in rates.items()]

@@ -15,7 +15,7 @@ from torch import Tensor
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays, project
 from completesplat.rasterizers import RenderingConstants
-from completesplat.splatter_image import CHANNELS, LAYER_DEPTHS, SH_C0, Parameterization, SplatterImage
+from completesplat.splatter_image import LAYER_DEPTHS, SH_C0, Parameterization, SplatterImage
 
 EMPTY_LOGIT = -30.0
 """Raw opacity of a place without a Gaussian: its opacity is 1e-13."""
@@ -69,9 +69,7 @@ def project_to_splatter_image(
         placed(gaussians.quaternions, 0.0),
         placed((gaussians.colors - 0.5) / SH_C0, 0.0),
     ]
-    raw = torch.cat(parts, dim=2)
-    assert raw.shape[2] == CHANNELS
-    return Projection(SplatterImage(raw, parameterization), ~filled.any(dim=1).squeeze(1))
+    return Projection(SplatterImage(torch.cat(parts, dim=2), parameterization), ~filled.any(dim=1).squeeze(1))
 
 
 def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:

@@ -46,8 +46,7 @@ class SplatterImageUNet(nn.Module):
         super().__init__()
         self.parameterization = parameterization
         attends = [level in attention_levels for level in range(len(channels))]
-        unet: Any = UNet2DModel
-        network = unet(
+        network: Any = UNet2DModel(  # type: ignore[no-untyped-call]
             in_channels=3,
             out_channels=parameterization.channels,
             block_out_channels=tuple(channels),

@@ -17,6 +17,8 @@ from completesplat.baselines.preoptimized import occupied
 from completesplat.errors import CompleteSplatError
 from completesplat.splatter_image import CHANNELS, SplatterImage
 
+Raw = Float[Tensor, "batch layer 15 height width"]
+
 
 class SparseVAE(nn.Module):
     """Splatter Image -> latent -> Splatter Image, in the autoreconstructor's blocks without skips.
@@ -53,19 +55,11 @@ class SparseVAE(nn.Module):
         posterior, _ = self.encoder.encode(seen.flatten(1, 2))
         latent = posterior.sample() if self.training else posterior.mode()
         decoded = self.reconstructor(latent, ())
-        return Reconstruction(SplatterImage(self.denormalize(decoded.raw), decoded.parameterization), posterior)
+        return Reconstruction(SplatterImage(decoded.raw * self.std + self.mean, decoded.parameterization), posterior)
 
-    def normalize(
-        self, raw: Float[Tensor, "batch layer 15 height width"]
-    ) -> Float[Tensor, "batch layer 15 height width"]:
+    def normalize(self, raw: Raw) -> Raw:
         """Raw values with mean 0 and deviation 1 in each channel of each layer."""
         return (raw - self.mean) / self.std
-
-    def denormalize(
-        self, values: Float[Tensor, "batch layer 15 height width"]
-    ) -> Float[Tensor, "batch layer 15 height width"]:
-        """The raw values that `normalize` made these of."""
-        return values * self.std + self.mean
 
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:

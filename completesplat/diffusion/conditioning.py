@@ -31,9 +31,7 @@ class LearnedConditioning(nn.Module):
 
     Args:
         out_channels: channels of phi_ref.
-        channels: width of each level; the resolution halves between levels, down to the latent's.
-        layers_per_block: residual blocks per level.
-        norm_groups: groups of the group normalisation.
+        channels, layers_per_block, norm_groups: see `Encoder`; there are as many levels as the latent's encoder has.
     """
 
     frozen = False

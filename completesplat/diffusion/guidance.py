@@ -8,35 +8,26 @@ from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 
+Latents = Float[Tensor, "batch channel height width"]
+Features = Float[Tensor, "batch feature height width"]
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(noisy latent, timestep, conditioning) -> predicted noise."""
 
 
 def check_guidance_weight(weight: float) -> None:
-    """Refuse a weight that is no share of the unconditional prediction.
-
-    Raises:
-        CompleteSplatError: it lies outside of [0, 1].
-    """
+    """Refuse a weight outside of [0, 1], which is no share of the unconditional prediction (`CompleteSplatError`)."""
     if not 0 <= weight <= 1:
         raise CompleteSplatError(f"guidance_weight={weight:g}: must lie between 0 and 1")
 
 
 def guided_noise(
-    denoise: Denoise,
-    noisy_latent: Float[Tensor, "batch channel height width"],
-    timestep: Int[Tensor, " batch"],
-    conditioning: Float[Tensor, "batch features height width"],
-    weight: float,
-) -> Float[Tensor, "batch channel height width"]:
+    denoise: Denoise, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features, weight: float
+) -> Latents:
     """eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
-    The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as
-    it is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice
-    the batch.
-
-    Raises:
-        CompleteSplatError: w outside of [0, 1].
+    The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as it
+    is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice the
+    batch. `CompleteSplatError`: w outside of [0, 1].
     """
     check_guidance_weight(weight)
     if weight == 0:

@@ -11,11 +11,11 @@ flow matching a = 1 - t and b = t (Lipman et al. 2023; Liu et al. 2023, "rectifi
 
 from typing import Any
 
-import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from completesplat.diffusion.guidance import Latents
 from completesplat.errors import CompleteSplatError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
@@ -33,28 +33,10 @@ def signal_and_noise(
     return alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
 
 
-def draw_timesteps(scheduler: Any, count: int, device: torch.device) -> Int[Tensor, " count"]:
-    """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
-
-    The latter favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
-    """
-    steps: int = scheduler.config.num_train_timesteps
-    if is_flow(scheduler):
-        middle: Tensor = torch.randn(count, device=device).sigmoid()
-        return (middle * steps).ceil().long()
-    return torch.randint(steps, (count,), device=device)
-
-
-def target(
-    scheduler: Any,
-    latent: Float[Tensor, "batch channel height width"],
-    noise: Float[Tensor, "batch channel height width"],
-    timestep: Int[Tensor, " batch"],
-) -> Float[Tensor, "batch channel height width"]:
+def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
     """The right prediction for a latent and the noise that was added to it.
 
-    Raises:
-        CompleteSplatError: the scheduler predicts something else.
+    `CompleteSplatError`: the scheduler predicts something else.
     """
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
@@ -63,17 +45,8 @@ def target(
     return {"epsilon": noise, "sample": latent, "flow": noise - latent}[kind]
 
 
-def clean_estimate(
-    scheduler: Any,
-    noisy_latent: Float[Tensor, "batch channel height width"],
-    predicted: Float[Tensor, "batch channel height width"],
-    timestep: Int[Tensor, ""],
-) -> Float[Tensor, "batch channel height width"]:
-    """The latent h that a prediction stands for.
-
-    Raises:
-        CompleteSplatError: the scheduler predicts something else.
-    """
+def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
+    """The latent h that a prediction stands for. `CompleteSplatError`: the scheduler predicts something else."""
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
     if kind == "epsilon":
@@ -89,11 +62,7 @@ def is_flow(scheduler: Any) -> bool:
 
 
 def prediction_type(scheduler: Any) -> str:
-    """One of `PREDICTION_TYPES`, or "flow".
-
-    Raises:
-        CompleteSplatError: the scheduler has another one.
-    """
+    """One of `PREDICTION_TYPES`, or "flow". `CompleteSplatError`: the scheduler has another one."""
     if is_flow(scheduler):
         return "flow"
     kind: str = scheduler.config.prediction_type

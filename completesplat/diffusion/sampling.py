@@ -9,8 +9,8 @@ from diffusers import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from completesplat.diffusion.guidance import Denoise, guided_noise
-from completesplat.diffusion.objective import clean_estimate, draw_timesteps, is_flow, signal_and_noise
+from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
+from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 
 OnStep = Callable[[int, int, Tensor], None]
@@ -43,21 +43,18 @@ class Sampler:
     def __call__(
         self,
         denoise: Denoise,
-        noise: Float[Tensor, "batch channel height width"],
-        conditioning: Float[Tensor, "batch features height width"],
+        noise: Latents,
+        conditioning: Features,
         guidance_weight: float = 0.0,
         steps: int | None = None,
         on_step: OnStep | None = None,
-    ) -> Float[Tensor, "batch channel height width"]:
+    ) -> Latents:
         """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone.
 
         A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
         single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them with what the
-        prediction says about the clean latent.
-
-        Raises:
-            CompleteSplatError: a guidance weight outside of [0, 1], or a number of steps that the scheduler cannot
-                make.
+        prediction says about the clean latent. `CompleteSplatError`: a guidance weight outside of [0, 1], or a number
+        of steps that the scheduler cannot make.
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)
@@ -87,12 +84,16 @@ class Sampler:
             self.scheduler.set_timesteps(steps, device=device)
 
     def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
-        """Random noise levels to train at; see `objective.draw_timesteps`."""
-        return draw_timesteps(self.scheduler, count, device)
+        """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
 
-    def add_noise(
-        self, latent: Float[Tensor, "batch channel height width"], noise: Tensor, timestep: Tensor
-    ) -> Float[Tensor, "batch channel height width"]:
+        The latter favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
+        """
+        if is_flow(self.scheduler):
+            middle: Tensor = torch.randn(count, device=device).sigmoid()
+            return (middle * self.training_timesteps).ceil().long()
+        return torch.randint(self.training_timesteps, (count,), device=device)
+
+    def add_noise(self, latent: Latents, noise: Tensor, timestep: Tensor) -> Latents:
         """The forward process h_t = a h + b eps (paper, Eq. 2; `objective.signal_and_noise`)."""
         signal, share = signal_and_noise(self.scheduler, timestep, latent)
         return signal * latent + share * noise
@@ -107,8 +108,7 @@ class Sampler:
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
     """A sampler's configuration with the noise schedule and the prediction type of the one trained with.
 
-    Raises:
-        CompleteSplatError: one of the two is of diffusion, the other of flow matching.
+    `CompleteSplatError`: one of the two is of diffusion, the other of flow matching.
     """
     names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
     if len({name.startswith("FlowMatch") for name in names}) > 1:
@@ -122,8 +122,7 @@ def draw_noise(
 ) -> Float[Tensor, "latent _ _ _"]:
     """Noise of this shape for several samples of each image, those of one image next to each other.
 
-    Args:
-        seed: of all noise, or one for each image.
+    `seed` is that of all noise, or there is one for each image.
     """
     if isinstance(seed, int):
         return torch.randn((images * samples, *shape), generator=torch.Generator().manual_seed(seed))

@@ -1,16 +1,12 @@
 """Drawing many samples in parts that fit into memory."""
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable
 from typing import TypeVar
 
 import torch
 
-from completesplat.tensors import TensorDataclass
-
 Part = TypeVar("Part")
-Tensors = TypeVar("Tensors", bound=TensorDataclass)
 logger = logging.getLogger(__name__)
 
 
@@ -18,9 +14,7 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
     """`draw` for all of `count` samples, at most `most` at a time (None: all at once), in their order.
 
     Where a GPU's memory does not suffice, a part is drawn again by halves, with a warning.
-
-    Raises:
-        torch.cuda.OutOfMemoryError: a single sample does not fit.
+    `torch.cuda.OutOfMemoryError`: a single sample does not fit.
     """
     parts: list[Part] = []
     start, size = 0, min(count if most is None else most, count)
@@ -38,9 +32,3 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
         logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)
         size = (size + 1) // 2
     return parts
-
-
-def joined(parts: Sequence[Tensors]) -> Tensors:
-    """Parts along the leading axis of all their tensors as one."""
-    names = [field.name for field in fields(parts[0])]
-    return replace(parts[0], **{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -20,10 +20,8 @@ log = logging.getLogger(__name__)
 
 def storable(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
     """Which Gaussians have finite values (of at most 1e18) and extents above 0 (as float32) along all axes."""
-    bounded = [gaussians.opacities.abs() <= LARGEST]
-    values = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.colors)
-    bounded += [(x.abs() <= LARGEST).all(-1) for x in values]
-    return torch.stack([*bounded, (gaussians.scales.float() > 0).all(-1)]).all(0)
+    bounded = gaussians.map(lambda values: values.where(values.abs() <= LARGEST, torch.inf)).finite()
+    return bounded & (gaussians.scales.float() > 0).all(-1)
 
 
 def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
@@ -41,16 +39,14 @@ def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     return gaussians.keep(kept)
 
 
-def with_screen_space_dilation(
-    gaussians: Gaussians, reference: Cameras, blur: float = RenderingConstants().blur
-) -> Gaussians:
+def with_screen_space_dilation(gaussians: Gaussians, reference: Cameras) -> Gaussians:
     """Gaussians that are larger by the rasterizer's blur, as it is in the reference view.
 
-    A rasterizer adds `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
+    A rasterizer adds its `blur` px^2 to each projected covariance. Training counts on it at its own picture size, and
     makes Gaussians far smaller than a pixel; in a larger picture they would be dots with gaps between them. A Gaussian
     at depth z gets `blur * (z / focal length)^2` added to its covariance in all directions, which leaves its axes. The
     camera is the photograph's, unbatched, at the size that the model was trained at.
     """
     depth = transform_points(reference.world_to_camera, gaussians.means)[:, 2]
-    variance = blur * (depth / reference.intrinsics[0, 0]).square()
+    variance = RenderingConstants().blur * (depth / reference.intrinsics[0, 0]).square()
     return replace(gaussians, scales=(gaussians.scales.square() + variance[:, None]).sqrt())

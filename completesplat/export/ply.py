@@ -1,8 +1,8 @@
 """Gaussians as a `.ply` file in the layout of the original 3D Gaussian Splatting code."""
 
 import os
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,6 +19,7 @@ from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.splatter_image import SH_C0
 
 LONGEST_HEADER, LONGEST_COUNT = 1 << 16, 15  # bytes, digits
+HEADER = re.compile(rb"ply\s*\n(.*?)(?<=\n)end_header[ \t\r]*\n", re.DOTALL)
 TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
     "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
@@ -71,20 +72,6 @@ def _header(count: int, comments: Sequence[str]) -> bytes:
     return "\n".join(lines).encode("ascii", "backslashreplace")
 
 
-@dataclass(frozen=True)
-class Element:
-    """An element of the header: `count` records of type `dtype`."""
-
-    name: str
-    count: int
-    dtype: np.dtype[np.void]
-
-    @property
-    def size(self) -> int:
-        """Bytes that the records take."""
-        return self.count * self.dtype.itemsize
-
-
 def read_ply(path: str | Path) -> Gaussians:
     """Read a binary little-endian 3DGS `.ply`, of this project or another.
 
@@ -96,32 +83,50 @@ def read_ply(path: str | Path) -> Gaussians:
         if not Path(path).is_file():
             raise PlyError("no such file")
         with Path(path).open("rb") as file:
-            elements, data_start = read_header(file)
-            declared = data_start + sum(element.size for element in elements)
-            actual = os.fstat(file.fileno()).st_size
-            if actual != declared:
-                raise PlyError(f"the header declares {declared} bytes, the file has {actual}")
-            columns = _columns(file.read(actual - data_start), elements)
+            gaussians = _gaussians(_vertices(file))
     except OSError as error:
         raise PlyError(f"{path}: {error.strerror or error}") from error
     except PlyError as error:
         raise PlyError(f"{path}: {error}") from None
-    gaussians = _gaussians(columns)
     damaged = int((~gaussians.finite()).sum())
     if damaged:
         raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
     return gaussians
 
 
-def read_header(file: BinaryIO) -> tuple[list[Element], int]:
-    """Elements in the order of the file, and the position where their data begin."""
-    lines = _lines(file)
-    if lines[0] != "ply":
+def _vertices(file: BinaryIO) -> np.ndarray:
+    start = file.read(LONGEST_HEADER)
+    if not start.startswith(b"ply"):
         raise PlyError("not a .ply file")
-    if lines[1:2] != ["format binary_little_endian 1.0"]:
+    header = HEADER.match(start)
+    if header is None:
+        raise PlyError("no end of the header found")
+    places: dict[str, tuple[np.dtype[np.void], int, int]] = {}
+    end = header.end()
+    for name, count, fields in _elements(header[1].decode("ascii", "replace").splitlines()):
+        if len(dict(fields)) < len(fields):
+            raise PlyError(f"element {name[:60]!r} names a property twice")
+        places[name] = np.dtype(fields), count, end
+        end += count * places[name][0].itemsize
+    actual = file.seek(0, os.SEEK_END)
+    if actual != end:
+        raise PlyError(f"the header declares {end} bytes, the file has {actual}")
+    if "vertex" not in places:
+        raise PlyError("no element vertex")
+    dtype, count, position = places["vertex"]
+    missing = [name for name in REQUIRED if name not in (dtype.names or ())]
+    if missing:
+        raise PlyError(f"no property {', '.join(missing)}: not a 3D Gaussian Splatting file")
+    file.seek(position)
+    return np.fromfile(file, dtype, count)
+
+
+def _elements(lines: Sequence[str]) -> list[tuple[str, int, list[tuple[str, str]]]]:
+    """Name, number of records, and names and types of their properties, in the order of the file."""
+    if not lines or lines[0].strip() != "format binary_little_endian 1.0":
         raise PlyError("not a binary little-endian .ply file")
     declared: list[tuple[str, int, list[tuple[str, str]]]] = []
-    for line in lines[2:]:
+    for line in lines[1:]:
         match line.split():
             case ["comment" | "obj_info", *_]:
                 pass
@@ -131,42 +136,12 @@ def read_header(file: BinaryIO) -> tuple[list[Element], int]:
                 declared[-1][2].append((name, TYPES[kind]))
             case _:
                 raise PlyError(f"header line not understood: {line[:60]!r}")
-    for name, _, fields in declared:
-        if len(dict(fields)) < len(fields):
-            raise PlyError(f"element {name[:60]!r} names a property twice")
-    return [Element(name, count, np.dtype(fields)) for name, count, fields in declared], file.tell()
+    return declared
 
 
-def _lines(file: BinaryIO) -> list[str]:
-    """The lines before `end_header`; the file then stands at the first byte of data."""
-    lines: list[str] = []
-    while (raw := file.readline(LONGEST_HEADER)) and file.tell() <= LONGEST_HEADER:
-        line = raw.decode("ascii", "replace").strip()
-        if line == "end_header":
-            return lines or [""]
-        lines.append(line)
-        if lines[0] != "ply":
-            return lines
-    raise PlyError("no end of the header found" if lines else "not a .ply file")
-
-
-def _columns(data: bytes, elements: Sequence[Element]) -> dict[str, np.ndarray]:
-    """The required properties of the vertices, each as float64."""
-    offset = 0
-    for element in elements:
-        if element.name == "vertex":
-            missing = [name for name in REQUIRED if name not in (element.dtype.names or ())]
-            if missing:
-                raise PlyError(f"no property {', '.join(missing)}: not a 3D Gaussian Splatting file")
-            vertices = np.frombuffer(data, element.dtype, element.count, offset)
-            return {name: vertices[name].astype(np.float64) for name in REQUIRED}
-        offset += element.size
-    raise PlyError("no element vertex")
-
-
-def _gaussians(columns: dict[str, np.ndarray]) -> Gaussians:
+def _gaussians(vertices: np.ndarray) -> Gaussians:
     def gather(names: Sequence[str]) -> Float[Tensor, "gaussian channel"]:
-        return torch.from_numpy(np.stack([columns[name] for name in names], axis=-1))
+        return torch.from_numpy(np.stack([vertices[name].astype(np.float64) for name in names], axis=-1))
 
     return Gaussians(
         means=gather(MEANS).float(),

@@ -98,8 +98,7 @@ def write_prediction(
         rows.append(row)
         files |= written
         on_sample()
-    angles = [360 / DIRECTIONS * k for k in range(DIRECTIONS)]
-    contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows, angles)
+    contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows)
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
     if wanted.maps:
         written, ends = write_maps(folder, scenes, reference, rasterizer)
@@ -148,15 +147,11 @@ def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) ->
 
 
 def contact_sheet(
-    path: str | Path,
-    title: str,
-    reference: Float[Tensor, "3 height width"],
-    samples: Sequence[SampleViews],
-    angles: Sequence[float],
+    path: str | Path, title: str, reference: Float[Tensor, "3 height width"], samples: Sequence[SampleViews]
 ) -> None:
     """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
 
-    Depth is coloured on one scale for all rows. The angles of the views, in degrees, are the same for all samples.
+    Depth is coloured on one scale for all rows. The views, as many for all samples, are evenly spread over a turn.
     """
     depths, (near, far) = color_depth(torch.stack([sample.depth for sample in samples]))
     rows = [
@@ -164,7 +159,8 @@ def contact_sheet(
         for sample, depth in zip(samples, depths, strict=True)
     ]
     rows[0][0] = SheetCell(reference)
-    headings = ["input", *(f"{angle:g}°" for angle in angles), f"depth {near:.3g} to {far:.3g}"]
+    views = len(samples[0].images)
+    headings = ["input", *(f"{360 / views * k:g}°" for k in range(views)), f"depth {near:.3g} to {far:.3g}"]
     with atomic_path(path) as temporary:
         picture_sheet(headings, rows, title).save(temporary, format="PNG")
 

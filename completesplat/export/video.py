@@ -14,6 +14,8 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.rasterizers import Rasterizer
 
 SMALLEST_SIDE = 256
+CHUNK = 8  # views that are rendered at a time
+Frames = Float[Tensor, "frame 3 height width"]
 
 
 def orbit_views(
@@ -24,7 +26,7 @@ def orbit_views(
     frames: int,
     background: float,
     up: Float[Tensor, "3"] | None = None,
-) -> tuple[Float[Tensor, "frame 3 height width"], Float[Tensor, "frame 1 height width"]]:
+) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
     """`render_views` on a full turn, that starts at the reference camera, about the pivot and the direction up.
 
     A photograph does not tell where gravity points: by default, up is where the camera's own up is.
@@ -35,22 +37,18 @@ def orbit_views(
 
 @torch.no_grad()
 def render_views(
-    rasterizer: Rasterizer,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    background: float,
-    chunk: int = 8,
-) -> tuple[Float[Tensor, "frame 3 height width"], Float[Tensor, "frame 1 height width"]]:
-    """Images of one unbatched scene from several cameras, `chunk` at a time, and expected depths (0: nothing seen)."""
+    rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: float
+) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
+    """Images of one unbatched scene from several cameras, and expected depths (0: nothing seen)."""
     images, depths = [], []
-    for start in range(0, len(cameras.world_to_camera), chunk):
-        rendering = rasterizer(gaussians[None], cameras[start : start + chunk][None])
+    for start in range(0, len(cameras.world_to_camera), CHUNK):
+        rendering = rasterizer(gaussians[None], cameras[start : start + CHUNK][None])
         images.append(rendering.over(background)[0])
         depths.append(rendering.expected_depth()[0])
     return torch.cat(images), torch.cat(depths)
 
 
-def write_video(path: str | Path, frames: Float[Tensor, "frame 3 height width"], fps: int = 24) -> None:
+def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
     """Write an H.264 `.mp4` (yuv420p) of images (sRGB, 0 to 1).
 
     Small images are enlarged by a whole factor until their shorter side has at least 256 px. H.264 needs even sizes: an

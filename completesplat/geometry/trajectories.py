@@ -9,10 +9,10 @@ from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, look_at
 
+Vector = Float[Tensor, "3"]
 
-def orbit(
-    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int, degrees: float = 360.0
-) -> Cameras:
+
+def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: float = 360.0) -> Cameras:
     """Cameras that circle the axis through `pivot` along `up`, starting at the reference camera.
 
     The reference camera (unbatched) keeps its distance and height; every camera looks at `pivot`. The last frame
@@ -31,9 +31,7 @@ def orbit(
     return _looking_at(reference, eyes, pivot, axis)
 
 
-def swipe(
-    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int, reach: float = 0.3
-) -> Cameras:
+def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: float = 0.3) -> Cameras:
     """Cameras that go to the left, to the right and back on a level straight line, looking at `pivot`.
 
     They start at the reference camera (unbatched), slow down towards both ends, and stop one step before the start, so
@@ -48,9 +46,7 @@ def swipe(
     return _looking_at(reference, reference.centers - reach * angles.sin()[:, None] * right, pivot, up)
 
 
-def wobble(
-    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int, radius: float = 0.1
-) -> Cameras:
+def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: float = 0.1) -> Cameras:
     """Cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
 
     The circle lies across the direction of `pivot`, begins on the right and goes up first; the last frame stops one
@@ -72,17 +68,13 @@ def _full_turn(frames: int, like: Tensor) -> Float[Tensor, " frame"]:
     return torch.arange(frames, dtype=like.dtype, device=like.device) / frames * (2 * math.pi)
 
 
-def _sideways(
-    reference: Cameras, pivot: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+def _sideways(reference: Cameras, pivot: Vector, up: Vector) -> tuple[Vector, Vector]:
     """Right and up across the direction of the pivot, as long as the pivot is away."""
     forward = pivot - reference.centers
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     return right * forward.norm(), torch.linalg.cross(right, forward)
 
 
-def _looking_at(
-    reference: Cameras, eyes: Float[Tensor, "frame 3"], pivot: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> Cameras:
+def _looking_at(reference: Cameras, eyes: Float[Tensor, "frame 3"], pivot: Vector, up: Vector) -> Cameras:
     intrinsics = reference.intrinsics.expand(len(eyes), 3, 3)
     return replace(reference, world_to_camera=look_at(eyes, pivot, up), intrinsics=intrinsics)

@@ -1,6 +1,5 @@
 """Which of the surfaces that one camera sees another camera sees too, by true depth."""
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -27,13 +26,10 @@ def hidden_from(
     places, ahead = project(reference, points)
     inside = (ahead > 0) & (places >= 0).all(-1) & (places < places.new_tensor([width, height])).all(-1)
     # The furthest of the four pixels around the point: at an edge it may belong to either side.
-    around = torch.stack([(places - 0.5 + step).floor() for step in _corners(places)])
+    corners = places.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
+    around = (places - 0.5 + corners[:, None, None]).floor()
     columns, rows = around.nan_to_num().long().unbind(-1)
     shown = reference_depth[0][rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
     hidden = ~inside | (ahead > (1 + TOLERANCE) * shown.amax(0))
     known = (depths.flatten(1) > 0) & (~inside | (shown > 0).all(0))
     return (hidden & known).view(-1, height, width), known.view(-1, height, width)
-
-
-def _corners(like: Tensor) -> Float[Tensor, "4 2"]:
-    return like.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]])

@@ -97,7 +97,13 @@ class PerceptualDistance(nn.Module):
     def forward(
         self, first: Float[Tensor, "image 3 height width"], second: Float[Tensor, "image 3 height width"]
     ) -> Float[Tensor, " image"]:
-        """Distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
+        """Distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels.
+
+        The weights follow the images to their device.
+        """
+        # Weights that moved in inference mode (a validation before the first step) could not take part in training.
+        with torch.inference_mode(False):
+            self.to(first.device)
         layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)
         maps = [nn.functional.conv2d((one - other).square(), head) for head, one, other in layers]
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
@@ -121,25 +127,17 @@ def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
 class LearnedPerceptualSimilarity:
     """LPIPS with VGG16, averaged over the views (paper, Eq. 1, third term); always in float32.
 
-    The network is no part of the trained module, so no checkpoint holds it; it follows the images to their device.
+    The network is no part of the trained module, so no checkpoint holds it.
 
     Args:
-        vgg_weights: torchvision's `vgg16` state dict: a file, or a URL that is downloaded into torch's hub cache once.
-        vgg_sha256: SHA-256 of that file, or its first digits; None takes any file of the right layout.
-
-    Raises:
-        WeightsError: the weights are missing, cannot be downloaded, are another file, or have another layout.
+        vgg_weights, vgg_sha256: see `load_vgg16`; None as the latter takes any file of the right layout.
     """
 
     def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:
         self.distance = PerceptualDistance(load_vgg16(vgg_weights, vgg_sha256), load_heads())
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]:
-        device = prediction.images.device
-        # Weights that moved in inference mode (a validation before the first step) could not take part in training.
-        with torch.inference_mode(False):
-            self.distance.to(device)
-        with torch.autocast(device.type, enabled=False):
+        with torch.autocast(prediction.images.device.type, enabled=False):
             pair = (images.flatten(0, 1).float() for images in (prediction.images, truth.images))
             distances: Tensor = self.distance(*pair)
             return distances.mean()

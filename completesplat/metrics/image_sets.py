@@ -31,15 +31,12 @@ class SetMetric(Protocol):
 
     def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """What is kept of images with values in [0, 1]; whatever it draws for an image depends on its seed only."""
-        ...
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """Figures by name, lower is better."""
-        ...
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """What figures depend on, by their names."""
-        ...
 
 
 class ImageSets:
@@ -149,9 +146,7 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256) -> Inception
 
     A TorchScript file is a program, not mere weights: only the one with this SHA-256 (or these first digits of it) is
     run. With None any file is run, and whoever gives it vouches for it. A URL is downloaded into torch's hub cache.
-
-    Raises:
-        WeightsError: the file is missing, cannot be downloaded, is another one, or is no such network.
+    `WeightsError`: the file is missing, cannot be downloaded, is another one, or is no such network.
     """
     path = weights_file(weights, sha256, DOWNLOAD_ADVICE, "evaluation.scoring.sets.inception.sha256")
     try:
@@ -171,9 +166,7 @@ def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor
     """Squared Frechet distance of the normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6), in float64.
 
     Needs far more items than features for a trustworthy value; sets of different sizes must not be compared.
-
-    Raises:
-        ValueError: a set of less than two.
+    `ValueError`: a set of less than two.
     """
     from torchmetrics.image.fid import FrechetInceptionDistance
 
@@ -197,10 +190,8 @@ def kernel_distance(
     """Squared maximum mean discrepancy, unbiased, hence at times below zero (Binkowski et al. 2018, Section 4).
 
     The kernel is (x.y / features + 1)^3. The mean over random subsets of at most `subset_size` items, in float64 and
-    not multiplied by 1000; where a set is larger than a subset, it depends on the order of the items.
-
-    Raises:
-        ValueError: a set of less than two.
+    not multiplied by 1000; where a set is larger than a subset, it depends on the order of the items. `ValueError`: a
+    set of less than two.
     """
     from torchmetrics.image.kid import poly_mmd
 

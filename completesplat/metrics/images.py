@@ -76,20 +76,7 @@ def object_only(
     return torch.where(masks > 0.5, images, torch.zeros_like(images))
 
 
-class PerceptualMetric:
-    """LPIPS with VGG16 of each pair of images with values in [0, 1]: the paper's (Tables 2 to 5)."""
-
-    def __init__(self, distance: PerceptualDistance) -> None:
-        self.distance = distance
-
-    def __call__(self, predicted: Images, true: Images) -> PerImage:
-        distances: Tensor = self.distance.to(predicted.device)(predicted, true)
-        return distances
-
-
-def perceptual_metric(
-    vgg_weights: str | None, vgg_sha256: str | None = None
-) -> Callable[[Tensor, Tensor], Tensor] | Missing:
-    """LPIPS, or why there is none; see `load_vgg16` for the weights."""
-    load = lambda weights: PerceptualMetric(PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads()))  # noqa: E731
+def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | Missing:
+    """LPIPS with VGG16, the paper's (Tables 2 to 5), or why there is none; see `load_vgg16` for the weights."""
+    load = lambda weights: PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())  # noqa: E731
     return unless_missing(vgg_weights, load, ADVICE, ("lpips",))

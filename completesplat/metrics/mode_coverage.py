@@ -40,11 +40,7 @@ def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
 
 
 def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
-    """The mode that each sample belongs to, or `REJECTED`.
-
-    Raises:
-        ValueError: fewer than two modes, equal ones, or no pixels.
-    """
+    """The mode of each sample, or `REJECTED`. `ValueError`: fewer than two modes, equal ones, or no pixels."""
     if len(modes) < 2 or not modes.shape[1]:
         raise ValueError("needs two modes and a pixel")
     between = distances(modes, modes).fill_diagonal_(torch.inf)
@@ -67,8 +63,7 @@ def mean_of(
 def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
     """Scores of one scene; samples and modes are the region's pixels, those of all its views in one row.
 
-    Raises:
-        ValueError: no samples, or what `classify` refuses.
+    `ValueError`: no samples, or what `classify` refuses.
     """
     if not len(samples):
         raise ValueError("needs a sample")
@@ -104,8 +99,7 @@ def spread_and_error(
 ) -> tuple[PerPixel, PerPixel]:
     """Variance over the samples (unbiased) and squared error of their mean, each a mean over the three channels.
 
-    Raises:
-        ValueError: fewer than two samples.
+    `ValueError`: fewer than two samples.
     """
     if len(samples) < 2:
         raise ValueError("needs two samples")

@@ -196,10 +196,8 @@ def proper_scores(
     for region, pixels in counted.items():
         drawn = images.movedim(2, -1)[:, pixels].flatten(1).float()
         true = novel.images.movedim(1, -1)[pixels].flatten().float()
-        scores[region, "novel", "energy"], scores[region, "novel", "crps"] = (
-            energy_score(drawn, true),
-            crps(drawn, true),
-        )
+        scores[region, "novel", "energy"] = energy_score(drawn, true)
+        scores[region, "novel", "crps"] = crps(drawn, true)
         ranks[region] = rank_histogram(drawn, true).tolist()
     return scores, ranks
 
@@ -231,21 +229,15 @@ def depth_errors(
 
 
 def best(scores: Sequence[float], higher_is_better: bool = True) -> int:
-    """The index of the best sample, the first of equals.
-
-    Raises:
-        ValueError: there is no score, or one is no number.
-    """
+    """The index of the best sample, the first of equals. `ValueError`: there is no score, or one is no number."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
 
 def expected_best_curve(scores: Sequence[float], higher_is_better: bool = True) -> list[float]:
     """Entry j - 1 is the mean, over all choices of j of the k samples, of the best score among the j.
 
-    Of k scores from worst to best, the i-th is the best of C(i - 1, j - 1) of the C(k, j) choices.
-
-    Raises:
-        ValueError: there is no score, or one is no number.
+    Of k scores from worst to best, the i-th is the best of C(i - 1, j - 1) of the C(k, j) choices. `ValueError`: there
+    is no score, or one is no number.
     """
     worst_first, k = _worst_first(scores, higher_is_better), len(scores)
     return [sum(comb(i, j) * score for i, score in enumerate(worst_first)) / comb(k, j + 1) for j in range(k)]
@@ -260,8 +252,7 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
 def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
     """Root mean square difference of two samples' renders, mean over all pairs of samples and all views.
 
-    Raises:
-        ValueError: less than two samples.
+    `ValueError`: less than two samples.
     """
     if len(images) < 2:
         raise ValueError("needs two samples")

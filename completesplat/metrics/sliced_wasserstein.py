@@ -22,8 +22,7 @@ SMALLEST_DEVIATION = 1e-4  # A fortieth of a step of 8 bits: less is rounding, a
 def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image 3 _ _"]]:
     """Burt and Adelson's pyramid, full resolution first, each level half the one before, the last a small image.
 
-    Raises:
-        ValueError: the images are smaller than 16 pixels.
+    `ValueError`: the images are smaller than 16 pixels.
     """
     if min(images.shape[-2:]) < SMALLEST_SIDE:
         raise ValueError(f"needs images of at least {SMALLEST_SIDE} pixels")
@@ -54,10 +53,8 @@ def descriptors(
     """Patches of each level of the pyramid, not yet normalised; those of all images of a set are concatenated.
 
     An image's patches depend on itself and its seed only, so a set may be described in parts, by several processes. A
-    prediction and its truth share their seeds.
-
-    Raises:
-        ValueError: the images are smaller than 16 pixels, or another number of seeds.
+    prediction and its truth share their seeds. `ValueError`: the images are smaller than 16 pixels, or another number
+    of seeds.
     """
     if len(seeds) != len(images):
         raise ValueError(f"{len(images)} images need as many seeds, not {len(seeds)}")
@@ -73,19 +70,15 @@ def descriptors(
     return described
 
 
-def sliced_wasserstein(
-    first: Sequence[Float[Tensor, "_ 147"]], second: Sequence[Float[Tensor, "_ 147"]], seed: int = 0
-) -> float:
+def sliced_wasserstein(first: Sequence[Float[Tensor, "_ 147"]], second: Sequence[Float[Tensor, "_ 147"]]) -> float:
     """Mean over the levels of two sets' descriptors, multiplied by 1000 as in the paper's tables.
 
-    Blind to brightness and contrast, which the normalisation of each set removes. `seed` is of the projections.
-
-    Raises:
-        ValueError: sets of different sizes.
+    Blind to brightness and contrast, which the normalisation of each set removes. The projections are always the same.
+    `ValueError`: sets of different sizes.
     """
     if [len(level) for level in first] != [len(level) for level in second]:
         raise ValueError("needs two sets of one size")
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     distances = []
     for one, other in zip(first, second, strict=True):
         sets = _normalized(one), _normalized(other)

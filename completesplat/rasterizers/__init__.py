@@ -68,7 +68,6 @@ class Rasterizer(Protocol):
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Gaussians of batch shape [batch], cameras of batch shape [batch view]."""
-        ...
 
 
 def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:

@@ -29,11 +29,6 @@ FASTER: dict[str, Callable[[RenderingConstants | None], Rasterizer]] = {"cuda": 
 """Backends that may not work everywhere, the fastest first."""
 
 
-def available(constants: RenderingConstants | None = None) -> dict[str, bool]:
-    """The names of all backends, with whether each renders correctly here and honours the constants."""
-    return {name: failure(name, constants) is None for name in FASTER} | {"reference": True}
-
-
 def auto(constants: RenderingConstants | None = None) -> Rasterizer:
     """The fastest backend that works here and honours the constants; the choice and its reasons are logged.
 
@@ -52,11 +47,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
 
 
 def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
-    """The `cuda` backend, for training that would take far too long without it.
-
-    Raises:
-        CompleteSplatError: it does not work here; the line says what to choose instead.
-    """
+    """The `cuda` backend, without which training takes far too long. `CompleteSplatError`: it does not work here."""
     try:
         return CudaRasterizer(constants)
     except CompleteSplatError as error:

@@ -67,7 +67,10 @@ class MetricsFile(ExperimentWriter):
         if new or not self.begun:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
-            self._replace([*old, *self.metrics])
+            with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
+                writer = csv.DictWriter(file, self.metrics_keys)
+                writer.writeheader()
+                writer.writerows([*old, *self.metrics])
         else:
             with self.path.open("a", newline="") as file:
                 csv.DictWriter(file, self.metrics_keys).writerows(self.metrics)
@@ -81,12 +84,6 @@ class MetricsFile(ExperimentWriter):
             rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
         first = min(row["step"] for row in self.metrics)
         return [row for row in rows if self.begun or int(row["step"]) < first]
-
-    def _replace(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.metrics_keys)
-            writer.writeheader()
-            writer.writerows(rows)
 
 
 class WandbRun(WandbLogger):

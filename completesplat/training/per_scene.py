@@ -8,7 +8,6 @@ from completesplat.baselines.fitting import FittingSettings, fit_gaussians
 from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.data.loading.distributed import gathered
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras
 from completesplat.losses import WeightedSum
 from completesplat.scene import SceneBatch
 from completesplat.splatter_image import Parameterization, SplatterImage
@@ -30,10 +29,7 @@ class PerScene(SceneModule):
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene to its reference and all its targets."""
-
-        def render(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
-            return self.rasterizer(gaussians, cameras).over(self.background)
-
+        render = lambda gaussians, cameras: self.rasterizer(gaussians, cameras).over(self.background)  # noqa: E731
         generator = torch.Generator().manual_seed(seed)
         with torch.autocast(self.device.type, enabled=False):
             views = scenes.all_views()

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.autoreconstructor.model import Reconstruction
-from completesplat.baselines.autodecoder import AutoDecoder, optimize_codes
+from completesplat.baselines.autodecoder import AutoDecoder, Codes, optimize_codes
 from completesplat.data.sequences import SequenceSource
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.gaussians import Gaussians
@@ -56,7 +56,7 @@ class ReconstructorOnly(ReconstructionModule):
         """Gaussians from new codes that make the reference view look right; the seed decides where they start."""
         return self.gaussians(self.infer_codes(scenes, seed), scenes)
 
-    def infer_codes(self, scenes: SceneBatch, seed: int) -> Float[Tensor, "batch channel height width"]:
+    def infer_codes(self, scenes: SceneBatch, seed: int) -> Codes:
         """Codes optimised for the reference views alone, at fixed weights."""
         with torch.inference_mode(False), torch.autocast(self.device.type, enabled=False):
             # Tensors made in inference mode stay unusable for autograd; their copies do not.
@@ -64,14 +64,12 @@ class ReconstructorOnly(ReconstructionModule):
             codes = self.model.new_codes(len(scenes.names), seed)
             return optimize_codes(codes, lambda x: self.reference_loss(x, scenes), self.code_steps, self.code_rate)
 
-    def gaussians(self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch) -> Gaussians:
+    def gaussians(self, codes: Codes, scenes: SceneBatch) -> Gaussians:
         """Gaussians from codes."""
         image: SplatterImage = self.model(codes)
         return image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
-    def reference_loss(
-        self, codes: Float[Tensor, "batch channel height width"], scenes: SceneBatch
-    ) -> Float[Tensor, ""]:
+    def reference_loss(self, codes: Codes, scenes: SceneBatch) -> Float[Tensor, ""]:
         """The loss of the reference views alone, at the step that training has come to."""
         views: Views = scenes.reference.map(lambda tensor: tensor[:, None])
         gaussians = self.gaussians(codes, scenes)

@@ -63,11 +63,9 @@ class Samples(DrawsFixedScenes):
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=keep)
         pair = [0, 1 + (len(views.images[0]) - 1) // 2]  # the reference, and the middle one of the targets
-        with torch.autocast(module.device.type, enabled=False):
-            cameras = views.cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
-            seen = module.rasterizer(gaussians, cameras)
-            of_pair = views.cameras[:, pair]
-            denoising = [module.rasterizer(part, of_pair).over(module.background)[0] for _, part in shown.values()]
+        cameras = views.cameras[0]
+        seen = module.render_from(gaussians, cameras)
+        denoising = [module.render_from(part, cameras[pair]).over(module.background)[0] for _, part in shown.values()]
         return SceneDrawings(
             views.images[0],
             seen.over(module.background).clamp(0, 1),

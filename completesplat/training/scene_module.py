@@ -25,16 +25,15 @@ from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 
 Result = TypeVar("Result")
+Renders = Float[Tensor, "batch view 3 height width"]
 
 
-def copy_reference(scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
+def copy_reference(scenes: SceneBatch) -> Renders:
     """The reference image for every view. A model that does not beat this and `repeat_image` has learned nothing."""
     return scenes.reference.images[:, None].expand_as(scenes.all_views().images)
 
 
-def repeat_image(
-    image: Float[Tensor, "3 height width"], scenes: SceneBatch
-) -> Float[Tensor, "batch view 3 height width"]:
+def repeat_image(image: Float[Tensor, "3 height width"], scenes: SceneBatch) -> Renders:
     """One image for every view: with the training set's mean image, the best constant prediction of the MSE."""
     return image.to(scenes.reference.images).expand_as(scenes.all_views().images)
 
@@ -47,9 +46,9 @@ class Timings:
 
     def of(self, name: str, work: Callable[[], Result], scenes: int = 1) -> Result:
         """Do the work, for this number of scenes at once."""
-        start = _now()
+        start = now()
         result = work()
-        self.seconds[name].append((_now() - start) / scenes)
+        self.seconds[name].append((now() - start) / scenes)
         return result
 
     def gather(self) -> None:
@@ -64,7 +63,8 @@ class Timings:
         return {name: statistics.median(values[1:] or values) for name, values in self.seconds.items()}
 
 
-def _now() -> float:
+def now() -> float:
+    """Seconds, when the GPU, if there is one, has finished its work."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -145,7 +145,7 @@ class SceneModule(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, everywhere)
 
-    def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch view 3 height width"]:
+    def render(self, gaussians: Gaussians, scenes: SceneBatch) -> Renders:
         """The reference view and all targets, in full precision even where the network runs in less."""
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
@@ -175,17 +175,14 @@ class SceneModule(LightningModule):
             rendered = self.timings.of("rendering", partial(self.render_from, own, cameras[b]), evaluation.samples)
             images = upsampled(rendered.over(self.background), truth.cameras.image_size)
             evaluation.update_samples(name, images, truth[b])
-            self._score_depth(name, rendered[0].expected_depth(), truth[b])
+            depths = truth.depths
+            if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
+                evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
             if self.on_scene_scored is not None:
                 shown = seen.reference.images[b] * seen.visible[b]
                 self.on_scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
         evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
-
-    def _score_depth(self, name: str, predicted: Float[Tensor, "view 1 _ _"], truth: Views) -> None:
-        """Where the truth is known, at the size of the renders."""
-        if truth.depths is not None and truth.depths.shape == predicted.shape:
-            self.evaluation.update_depth(name, predicted, truth)
 
     def on_test_end(self) -> None:
         loader: Any = self.trainer.test_dataloaders

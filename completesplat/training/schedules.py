@@ -14,17 +14,13 @@ def exponential(
 
     The paper follows Marigold without giving numbers; warm-up and ratio are Marigold's.
     """
-    decay = _after_warmup(lambda progress: math.exp(math.log(final_ratio) * progress), total_steps, warmup_steps)
-    return LambdaLR(optimizer, decay)
+    return _after_warmup(optimizer, lambda x: math.exp(math.log(final_ratio) * x), total_steps, warmup_steps)
 
 
 def cosine(optimizer: Optimizer, total_steps: float, warmup_steps: int = 100, final_ratio: float = 0.01) -> LambdaLR:
     """Linear warm-up, then half a cosine down to `final_ratio` at the end."""
-
-    def decay(progress: float) -> float:
-        return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * progress))
-
-    return LambdaLR(optimizer, _after_warmup(decay, total_steps, warmup_steps))
+    half_a_cosine = lambda x: final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))  # noqa: E731
+    return _after_warmup(optimizer, half_a_cosine, total_steps, warmup_steps)
 
 
 def constant(optimizer: Optimizer, total_steps: float) -> LambdaLR:
@@ -32,7 +28,9 @@ def constant(optimizer: Optimizer, total_steps: float) -> LambdaLR:
     return LambdaLR(optimizer, lambda step: 1.0)
 
 
-def _after_warmup(decay: Callable[[float], float], total_steps: float, warmup_steps: int) -> Callable[[int], float]:
+def _after_warmup(
+    optimizer: Optimizer, decay: Callable[[float], float], total_steps: float, warmup_steps: int
+) -> LambdaLR:
     """A linear rise, then `decay` of the share of the other steps that is done: none in a run without an end."""
 
     def factor(step: int) -> float:
@@ -40,4 +38,4 @@ def _after_warmup(decay: Callable[[float], float], total_steps: float, warmup_st
             return (step + 1) / warmup_steps
         return decay(min(1.0, (step - warmup_steps) / max(1, total_steps - warmup_steps)))
 
-    return factor
+    return LambdaLR(optimizer, factor)

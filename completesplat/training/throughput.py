@@ -8,6 +8,8 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
+from completesplat.training.scene_module import now
+
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
 STATUS = Path("/proc/self/status")
 
@@ -37,11 +39,11 @@ class Throughput(Callback):
         self.step = trainer.global_step
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.pause = _now(pl_module)
+        self.pause = now()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.clock.begin is not None:
-            self.paused += _now(pl_module) - self.pause
+            self.paused += now() - self.pause
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -51,7 +53,7 @@ class Throughput(Callback):
         interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not stepped or not interval or trainer.global_step % interval or self.clock.begin is None:
             return
-        seconds = _now(pl_module) - self.clock.begin - self.paused
+        seconds = now() - self.clock.begin - self.paused
         values = {
             "speed/scenes_per_second": self.scenes * trainer.world_size / seconds,
             "speed/data_wait": self.clock.waited / seconds,
@@ -95,10 +97,3 @@ def memory(device: torch.device) -> dict[str, float]:
     if device.type == "cuda":
         values["memory/gpu_gb"] = torch.cuda.max_memory_allocated(device) / 2**30
     return values
-
-
-def _now(module: LightningModule) -> float:
-    """Seconds, when the device has finished its work."""
-    if module.device.type == "cuda":
-        torch.cuda.synchronize(module.device)
-    return time.perf_counter()

@@ -4,7 +4,7 @@ import pytest
 import torch
 from diffusers import FlowMatchEulerDiscreteScheduler
 
-from completesplat.diffusion.objective import clean_estimate, draw_timesteps, target
+from completesplat.diffusion.objective import clean_estimate, target
 from completesplat.diffusion.sampling import Sampler, with_forward_process
 from completesplat.errors import CompleteSplatError
 
@@ -46,7 +46,7 @@ def test_a_perfect_denoiser_takes_noise_to_the_latent_in_any_number_of_steps(sam
 
 def test_training_favours_the_middle_of_the_way(sampler):
     torch.manual_seed(0)
-    drawn = draw_timesteps(sampler.scheduler, 20_000, torch.device("cpu"))
+    drawn = sampler.draw_timesteps(20_000, torch.device("cpu"))
     assert drawn.min() >= 1
     assert drawn.max() <= 1000
     # The logistic of a standard normal: P(t < 0.2) = P(z < log(0.2 / 0.8)) = 0.0828.

@@ -5,8 +5,7 @@ import inspect
 import logging
 import os
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,8 +30,12 @@ def kernel(function: Callable[..., Any]) -> Any:
     directory = _cache_directory()
     if directory is None:
         return numba.njit(**OPTIONS)(inspect.unwrap(function))
-    with _numba_cache_in(directory):
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(directory)
+    try:
         return numba.njit(cache=True, **OPTIONS)(inspect.unwrap(function))
+    finally:
+        numba_config.CACHE_DIR = before
 
 
 def helper(function: Callable[..., Any]) -> Any:
@@ -62,13 +65,3 @@ def _cache_directory() -> Path | None:
         return folder
     logger.info("no writable cache folder (%s): kernels are compiled anew in every process", bases[-1])
     return None
-
-
-@contextmanager
-def _numba_cache_in(directory: Path) -> Iterator[None]:
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(directory)
-    try:
-        yield
-    finally:
-        numba_config.CACHE_DIR = before

@@ -234,13 +234,7 @@ def row_gradients(slope_x, slope_y, inverse_z, root, camera, rotation, blur, sum
     row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
     grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
     grad_root = add_each(outer(row_x, grad_a), outer(row_y, grad_b))
-    return (
-        grad_center_x,
-        grad_center_y,
-        matrix_times_column(root, grad_a),
-        matrix_times_column(root, grad_b),
-        grad_root,
-    )
+    return grad_center_x, grad_center_y, matrix_times_column(root, grad_a), matrix_times_column(root, grad_b), grad_root
 
 
 @helper
