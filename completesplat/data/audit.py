@@ -1,20 +1,18 @@
 """Reading a whole data set once: what of it can be used, and what cannot and why."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-import torch
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
@@ -89,7 +87,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
     sequences, batches = list[_Sequence](), _batches(sources)
     with Progress(disable=not progress) as bar:
         task = bar.add_task("reading sequences", total=sum(map(len, batches)))
-        for batch in _read_batches(sources, batches, workers):
+        for batch in map_in_processes(partial(_read_batch, sources), batches, workers):
             sequences += batch
             bar.advance(task, len(batch))
     refused += [error for sequence in sequences for error in sequence.refused]
@@ -158,25 +156,8 @@ def _batches(sources: Sources) -> list[_Batch]:
     return batches
 
 
-def _read_batches(sources: Sources, batches: list[_Batch], workers: int | None) -> Iterator[list[_Sequence]]:
-    workers = min(workers or os.cpu_count() or 1, len(batches))
-    if workers <= 1:
-        yield from ([_read(sources, *item) for item in batch] for batch in batches)
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker, (dict(sources),)) as pool:
-        yield from pool.map(_read_in_worker, batches)
-
-
-_sources_of_worker: dict[str, SequenceSource] = {}
-
-
-def _start_worker(sources: dict[str, SequenceSource]) -> None:
-    torch.set_num_threads(1)
-    _sources_of_worker.update(sources)
-
-
-def _read_in_worker(batch: _Batch) -> list[_Sequence]:
-    return [_read(_sources_of_worker, *item) for item in batch]
+def _read_batch(sources: Sources, batch: _Batch) -> list[_Sequence]:
+    return [_read(sources, *item) for item in batch]
 
 
 def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:

@@ -59,11 +59,7 @@ class KnowsHiddenModes(Protocol):
 
 
 def hidden_modes(data: Any, views: int, spread_views: int) -> HiddenModeScenes:
-    """What `data.hidden_modes` gives.
-
-    Raises:
-        CompleteSplatError: the data module knows of no hidden modes, or its files are not those that it made.
-    """
+    """What `data.hidden_modes` gives; `CompleteSplatError` if it knows of none, or has files that it did not make."""
     if not isinstance(data, KnowsHiddenModes):
         raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
     return data.hidden_modes(views, spread_views)

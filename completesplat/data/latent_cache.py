@@ -150,11 +150,7 @@ class ArrayWriter:
 
 
 def open_array(root: Path, array: Array) -> np.memmap:
-    """A stored array; nothing of it is read yet.
-
-    Raises:
-        DataError: missing, cut short, or with another shape or type than the manifest says.
-    """
+    """A stored array, of which nothing is read yet; `DataError` if missing, cut short or not as the manifest says."""
     with at(file=root / MANIFEST):
         path = inside(root, array.file)
     with at(file=require_file(path)):
@@ -192,11 +188,7 @@ class LatentCache:
         self.holds_pictures = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
-        """The frame at a place in a sequence, without batch axis; features as they were stored, in float32.
-
-        Raises:
-            DataError: it is not in the store.
-        """
+        """The frame at a place in a sequence, without batch axis, in float32; `DataError` if it was not encoded."""
         sequence = self.sequences[name]
         if frame not in sequence.stored:
             raise DataError("was not encoded", str(self.folder), name, frame)

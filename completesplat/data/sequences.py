@@ -59,16 +59,12 @@ class SequenceSource(Protocol):
     listed: int
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence: its cameras now, its pictures when `PosedSequence.read` is called.
-
-        Raises:
-            DataError: it cannot be used as a whole.
-        """
+        """One sequence: its cameras now, its pictures when `PosedSequence.read` is called. `DataError` if unusable."""
         ...
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Indices into `names` of the sequences that are best read one after the other."""
-        ...
+        """Indices into `names` of the sequences that are best read one after the other; by default any order does."""
+        return [list(range(len(names)))]
 
     def fingerprint(self) -> str:
         """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""

@@ -85,11 +85,7 @@ def refused_to(refuse: Refuse) -> Iterator[None]:
 
 
 def require_file(path: Path) -> Path:
-    """The path itself.
-
-    Raises:
-        MissingFile: no such file.
-    """
+    """The path itself; `MissingFile` if there is no such file."""
     # `Path.is_file` raises where a name is too long or a folder may not be entered.
     if not os.path.isfile(path):
         raise MissingFile("no such file", str(path))
@@ -135,12 +131,7 @@ def read_json(path: Path, allow_nan: bool = False) -> Any:
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """The content of a text file in UTF-8.
-
-    Raises:
-        MissingFile: no such file.
-        UnreadableFile: no text, or too large.
-    """
+    """The content of a text file in UTF-8; `MissingFile` if there is none, `UnreadableFile` if no text or too large."""
     try:
         return _read(path, most_bytes).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -148,12 +139,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
 
 def read_vertices(path: Path) -> tuple[PlyElement, np.ndarray]:
-    """The vertices of a PLY file, and their places [n 3] in float64.
-
-    Raises:
-        MissingFile: no such file.
-        UnreadableFile: no PLY with vertices.
-    """
+    """The vertices of a PLY file, and their places [n 3] in float64; errors as of `read_text`."""
     require_file(path)
     try:
         vertices = PlyData.read(str(path))["vertex"]
@@ -163,11 +149,7 @@ def read_vertices(path: Path) -> tuple[PlyElement, np.ndarray]:
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
-    """A value of a JSON object.
-
-    Raises:
-        BadAnnotation: no object, without this key, or with a value of another type than `kind` (true is no `int`).
-    """
+    """A value of a JSON object; `BadAnnotation` if it is missing or of another type than `kind` (true is no `int`)."""
     if type(entry) is not dict or key not in entry:
         raise BadAnnotation(f"no {key} in {_shortened(entry)}")
     value = entry[key]
@@ -178,11 +160,7 @@ def field(entry: object, key: str, kind: type[T]) -> T:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Numbers from JSON as a float64 array.
-
-    Raises:
-        BadAnnotation: not numbers, another shape, or NaN or infinity among them.
-    """
+    """Numbers from JSON as a float64 array; `BadAnnotation` for anything else, another shape, NaN or infinity."""
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
@@ -194,27 +172,6 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
     if not np.isfinite(array).all():
         raise BadAnnotation(f"{what} is not finite: {_shortened(value)}")
     return array.astype(np.float64)
-
-
-def optional_field(entry: object, key: str, kind: type) -> Any:
-    """A field of a JSON object that may be null.
-
-    Raises:
-        BadAnnotation: missing, or neither null nor of this kind.
-    """
-    return None if isinstance(entry, dict) and entry.get(key, "") is None else field(entry, key, kind)
-
-
-def list_field(entry: object, key: str, kind: type) -> tuple[Any, ...]:
-    """A list in a JSON object, all of its items of one kind.
-
-    Raises:
-        BadAnnotation: missing, no list, or with another item.
-    """
-    items = field(entry, key, list)
-    if not all(type(item) is kind for item in items):
-        raise BadAnnotation(f"{key} must be a list of {kind.__name__}")
-    return tuple(items)
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:

@@ -1,8 +1,10 @@
-"""CO3D v2's annotations: frames and their cameras, without PyTorch3D.
+"""CO3D v2's annotations: frames and their cameras, read and written without PyTorch3D.
 
 Layout: facebookresearch/co3d, `co3d/dataset/data_types.py`.
 """
 
+import gzip
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from plyfile import PlyData, PlyElement
 
 from completesplat.data.validation import (
     BadAnnotation,
@@ -26,6 +30,8 @@ from completesplat.data.validation import (
 )
 from completesplat.geometry.cameras import Cameras
 
+# From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
+FLIP = np.diag([-1.0, -1.0, 1.0])
 VIEWPOINT_SHAPES = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
 
 
@@ -86,11 +92,7 @@ def _optional_number(entry: dict[str, Any], key: str) -> float | None:
 def read_frames(
     root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
 ) -> dict[str, dict[int, CO3DFrame]]:
-    """The frames in `frame_annotations.jgz` by sequence and number, as far as they are `wanted`.
-
-    Raises:
-        DataError: the file is missing, unreadable or no list.
-    """
+    """The frames in `frame_annotations.jgz` by sequence and number, as far as they are `wanted`; see `read_videos`."""
     frames: dict[str, dict[int, CO3DFrame]] = {}
     for index, entry in enumerate(_read_list(path)):
         with refused_to(refuse), at(path):
@@ -159,7 +161,45 @@ def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) 
         raise BadCamera(f"focal_length must be positive and finite, not {viewpoint['focal_length']}")
     if not ((center > 0) & (center < 2 * half)).all():
         raise BadCamera(f"principal point ({center[0]:g}, {center[1]:g}) lies outside of the {width} x {height} image")
-    flip, world_to_camera = np.diag([-1.0, -1.0, 1.0]), np.eye(4)
-    world_to_camera[:3, :3], world_to_camera[:3, 3] = flip @ numbers["R"].T, flip @ numbers["T"]
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = FLIP @ numbers["R"].T, FLIP @ numbers["T"]
     intrinsics = np.array([[focal[0], 0, center[0]], [0, focal[1], center[1]], [0, 0, 1]])
     return Cameras(torch.from_numpy(world_to_camera), torch.from_numpy(intrinsics), (height, width))
+
+
+def viewpoint(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], focal: list[float], center: list[float]
+) -> dict[str, Any]:
+    """The inverse of `camera_from_viewpoint`; `focal` and `center` are in units of half the picture's sides."""
+    return {
+        "R": (FLIP @ rotation).T.tolist(),
+        "T": (FLIP @ translation).tolist(),
+        "focal_length": focal,
+        "principal_point": center,
+        "intrinsics_format": "ndc_norm_image_bounds",
+    }
+
+
+def sequence_annotation(category: str, name: str, points: int) -> dict[str, Any]:
+    """A sequence without a video, with a point cloud at `name`/pointcloud.ply if it has points."""
+    cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
+    sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud if points else None}
+    return sequence | {"viewpoint_quality_score": 1.0}
+
+
+def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> None:
+    """A point cloud as a binary PLY file."""
+    types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
+    vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+
+
+def write_annotations(
+    category: Path, frames: list[dict[str, Any]], sequences: list[dict[str, Any]], subset: str, lists: dict[str, Any]
+) -> None:
+    """A category's annotations and its set list `subset`: [sequence, frame number, picture] of each split's frames."""
+    for name, content in (("frame_annotations", frames), ("sequence_annotations", sequences)):
+        # A fixed time stamp and no file name in the gzip header: equal content gives equal bytes.
+        (category / f"{name}.jgz").write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
+    (category / "set_lists").mkdir()
+    (category / "set_lists" / f"set_lists_{subset}.json").write_text(json.dumps(lists))

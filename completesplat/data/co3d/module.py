@@ -72,7 +72,6 @@ class CO3DDataModule(SceneDataModule):
         self.validation_targets = evaluation_targets if validation_targets is None else validation_targets
 
     def describe(self) -> dict[str, str | None]:
-        """See `SceneDataModule`."""
         targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
         return {
             "data_set": f"co3d/{self.category}",
@@ -92,7 +91,6 @@ class CO3DDataModule(SceneDataModule):
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
     def packed_settings(self) -> dict[str, Any]:
-        """See `SceneDataModule`."""
         given = ("category", "subset", "allow_shared_sequences")
         seeded = dict(zip(("val_fraction", "test_fraction", "split_seed"), self.seeded, strict=True))
         return {name: getattr(self, name) for name in given} | seeded | vars(self.filters) | vars(self.framing)

@@ -16,7 +16,7 @@ from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
 from completesplat.data.pictures.crop import Square, principal_square, read_square
 from completesplat.data.pictures.files import decode, read_depth
-from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.data.validation import BadCamera, BadPlacement, at, read_vertices
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import crop_resize, invert_rigid, pixel_centers, transform_points, unproject
@@ -72,7 +72,9 @@ def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], capt
     All frames of the sequence, `captured`, tell the axes.
 
     Raises:
-        DataError: what would tell is unreadable, empty, without extent or not finite.
+        DataError: the point cloud, a depth map or a mask is missing or unreadable.
+        BadPlacement: points that are none, in one place or not finite; no foreground with a known depth; optical axes
+            that are parallel, or meet behind the cameras.
     """
     if point_cloud is not None:
         return from_point_cloud(point_cloud, upright_axes(captured))
@@ -97,11 +99,6 @@ def from_point_cloud(path: Path, axes: Axes) -> Placement:
 
     The centre is the points' mean, but upwards the middle between the lowest and the highest; half the size is the
     largest coordinate from there, along the upright axes.
-
-    Raises:
-        MissingFile: no such file.
-        UnreadableFile: no PLY.
-        BadPlacement: no points, points in one place, or points that are not finite.
     """
     _, points = read_vertices(path)
     with at(path):
@@ -113,10 +110,6 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
     Depth maps have outliers: the 99 % quantile counts instead of the largest value, and the 1 % quantile instead of
     the smallest.
-
-    Raises:
-        DataError: a depth map or a mask is missing or unreadable.
-        BadPlacement: no foreground with a known depth.
     """
     count, points = min(len(frames), DEPTH_MAPS), []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
@@ -126,11 +119,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
 
 def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
-    """The point that is nearest to all optical axes; the object is taken to fill the largest square of the pictures.
-
-    Raises:
-        BadPlacement: optical axes that are parallel, or meet behind the cameras.
-    """
+    """The point nearest to all optical axes; the object is taken to fill the largest square of the pictures."""
     world_to_camera = torch.stack([frame.camera.world_to_camera for frame in frames])
     axes, eyes = world_to_camera[:, 2, :3], invert_rigid(world_to_camera)[:, :3, 3]
     # The squared distance of x to an axis is (x - eye)^T P (x - eye), where P takes out the part along the axis.
@@ -182,7 +171,7 @@ class ObjectFraming:
     depth_after: float
 
 
-class CO3DSource:
+class CO3DSource(SequenceSource):
     """The sequences of one split; see `SequenceSource`."""
 
     def __init__(
@@ -196,10 +185,6 @@ class CO3DSource:
         self._members = members
         self._files = files
         self._sequences: dict[str, PosedSequence] = {}
-
-    def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """All in one: every picture is a file of its own."""
-        return [list(range(len(names)))]
 
     def fingerprint(self) -> str:
         """SHA-256 of the annotations; pictures are not looked at."""

@@ -41,11 +41,7 @@ class SeededSplit(NamedTuple):
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
-    """The set list of that name; None where the sequences are to be split by seed.
-
-    Raises:
-        DataError: there is no such set list.
-    """
+    """The set list of that name (`DataError` if it is not there); None where the sequences are to be split by seed."""
     if subset is None:
         return None
     folder = category / "set_lists"
@@ -108,11 +104,7 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
 
 
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
-    """Whole sequences for each split.
-
-    Raises:
-        DataError: fewer than three sequences.
-    """
+    """Whole sequences for each split; `DataError` if there are fewer than three."""
     if len(frames) < FEWEST_SEQUENCES:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)

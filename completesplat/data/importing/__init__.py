@@ -81,16 +81,9 @@ def _write_whole(folder: Path, sequence: str, capture: Capture, hold_out: int, q
 
 
 def _report(folder: Path, sequence: str, written: Written) -> None:
-    logger.info(
-        "%s: sequence %s, %d pictures (%d copied as they are, %d written anew), %d to train, %d to validate and test",
-        folder,
-        sequence,
-        written.frames,
-        written.copied,
-        written.frames - written.copied,
-        written.frames - written.held_out,
-        written.held_out,
-    )
+    files = f"{written.copied} copied as they are, {written.frames - written.copied} written anew"
+    use = f"{written.frames - written.held_out} to train, {written.held_out} to validate and test"
+    logger.info("%s: sequence %s, %d pictures (%s), %s", folder, sequence, written.frames, files, use)
     logger.info("point cloud: %s", f"{written.points} points" if written.points else "none")
     root, batches = shlex.quote(f"data.root={folder.parent}"), "data.batch_size=8 data.references_per_sequence=64"
     # A capture is one sequence, some of whose frames are held out.

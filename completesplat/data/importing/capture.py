@@ -68,12 +68,7 @@ class Capture:
 
 
 def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
-    """The frames by file name.
-
-    Raises:
-        TooFewFrames: fewer than 6.
-        BadAnnotation: a picture is there twice.
-    """
+    """The frames by file name; `TooFewFrames` if fewer than 6, `BadAnnotation` where a picture is there twice."""
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"{len(frames)} frames; a capture needs at least {FEWEST_FRAMES}")
     seen: dict[Path, int] = {}
@@ -102,11 +97,7 @@ def check_lens(lens: Lens) -> Lens:
 
 
 def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
-    """A point cloud, or None if there are no points.
-
-    Raises:
-        BadAnnotation: coordinates that are not finite.
-    """
+    """A point cloud, or None if there are no points; `BadAnnotation` where coordinates are not finite."""
     if not len(points):
         return None
     if not np.isfinite(points).all():

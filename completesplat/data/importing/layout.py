@@ -1,9 +1,8 @@
 """Writes a capture as a category in CO3D v2's layout, its pictures without lens distortion."""
 
-import gzip
-import json
 import shutil
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +12,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from kornia.geometry.calibration import distort_points
 from PIL import Image
-from plyfile import PlyData, PlyElement
 from rich.progress import track
 from torch import Tensor
 
+from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
 from completesplat.data.importing.capture import Capture, CapturedFrame, Lens, PointCloud, read_picture
 from completesplat.data.pictures.files import decode
 from completesplat.data.validation import BadCamera, at
@@ -26,8 +25,6 @@ ROWS_AT_ONCE = 64
 SMALLEST_SHARE = 0.5  # A lens whose picture keeps less of its area is not what its coefficients say.
 
 SUBSET = "imported"
-# From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
-TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
 # Points further from the median point than this multiple of their median distance are taken for stray: the farthest
 # point gives the scale of the scene.
 FARTHEST = 5.0
@@ -136,7 +133,8 @@ class CaptureWriter:
 
     def __init__(self, folder: Path, category: str, sequence: str, quality: int) -> None:
         self.folder, self.category, self.sequence, self.quality = folder, category, sequence, quality
-        self._undistortions: dict[Lens, Undistortion] = {}
+        # Captures have one lens, or one for each frame: keeping more than the last would fill the memory.
+        self._undistortion = lru_cache(maxsize=1)(Undistortion)
         self._copied = 0
 
     def write(self, capture: Capture, hold_out: int, progress: bool) -> Written:
@@ -168,10 +166,7 @@ class CaptureWriter:
             mask = decode(frame.mask, str(frame.mask), "L", size)
         mask = mask or Image.new("L", image.size, 255)
         if any(lens.distortion):
-            # Captures have one lens, or one for each frame: keeping more than the last would fill the memory.
-            if lens not in self._undistortions:
-                self._undistortions = {lens: Undistortion(lens)}
-            undistort = self._undistortions[lens]
+            undistort = self._undistortion(lens)
             image, mask, lens = undistort(image), undistort(mask), undistort.pinhole
         stem = f"frame{number + 1:06d}"
         path = f"{self.sequence}/images/{stem}{'.jpg' if picture.lossy else '.png'}"
@@ -190,35 +185,22 @@ class CaptureWriter:
             "image": {"path": f"{self.category}/{path}", "size": list(lens.image_size)},
             "mask": {"path": f"{self.category}/{mask_path}", "mass": float(np.asarray(mask, dtype=float).sum() / 255)},
             "depth": None,
-            "viewpoint": viewpoint(lens, frame.world_to_camera),
+            "viewpoint": _viewpoint(lens, frame.world_to_camera),
             "meta": {"frame_type": "test_unseen" if held_out else "train_known", "imported_from": frame.image.name},
         }
 
     def _write_cloud(self, cloud: PointCloud) -> int:
         distance = np.linalg.norm(cloud.points - np.median(cloud.points, axis=0), axis=-1)
         kept = distance <= FARTHEST * np.median(distance)
-        types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-        vertices = np.rec.fromarrays([*cloud.points[kept].T, *cloud.colors[kept].T], dtype=types)
-        path = self.folder / self.sequence / "pointcloud.ply"
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
-        return len(vertices)
+        write_points(self.folder / self.sequence / "pointcloud.ply", cloud.points[kept], cloud.colors[kept])
+        return int(kept.sum())
 
     def _write_lists(self, frames: list[dict[str, Any]], held_out: set[int], points: int) -> None:
-        cloud = {"path": f"{self.category}/{self.sequence}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
-        sequence = {
-            "sequence_name": self.sequence,
-            "category": self.category,
-            "video": None,
-            "point_cloud": cloud if points else None,
-            "viewpoint_quality_score": 1.0,
-        }
+        sequence = sequence_annotation(self.category, self.sequence, points)
         keys = [[self.sequence, number, frame["image"]["path"]] for number, frame in enumerate(frames)]
         unseen = [keys[number] for number in sorted(held_out)]
         lists = {"train": [key for key in keys if key not in unseen], "val": unseen, "test": unseen}
-        for name, content in (("frame_annotations", frames), ("sequence_annotations", [sequence])):
-            (self.folder / f"{name}.jgz").write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
-        (self.folder / "set_lists").mkdir()
-        (self.folder / "set_lists" / f"set_lists_{SUBSET}.json").write_text(json.dumps(lists))
+        write_annotations(self.folder, frames, [sequence], SUBSET, lists)
 
 
 def held_out_frames(frames: int, hold_out: int) -> set[int]:
@@ -226,13 +208,7 @@ def held_out_frames(frames: int, hold_out: int) -> set[int]:
     return set(range(0, frames, min(hold_out, frames // FEWEST_HELD_OUT)))
 
 
-def viewpoint(lens: Lens, world_to_camera: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """PyTorch3D's camera (row vectors: X_cam = X_world R + T), its intrinsics in units of half the picture's sides."""
+def _viewpoint(lens: Lens, world_to_camera: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     half = np.array(lens.image_size[::-1]) / 2
-    return {
-        "R": (TO_PYTORCH3D @ world_to_camera[:3, :3]).T.tolist(),
-        "T": (TO_PYTORCH3D @ world_to_camera[:3, 3]).tolist(),
-        "focal_length": (np.array(lens.focal) / half).tolist(),
-        "principal_point": ((half - lens.center) / half).tolist(),
-        "intrinsics_format": "ndc_norm_image_bounds",
-    }
+    focal, center = np.array(lens.focal) / half, (half - lens.center) / half
+    return viewpoint(world_to_camera[:3, :3], world_to_camera[:3, 3], focal.tolist(), center.tolist())

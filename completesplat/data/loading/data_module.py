@@ -131,11 +131,7 @@ class SceneDataModule(LightningDataModule):
 
     @abstractmethod
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Reference and targets of a scene of "val" or "test".
-
-        Raises:
-            DataError: the sequence lacks one of the frames.
-        """
+        """Reference and targets of a scene of "val" or "test"; `DataError` if the sequence lacks one of the frames."""
 
     def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
         """Of the sequences of a split those that are used."""
@@ -174,11 +170,7 @@ class SceneDataModule(LightningDataModule):
         return source
 
     def store(self, split: str) -> SceneStore:
-        """The scenes of a split.
-
-        Raises:
-            DataError: as `source`, or it has no sequences.
-        """
+        """The scenes of a split; `DataError` as `source`, or if it has no sequences."""
         if split not in self._stores:
             source = self.source(split)
             used = self.evaluated(split, source)

@@ -28,10 +28,7 @@ def gathered(value: Any) -> list[Any]:
 def batch_per_process(batch_size: int, count: int, accumulated: int) -> int:
     """Scenes of one batch of one of `count` processes, so that an optimizer step sees `batch_size` scenes.
 
-    `accumulated` batches of each process make one step.
-
-    Raises:
-        CompleteSplatError: `batch_size` cannot be divided so.
+    `accumulated` batches of each process make one step. `CompleteSplatError` if `batch_size` cannot be divided so.
     """
     share, rest = divmod(batch_size, count * accumulated)
     if rest:

@@ -52,8 +52,7 @@ class SceneLoader:
 
     Args:
         sampler: the order of a training epoch; None: as they are.
-        on_bad: "raise" what cannot be read, or "skip" it, with a report at the end of the epoch.
-        max_bad_fraction: skipping more than this share of an epoch's items is an error.
+        on_bad, max_bad_fraction: see `SceneDataModule`; what is skipped is reported at the end of the epoch.
     """
 
     def __init__(

@@ -52,11 +52,7 @@ class SceneStore:
         self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
-        """One scene in the reference camera's frame, from the frames of these indices.
-
-        Raises:
-            DataError: a picture that cannot be read.
-        """
+        """One scene in the reference camera's frame, from the frames of these indices; `DataError` if unreadable."""
         views = [reference, *targets]
         pictures = [self._picture(sequence, view) for view in views]
         images = _shares([picture.image for picture in pictures])
@@ -127,11 +123,7 @@ class TrainingScenes(Dataset[Loaded]):
         return Loaded(None, tuple(refused))
 
     def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | CachedScene:
-        """A scene of random views of the sequence of this name.
-
-        Raises:
-            DataError: the sequence or a picture cannot be read.
-        """
+        """A scene of random views of the sequence of this name; `DataError` if it or a picture cannot be read."""
         sequence = self.store.source.read(name)
         scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
         return self.augment(scene, rng)

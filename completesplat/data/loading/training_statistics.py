@@ -49,11 +49,7 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:
-    """The typical camera of at most 8,192 frames, in the first 400 sequences.
-
-    Raises:
-        DataError: none of them can be read.
-    """
+    """The typical camera of at most 8,192 frames, in the first 400 sequences; `DataError` if none can be read."""
     chosen = list(excerpts(store))
     if not chosen:
         raise DataError("no training sequence can be read")

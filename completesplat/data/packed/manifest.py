@@ -130,11 +130,7 @@ def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None 
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
-    """Refuse a store that was made with other settings than these.
-
-    Raises:
-        DataError: names every setting that differs.
-    """
+    """Refuse a store that was made with other settings, with a `DataError` that names every one that differs."""
     differing = differences(read_manifest(root).settings, settings)
     if differing:
         advice = "set these as they were, or prepare the data again into another folder"

@@ -40,11 +40,7 @@ def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
 
 
 def decode(content: bytes, channels: int, size: int) -> UInt8[Tensor, "channel size size"]:
-    """The inverse of `encode`.
-
-    Raises:
-        BadPicture: damaged, or with other channels or another size than expected.
-    """
+    """The inverse of `encode`; `BadPicture` if damaged, or with other channels or another size than expected."""
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
             # The header is looked at before the pixels are, so that no bytes make a huge picture.
@@ -97,11 +93,7 @@ class EncodedPicture:
 
 
 def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPicture:
-    """A frame's picture as files; the mask is without loss whatever the codec.
-
-    Raises:
-        DataError: it cannot be read, or has another size than its camera.
-    """
+    """A frame's picture as files, the mask without loss; `DataError` if unreadable or not of its camera's size."""
     image, mask = sequence.read(index)
     for part in (image, mask):
         if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
@@ -156,28 +148,15 @@ def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
         depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
         images, masks = _values(row, "images", count), _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
-        pictures = _Pictures(images, masks, checksums, size, (file, name), frames)
-        return PosedSequence(name, frames, cameras, depth_ranges, pictures)
 
+        def read(index: int) -> Picture:  # The others' bytes are not touched.
+            with at(file=file, sequence=name, frame=frames[index]):
+                image, mask = images[index].as_py(), masks[index].as_py()
+                if image is None or EncodedPicture(image, mask).checksum() != checksums[index]:
+                    raise BadPicture("is no longer what was written")
+                return Picture(decode(image, 3, size), None if mask is None else decode(mask, 1, size))
 
-@dataclass(frozen=True)
-class _Pictures:
-    """Decodes one frame's picture; the others' bytes are not touched."""
-
-    images: pa.LargeBinaryArray
-    masks: pa.LargeBinaryArray
-    checksums: np.ndarray
-    size: int
-    place: tuple[str, str]
-    frames: tuple[int, ...]
-
-    def __call__(self, index: int) -> Picture:
-        with at(*self.place, frame=self.frames[index]):
-            encoded = EncodedPicture(self.images[index].as_py(), self.masks[index].as_py())
-            if encoded.image is None or encoded.checksum() != self.checksums[index]:
-                raise BadPicture("is no longer what was written")
-            mask = None if encoded.mask is None else decode(encoded.mask, 1, self.size)
-            return Picture(decode(encoded.image, 3, self.size), mask)
+        return PosedSequence(name, frames, cameras, depth_ranges, read)
 
 
 def _values(row: pa.Table, column: str, count: int | None = None) -> pa.Array:

@@ -1,7 +1,5 @@
 """Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is read."""
 
-import hashlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +7,16 @@ import pyarrow as pa
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
 from completesplat.data.packed.rows import features, from_row
-from completesplat.data.sequences import PosedSequence
+from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
 from completesplat.errors import DataError
+from completesplat.weights import sha256_of
 
 
-class PackedSource:
-    """One split of a packed store, as a `SequenceSource`. What was refused while it was made is in its manifest.
+class PackedSource(SequenceSource):
+    """One split of a packed store; what was refused while it was made is in its manifest.
 
-    Raises:
-        DataError: no such split, a malformed manifest, or a shard that is missing or of another size.
+    `DataError` if there is no such split, or for a malformed manifest, or a shard that is missing or of another size.
     """
 
     def __init__(self, root: Path, split: str) -> None:
@@ -47,11 +45,7 @@ class PackedSource:
                     raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence: its cameras as they were prepared, its pictures decoded one by one when they are read.
-
-        Raises:
-            DataError: its shard is damaged or does not hold it.
-        """
+        """One sequence; its pictures are decoded one by one when they are read. `DataError` if its shard is damaged."""
         number, row = self._places[name]
         shard = self.shards[number]
         path = self.root / shard.file
@@ -60,24 +54,15 @@ class PackedSource:
                 self._opened[number] = open_shard(path, shard)
         return from_row(self._opened[number][row], str(path), name)
 
-    def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """One group: any order is as fast as any other."""
-        return [list(range(len(names)))]
-
     def fingerprint(self) -> str:
         """That of the source which the store was made from."""
         return self._fingerprint
 
     def verify(self) -> list[ChangedFile]:
         """The shards of this split that are no longer those whose checksums are in the manifest; reads all of them."""
-        changed = []
-        for shard in self.shards:
-            with require_file(self.root / shard.file).open("rb") as file:
-                found = hashlib.file_digest(file, "sha256").hexdigest()
-            if found != shard.sha256:
-                advice = "remove it and prepare again into the same folder"
-                changed.append(ChangedFile(f"its checksum is no longer that of the manifest: {advice}", file.name))
-        return changed
+        reason = "its checksum is no longer that of the manifest: remove it and prepare again into the same folder"
+        paths = {require_file(self.root / shard.file): shard.sha256 for shard in self.shards}
+        return [ChangedFile(reason, str(path)) for path, checksum in paths.items() if sha256_of(path) != checksum]
 
     def __getstate__(self) -> dict[str, Any]:
         # Worker processes open the files themselves and share their pages.
@@ -85,11 +70,7 @@ class PackedSource:
 
 
 def open_shard(path: Path, shard: Shard) -> Any:
-    """A memory-mapped `datasets.Dataset` that gives Arrow tables, one row for each sequence.
-
-    Raises:
-        DataError: missing, damaged, or with other columns or rows than expected.
-    """
+    """A memory-mapped `datasets.Dataset`, one row a sequence; `DataError` if missing, damaged or not as expected."""
     from datasets import Dataset  # See `features`.
 
     with at(file=path):

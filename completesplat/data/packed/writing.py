@@ -6,17 +6,13 @@ import logging
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from rich.filesize import decimal
 from rich.progress import Progress
 
@@ -34,6 +30,7 @@ from completesplat.data.packed.manifest import (
     write_json,
 )
 from completesplat.data.packed.rows import CODECS, EncodedPicture, encode_picture, features, to_row
+from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource, spread_places
 from completesplat.data.validation import TooFewFrames, at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
@@ -265,7 +262,7 @@ def prepare(
         _check_space(writer, missing)
         with Progress(disable=not progress) as bar:
             task = bar.add_task("preparing sequences", total=sum(len(plan.names) for plan in missing))
-            for plan, record in zip(missing, _write(writer, missing, workers), strict=True):
+            for plan, record in zip(missing, map_in_processes(writer.write, missing, workers), strict=True):
                 bar.advance(task, len(record.names))
                 records[plan] = record
     splits = {split: _split(split, source, records.values()) for split, source in writer.sources.items()}
@@ -298,37 +295,6 @@ def _claim(out: Path, plan: dict[str, Any]) -> None:
         differing = differences(field(found, part, dict), wanted)
         if differing:
             raise DataError(f"was made with {differing}: choose another folder, or remove this one", str(out))
-
-
-_writer: ShardWriter | None = None
-
-
-def _start_worker(writer: ShardWriter) -> None:
-    """Remember in a new process what its shards are made from."""
-    global _writer
-    torch.set_num_threads(1)  # There is one process for each core.
-    _writer = writer
-
-
-def _write_in_worker(plan: ShardPlan) -> ShardRecord:
-    assert _writer is not None
-    return _writer.write(plan)
-
-
-def _write(writer: ShardWriter, plans: Sequence[ShardPlan], workers: int | None) -> Iterator[ShardRecord]:
-    workers = min(workers or os.cpu_count() or 1, len(plans))
-    if workers == 1:
-        yield from map(writer.write, plans)
-        return
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(writer,)) as pool:
-        try:
-            yield from pool.map(_write_in_worker, plans)
-        except BrokenProcessPool:
-            advice = "run the same command again, with fewer workers, to continue"
-            raise CompleteSplatError(f"a worker process ended unexpectedly (out of memory?): {advice}") from None
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _split(name: str, source: SequenceSource, made: Iterable[ShardRecord | None]) -> Split:

@@ -24,10 +24,7 @@ class Square(NamedTuple):
 def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -> Square:
     """Largest square centred on the principal point (x, y) within an image of (height, width).
 
-    Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`).
-
-    Raises:
-        BadCamera: the principal point is not inside the image.
+    Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`). `BadCamera` if the point is not inside.
     """
     (x, y), (height, width) = center, image_size
     half = min(x, y, width - x, height - y)

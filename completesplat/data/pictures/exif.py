@@ -44,16 +44,12 @@ def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     to the actual one. Then fov = 2 atan(shorter side / (2 focal)). A picture that was cut or stitched after it was
     taken has another field of view than its record says.
     """
-    focal = _focal_from_full_frame(exif, max(size)) or _focal_from_sensor(exif, max(size))
+    equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
+    focal = equivalent / FULL_FRAME_WIDTH * max(size) if equivalent else _focal_from_sensor(exif, max(size))
     if focal is None:
         return None
     fov = math.degrees(2 * math.atan(min(size) / (2 * focal)))
     return fov if 1 < fov < 170 else None
-
-
-def _focal_from_full_frame(exif: Mapping[int, Any], longer_side: int) -> float | None:
-    equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    return equivalent and equivalent / FULL_FRAME_WIDTH * longer_side
 
 
 def _focal_from_sensor(exif: Mapping[int, Any], longer_side: int) -> float | None:

@@ -59,12 +59,7 @@ def decode(
 
 
 def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """(height, width) of an image file or its content, from its header.
-
-    Raises:
-        MissingFile: no such file.
-        BadPicture: no image in one of these formats, or one of more than 50 million pixels.
-    """
+    """(height, width) of an image file or its content, from its header; errors as of `decode`."""
     with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
         return image.height, image.width
 
@@ -195,11 +190,7 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
 
 
 def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
-    """Refuse a picture that has not the (height, width) it should have.
-
-    Raises:
-        ImageError: another size.
-    """
+    """Refuse a picture that has not the (height, width) it should have, with `ImageError`."""
     if image.size != annotated[::-1]:
         actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
         if orientation in QUARTER_TURNS and image.size == annotated:

@@ -3,6 +3,7 @@
 import io
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -103,14 +104,12 @@ def _to_srgb(square: Image.Image) -> Image.Image:
     if square.has_transparency_data:
         square = over_white(square)
     if profile:
-        try:
+        # A damaged profile, or one of another colour model than the pixels, is ignored, as viewers do.
+        with suppress(ImageCms.PyCMSError, OSError):
             embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
             native = square if square.mode in ("L", "RGB", "CMYK") else square.convert("RGB")
             converted = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
             return converted if converted is not None else native
-        except (ImageCms.PyCMSError, OSError):
-            # A damaged profile, or one of another colour model than the pixels: viewers ignore it as well.
-            pass
     return square.convert("RGB")
 
 
@@ -137,9 +136,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
     """The same for a mask, a picture that is white where the photograph is hidden, cropped as it is.
 
-    Raises:
-        ImageError: not a readable picture.
-        CompleteSplatError: it is white nowhere.
+    `ImageError` if it is not a readable picture, `CompleteSplatError` if it is white nowhere.
     """
     hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
     if not hidden.any():

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, shortened
@@ -25,47 +25,28 @@ class EvaluationIndex:
     views: dict[str, list[Choice]]
 
 
-class ChosenClips(NamedTuple):
-    """What is tested, and which clips are not, by reason.
+class ChosenSource:
+    """Clips under the names of their tests: the clip's, or `KEY#1`, `KEY#2` ... where one has several.
 
-    Attributes:
-        clips: the clip of each test by the test's name: the clip's, or `KEY#1`, `KEY#2` ... where a clip has several.
-        views: reference and targets by name, where an index gives them.
+    `views` are reference and targets by name, where an index gives them; see `SequenceSource` for the rest.
     """
 
-    clips: dict[str, str]
-    views: dict[str, Choice] | None
-    left_out: dict[str, list[str]]
-
-    @property
-    def listed(self) -> int:
-        """How many tests there would be if all clips of the lists were in the data."""
-        absent = (keys for reason, keys in self.left_out.items() if reason.endswith("not in the data"))
-        return len(self.clips) + len({key for keys in absent for key in keys})
-
-
-class ChosenSource:
-    """Clips under the names of their tests; see `SequenceSource`."""
-
-    def __init__(self, source: SequenceSource, chosen: ChosenClips) -> None:
-        clips = chosen.clips
+    def __init__(self, source: SequenceSource, clips: dict[str, str], views: dict[str, Choice], listed: int) -> None:
         self.names = list(clips)
-        self.listed = chosen.listed
+        self.views = views
+        self.listed = listed
         self.refused = source.refused
         self.left_out = source.left_out
         self._source = source
         self._clips = clips
 
     def read(self, name: str) -> PosedSequence:
-        """The clip of a test."""
         return replace(self._source.read(self._clips[name]), name=name)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """As the clips are grouped."""
         return self._source.groups([self._clips[name] for name in names])
 
     def fingerprint(self) -> str:
-        """That of all clips."""
         return self._source.fingerprint()
 
 
@@ -89,11 +70,7 @@ def read_index(path: Path) -> EvaluationIndex:
 
 
 def read_keys(path: Path) -> list[str]:
-    """A list of clips, one key a line.
-
-    Raises:
-        DataError: missing, unreadable, or with several columns.
-    """
+    """A list of clips, one key a line; `DataError` if missing, unreadable, or with several columns."""
     keys = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         columns = line.split()
@@ -104,9 +81,12 @@ def read_keys(path: Path) -> list[str]:
     return keys
 
 
-def choose_clips(keys: list[str], index: EvaluationIndex | None, listed: list[str] | None) -> ChosenClips:
-    """Of the clips that are there, those which both lists name (all, without lists)."""
-    there, left_out = set(keys), dict[str, list[str]]()
+def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: list[str] | None) -> ChosenSource:
+    """Of the clips that are there, those which both lists name (all, without lists).
+
+    How many tests there are and which clips are left out is logged: as a warning if some are not in the data.
+    """
+    keys, there, left_out = source.names, set(source.names), dict[str, list[str]]()
     if index is not None:
         left_out["null in the index"] = [key for key, tests in index.views.items() if not tests]
         left_out["in the index, not in the data"] = [k for k, tests in index.views.items() if tests and k not in there]
@@ -116,24 +96,18 @@ def choose_clips(keys: list[str], index: EvaluationIndex | None, listed: list[st
         left_out["in the list, not in the data"] = [key for key in dict.fromkeys(listed) if key not in there]
         left_out["not in the list"] = [key for key in keys if key not in set(listed)]
         keys = [key for key in keys if key in set(listed)]
-    if index is None:
-        return ChosenClips({key: key for key in keys}, None, left_out)
-    clips, chosen = dict[str, str](), dict[str, Choice]()
+    clips, views = {key: key for key in keys} if index is None else {}, dict[str, Choice]()
     for key in keys:
-        for number, views in enumerate(index.views[key], 1):
-            name = f"{key}#{number}" if len(index.views[key]) > 1 else key
-            clips[name], chosen[name] = key, views
-    return ChosenClips(clips, chosen, left_out)
-
-
-def log_choice(chosen: ChosenClips) -> None:
-    """Say how many tests there are and which clips were left out: as a warning if some are not in the data."""
-    parts = [f"{len(keys)} {why}" + (f" ({shortened(keys)})" if keys else "") for why, keys in chosen.left_out.items()]
-    lacking = any(keys for reason, keys in chosen.left_out.items() if reason.endswith("not in the data"))
-    left_out = f"; left out: {', '.join(parts)}" if parts else ""
-    clips = len(set(chosen.clips.values()))
-    tests = f"{len(chosen.clips)} scenes of {clips} clips" if clips < len(chosen.clips) else f"{clips} clips"
-    logger.log(logging.WARNING if lacking else logging.INFO, "%s to test%s", tests, left_out)
+        choices = [] if index is None else index.views[key]
+        for number, choice in enumerate(choices, 1):
+            name = f"{key}#{number}" if len(choices) > 1 else key
+            clips[name], views[name] = key, choice
+    parts = [f"{len(them)} {why}" + (f" ({shortened(them)})" if them else "") for why, them in left_out.items()]
+    absent = {key for reason, them in left_out.items() if reason.endswith("not in the data") for key in them}
+    tests = f"{len(clips)} scenes of {len(keys)} clips" if len(keys) < len(clips) else f"{len(keys)} clips"
+    reasons = f"; left out: {', '.join(parts)}" if parts else ""
+    logger.log(logging.WARNING if absent else logging.INFO, "%s to test%s", tests, reasons)
+    return ChosenSource(source, clips, views, len(clips) + len(absent))
 
 
 def _from_table(content: Any) -> EvaluationIndex:

@@ -15,14 +15,7 @@ from completesplat.data.loading.view_selection import evaluation_views_within, n
 from completesplat.data.pictures.crop import Square, principal_square
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import Clip, TextClips
-from completesplat.data.realestate10k.evaluation import (
-    ChosenSource,
-    EvaluationIndex,
-    choose_clips,
-    log_choice,
-    read_index,
-    read_keys,
-)
+from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
@@ -47,11 +40,7 @@ class ClipFraming:
 
 
 def open_clips(folder: Path) -> Clips:
-    """The clips of a split's folder, in whichever form they are: with an `index.json`, in chunks, else in texts.
-
-    Raises:
-        DataError: neither is there.
-    """
+    """The clips of a split's folder: in chunks where it has an `index.json`, else in texts; `DataError` if neither."""
     if (folder / "index.json").is_file():
         return ChunkedClips(folder)
     if folder.is_dir() and any(folder.glob("*.txt")):
@@ -157,7 +146,7 @@ class RE10KDataModule(SceneDataModule):
         self.framing = ClipFraming(self.image_size, crop, scale, near, far)
         self.val_fraction = val_fraction
         self.val_seed = val_seed
-        self._test_views: dict[str, Choice] | None = None
+        self._test_views: dict[str, Choice] = {}
 
     @cached_property
     def index(self) -> EvaluationIndex | None:
@@ -177,7 +166,6 @@ class RE10KDataModule(SceneDataModule):
         }
 
     def packed_settings(self) -> dict[str, Any]:
-        """See `SceneDataModule`."""
         return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
 
     def open(self, split: str) -> Mapping[str, RE10KSource]:
@@ -195,14 +183,13 @@ class RE10KDataModule(SceneDataModule):
         if split != "test":
             return source
         listed = None if self.scene_list is None else read_keys(self.scene_list)
-        chosen = choose_clips(source.names, self.index, listed)
-        log_choice(chosen)
+        chosen = choose_clips(source, self.index, listed)
         self._test_views = chosen.views
-        return ChosenSource(source, chosen)
+        return chosen
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
         """Known from the evaluation index; reading all clips for it would take hours."""
-        views = self._test_views or {}
+        views = self._test_views
         return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
 
     def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
@@ -211,7 +198,7 @@ class RE10KDataModule(SceneDataModule):
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
         """The views of the evaluation index; without one, the first frame and some that follow it."""
-        if self._test_views is None or sequence.name not in self._test_views:
+        if sequence.name not in self._test_views:
             return evaluation_views_within(len(sequence.frames), *self.evaluation)
         reference, targets = self._test_views[sequence.name]
         position = {frame: view for view, frame in enumerate(sequence.frames)}

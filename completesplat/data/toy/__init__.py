@@ -16,16 +16,7 @@ KINDS: dict[str, Callable[..., Path]] = {
 }
 
 
-def write(
-    kind: str,
-    out: Path,
-    scenes: int,
-    frames: int,
-    size: int,
-    seed: int,
-    workers: int | None = None,
-    progress: bool = True,
-) -> Path:
+def write(kind: str, out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None) -> Path:
     """Write scenes of a kind (a key of `KINDS`); returns their folder.
 
     Raises:
@@ -33,7 +24,7 @@ def write(
     """
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
-    return KINDS[kind](out, scenes, frames, size, seed, workers, progress)
+    return KINDS[kind](out, scenes, frames, size, seed, workers)
 
 
 __all__ = ["write", "write_objects", "write_rooms"]

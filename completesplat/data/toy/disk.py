@@ -1,18 +1,15 @@
 """How toy data get onto the disk: a folder is there as a whole or not at all, and scenes are made in parallel."""
 
 import json
-import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import track
 
+from completesplat.data.processes import map_in_processes
 from completesplat.errors import DataError
 
 FORMAT_VERSION = 1
@@ -54,14 +51,9 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
     return folder
 
 
-def in_processes(
-    write: "partial[Result]", splits: Sequence[str], workers: int | None, description: str, progress: bool
-) -> Iterator[Result]:
-    """`write`(index, split) for every scene, in order, by `workers` processes (by default one a core)."""
-    shown = partial(track, description=description, total=len(splits), disable=not progress)
-    workers = min(workers or os.cpu_count() or 1, len(splits))
-    if workers == 1:
-        yield from shown(map(write, range(len(splits)), splits))
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from shown(pool.map(write, range(len(splits)), splits))
+def write_scenes(
+    write: Callable[[tuple[int, str]], Result], splits: Sequence[str], workers: int | None, name: str, progress: bool
+) -> list[Result]:
+    """`write` of (index, split) for every scene, in order, by `workers` processes (by default one a core)."""
+    written = map_in_processes(write, list(enumerate(splits)), workers)
+    return list(track(written, f"Rendering {name}", len(splits), disable=not progress))

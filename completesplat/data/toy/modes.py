@@ -1,7 +1,7 @@
 """The toy objects' hidden modes: every colour that the patch could have had, and what a frame shows of it."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,30 +62,22 @@ SAME_PICTURE = 0.025
 Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
 
 
+@dataclass
 class ToyHiddenModes:
     """The scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
 
-    `folder` is that of their category, one of `DRAW`. Of what `choose` gives for a sequence the reference counts.
-
-    Raises:
-        DataError: `folder` holds no complete set that was written by this version.
+    `folder` is that of their category, one of `DRAW`; `DataError` if it holds no complete set of this version. Of what
+    `choose` gives for a sequence the reference counts.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        store: SceneStore,
-        choose: Callable[[PosedSequence], Choice],
-        image_size: int,
-        views: int,
-        spread_views: int,
-    ) -> None:
-        self.store = store
-        self.choose = choose
-        self.image_size = image_size
-        self.views = views
-        self.spread_views = spread_views
-        self.folder = folder
+    folder: Path
+    store: SceneStore
+    choose: Callable[[PosedSequence], Choice]
+    image_size: int
+    views: int
+    spread_views: int
+
+    def __post_init__(self) -> None:
         description = self.folder / "toy.json"
         if not description.is_file():
             raise DataError("no toy.json: hidden modes need toy objects as they were written", str(self.folder))

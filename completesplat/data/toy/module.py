@@ -48,11 +48,7 @@ class ToyObjectsDataModule(CO3DDataModule):
             write_objects(self.root, *numbers, category=self.category)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
-        """The test scenes with every colour that the patch on the back could have had; see `KnowsHiddenModes`.
-
-        Raises:
-            DataError: the files are not the toy objects as they were written, or none is of the test split.
-        """
+        """The test scenes with every colour that the patch on the back could have had; see `ToyHiddenModes`."""
         store = self.store("test")
         choose = partial(self.evaluation_views, split="test")
         return ToyHiddenModes(self.root / self.category, store, choose, self.image_size, views, spread_views)

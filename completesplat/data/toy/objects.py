@@ -1,6 +1,5 @@
 """Writes toy objects as a category in CO3D v2's layout, with every file that its reader expects."""
 
-import gzip
 import json
 from collections.abc import Callable
 from functools import partial
@@ -9,15 +8,13 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
-from completesplat.data.toy.disk import in_processes, write_once
+from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
+from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.mini_scene import draw_mini
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
 from completesplat.data.toy.raytracing import Array
 
-# From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up).
-TO_PYTORCH3D = np.diag([-1.0, -1.0, 1.0])
 FRAMES_PER_SECOND = 10.0
 DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
     "toy_objects": draw_scene,
@@ -65,25 +62,12 @@ def _to_bytes(values: Array) -> Any:
 
 
 def _viewpoint(scene: ToyScene, frame: int) -> dict[str, Any]:
-    """PyTorch3D's camera (row vectors: X_cam = X_world R + T) in a world of the scene's own unit and origin."""
+    """In a world of the scene's own unit and origin."""
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
     rotation = world_to_camera[:3, :3]
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
-    focal = 1 / np.tan(np.radians(scene.fov_degrees) / 2)
-    return {
-        "R": (TO_PYTORCH3D @ rotation).T.tolist(),
-        "T": (TO_PYTORCH3D @ translation).tolist(),
-        "focal_length": [focal, focal],
-        "principal_point": [0.0, 0.0],
-        "intrinsics_format": "ndc_norm_image_bounds",
-    }
-
-
-def _write_point_cloud(path: Path, scene: ToyScene) -> None:
-    points, colors = scene.unit * scene.points + scene.origin, _to_bytes(scene.point_colors)
-    types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-    vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+    focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
+    return viewpoint(rotation, translation, [focal, focal], [0.0, 0.0])
 
 
 def write_objects(
@@ -101,15 +85,11 @@ def write_objects(
     The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
     family and the colour of the patch on the back. See `write_once`, which takes the numbers; `workers` are processes
     (by default one a core). Returns the folder of the category (a key of `DRAW`).
-
-    Raises:
-        DataError: a number that is too small, or a category folder with other content.
     """
 
     def fill(folder: Path) -> None:
         write = partial(_write_scene, folder, category, frames, size, seed)
-        written = in_processes(write, _splits(scenes), workers, f"Rendering {category}", progress)
-        _write_lists(folder, list(written))
+        _write_lists(folder, write_scenes(write, _splits(scenes), workers, category, progress))
 
     return write_once(out / category, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
 
@@ -121,32 +101,24 @@ def _splits(scenes: int) -> list[str]:
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
-def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, index: int, split: str) -> Annotations:
+def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, place: tuple[int, str]) -> Annotations:
     """One sequence, from a random generator of its own; returns its split and annotations."""
+    index, split = place
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     name = f"{index:05d}_{scene.family}"
     for folder in ("images", "masks", "depths", "depth_masks"):
         (root / name / folder).mkdir(parents=True)
     annotations = [_write_frame(root, category, name, scene, frame, size, split) for frame in range(frames)]
-    _write_point_cloud(root / name / "pointcloud.ply", scene)
+    points = scene.unit * scene.points + scene.origin
+    write_points(root / name / "pointcloud.ply", points, _to_bytes(scene.point_colors))
     hidden = {"family": scene.family, "patch_color": scene.patch_color}
     (root / name / "toy.json").write_text(json.dumps(hidden) + "\n")
-    cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": len(scene.points)}
-    sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud}
-    return split, annotations, sequence | {"viewpoint_quality_score": 1.0}
+    return split, annotations, sequence_annotation(category, name, len(points))
 
 
 def _write_lists(category: Path, written: list[Annotations]) -> None:
-    """Annotations of the category and its set list: [sequence, frame number, picture] of each split's frames."""
     lists: dict[str, list[list[Any]]] = {"train": [], "val": [], "test": []}
     for split, frames, _ in written:
         lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
-    _write_jgz(category / "frame_annotations.jgz", [frame for _, frames, _ in written for frame in frames])
-    _write_jgz(category / "sequence_annotations.jgz", [sequence for _, _, sequence in written])
-    (category / "set_lists").mkdir()
-    (category / "set_lists" / f"set_lists_{SUBSET}.json").write_text(json.dumps(lists))
-
-
-def _write_jgz(path: Path, content: list[dict[str, Any]]) -> None:
-    # A fixed time stamp and no file name in the gzip header: equal content gives equal bytes.
-    path.write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
+    annotations = [frame for _, frames, _ in written for frame in frames]
+    write_annotations(category, annotations, [sequence for _, _, sequence in written], SUBSET, lists)

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from completesplat.data.toy.disk import in_processes, write_once
+from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 
@@ -97,23 +97,21 @@ def write_rooms(
     `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg, `chunks`/<split>/ the same clips in NNNNNN.torch with
     index.json. Every tenth clip, from the first, is in the split `test`, the others in `train`. See `write_once`, which
     takes the numbers; `workers` are processes (by default one a core). Returns the folder, `out`/toy_rooms.
-
-    Raises:
-        DataError: a number that is too small, or a folder with other content.
     """
     splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
 
     def fill(folder: Path) -> None:
         write = partial(_write_clip, folder / "text", frames, size, seed)
-        clips = list(in_processes(write, splits, workers, "Rendering toy rooms", progress))
+        clips = write_scenes(write, splits, workers, ROOMS, progress)
         for split in ("train", "test"):
             write_chunks(folder / "chunks" / split, [clip for clip in clips if clip.folder.name == split])
 
     return write_once(out / ROOMS, fill, progress, 2, scenes=scenes, frames=frames, size=size, seed=seed)
 
 
-def _write_clip(text: Path, frames: int, size: int, seed: int, index: int, split: str) -> ClipFiles:
+def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> ClipFiles:
     """The text form of one clip, from a random generator of its own."""
+    index, split = place
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
     width, start = image_width(size), int(rng.integers(LATEST_START))

@@ -1,0 +1,51 @@
+"""Work for several processes: the same results in the same order, however many they are."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+import torch
+
+from completesplat.errors import CompleteSplatError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def map_in_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int | None
+) -> Iterator[Result]:
+    """`function` of every item, in order, by `workers` processes (None: one a core), each of which gets it once.
+
+    Raises:
+        CompleteSplatError: a process ended unexpectedly.
+    """
+    workers = min(workers or os.cpu_count() or 1, len(items))
+    if workers <= 1:
+        yield from map(function, items)
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start, (function,)) as pool:
+        try:
+            yield from pool.map(_call, items)
+        except BrokenProcessPool:
+            advice = "run the same command again, with fewer workers"
+            raise CompleteSplatError(f"a worker process ended unexpectedly (out of memory?): {advice}") from None
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+_function: Callable[[Any], Any]
+
+
+def _start(function: Callable[[Any], Any]) -> None:
+    """Remember in a new process what it is for."""
+    global _function
+    torch.set_num_threads(1)  # There is one process for each core.
+    _function = function
+
+
+def _call(item: Any) -> Any:
+    return _function(item)
