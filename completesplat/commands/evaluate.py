@@ -65,11 +65,6 @@ def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
 
 
-def scoring_trainer(trainer: Mapping[str, Any], evaluation: Mapping[str, Any], **settings: Any) -> Any:
-    """A trainer, with further settings, that tests in the protocol's precision, whatever the networks trained in."""
-    return instantiate(trainer, precision=evaluation["precision"], **settings, _convert_="all")
-
-
 def run(
     trained: Mapping[str, Any],
     evaluation: Mapping[str, Any],
@@ -94,7 +89,7 @@ def run(
     module = tested.open_module(run_config)
     set_scoring(module, evaluation)
     loggers = list(instantiate(logger or {}, _convert_="all").values())
-    testing = scoring_trainer(trainer, evaluation, logger=loggers)
+    testing = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
     with finished(loggers):
         shown = begin(module, testing, OmegaConf.load(out / CONFIG), out)
         testing.test(module, datamodule=data, verbose=False)

@@ -1,6 +1,6 @@
 """`completesplat test evaluation=hidden_modes`: samples of what the reference view hides, against the known truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
@@ -80,8 +80,9 @@ def run(
     results, calibration = measured.results(samples), measured.calibration()
     write_json(out / "hidden_modes.json", results)
     write_json(out / "calibration.json", calibration)
-    write_json(out / "protocol.json", protocol(tested, evaluation, module, data, measured.names, skipped))
-    draw(measured.shown["model"], results, calibration, samples, out / "hidden_modes.png")
+    used = {"scenes": measured.names, "skipped": skipped}
+    write_json(out / "protocol.json", protocol(tested, evaluation, module, data, used))
+    draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
         log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
@@ -92,12 +93,7 @@ def run(
 
 
 def protocol(
-    tested: Trained,
-    evaluation: HiddenModesEvaluation,
-    module: Any,
-    data: Any,
-    scenes: Sequence[str],
-    skipped: Sequence[str],
+    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]]
 ) -> dict[str, Any]:
     """The statement of what was measured and how, with the names of the scenes."""
     return {
@@ -105,12 +101,8 @@ def protocol(
         "method": module.method,
         **data.describe(),
         "image_size": data.image_size,
-        "scenes": scenes,
-        "skipped": skipped,
-        "samples": evaluation["samples"],
-        "views": evaluation["views"],
-        "spread_views": evaluation["spread_views"],
-        "seed": evaluation["seed"],
+        **scenes,
+        **{key: evaluation[key] for key in ("samples", "views", "spread_views", "seed")},
         **drawing(module),
         **provenance(data),
         **tested.facts(),

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from completesplat.commands import quieten
-from completesplat.commands.evaluate import scored_data, scoring_trainer, set_scoring
+from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.distributed import batch_per_process
@@ -134,10 +134,10 @@ def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict
 
 
 def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
-    """Score as `completesplat test` does; everything that was logged."""
+    """Score as `completesplat test` does, in the protocol's precision; everything that was logged."""
     progress = instantiate(config.callbacks.progress, _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
-    trainer = scoring_trainer(config.trainer, config.evaluation, **settings)
+    trainer = instantiate(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 

@@ -6,7 +6,7 @@ from typing import Annotated, TypedDict
 
 from completesplat.atomic import atomic_path
 from completesplat.commands.schema import Positive, Range
-from completesplat.results.html_page import Limits, page
+from completesplat.results.html_page import page
 from completesplat.results.published import tables as published_tables
 from completesplat.results.runs import find, origin
 from completesplat.results.tables import show, write_tables
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 class Most(TypedDict):
-    """The fields of `Limits`, none of which may be zero."""
+    """How much a page holds; `conf/report_task/html.yaml` explains each."""
 
     frames: Positive
     samples: Positive
@@ -49,7 +49,7 @@ def html(runs: str, most: Most, out: Path) -> None:
     Raises:
         CompleteSplatError: there is no such folder, or nothing to show in it.
     """
-    text, warnings = page(Path(runs), out, Limits(**most), origin(out, levels=0))
+    text, warnings = page(Path(runs), out, most, origin(out, levels=0))
     with atomic_path(out / "report.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
     for warning in warnings:

@@ -113,7 +113,7 @@ def make_page(config: Any, out: Path) -> Any:
         rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
         saver = Saver(out, stage, rasterizer, config.frames, config.background)
         if model is None:
-            return Page(server, stage, saver, stage.layers)
+            return Page(server, stage, saver, max(sample.layers for sample in samples))
         page = Page(server, stage, saver, model.autoreconstructor.reconstructor.parameterization.layers)
         names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
         steps = model.sampler.steps if config.steps is None else config.steps

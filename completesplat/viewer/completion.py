@@ -14,7 +14,6 @@ from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
-from completesplat.geometry.cameras import Cameras
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
 from completesplat.viewer.sample import Sample
@@ -72,8 +71,14 @@ class Completion:
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
-        arranged = partial(self._arranged, earlier, self.model.camera(photograph), {**settings, "image": name})
-        last_shown = 0.0
+        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
+        reference, last_shown = self.model.camera(photograph), 0.0
+
+        def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
+            """The new samples behind the earlier ones, as many as there is room for."""
+            told = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
+            new = [Sample(x, layers, reference, said, finished, True) for x, said in zip(scenes, told, strict=True)]
+            return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:
             nonlocal last_shown
@@ -91,19 +96,6 @@ class Completion:
             self.page.tell(error, client)
         finally:
             progress.visible = False
-
-    def _arranged(
-        self,
-        earlier: Sequence[Sample],
-        reference: Cameras,
-        settings: dict[str, Any],
-        scenes: Sequence[Gaussians],
-        finished: bool,
-    ) -> list[Sample]:
-        """The new samples behind the earlier ones, as many as there is room for."""
-        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
-        new = (Sample(x, layers, reference, {**settings, "sample": i}, finished, True) for i, x in enumerate(scenes))
-        return [*earlier, *new][-MOST_SAMPLES:]
 
 
 def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
