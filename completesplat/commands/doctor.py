@@ -30,6 +30,7 @@ EXTRAS = {
     "colmap": "imports captures of your own",
     "slurm": "spreads sweeps over a cluster",
 }
+OWN_PARTS = "completesplat.commands.doctor_checks"
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100e6
 """Bytes: the files of a few predictions."""
@@ -37,12 +38,9 @@ LEAST_SPACE = 100e6
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found, is missing or is broken.
+    """One thing that was found, is missing, which is no error, or is broken: completing a photograph needs it.
 
-    Args:
-        name: of the thing.
-        state: `broken` is what completing a photograph needs and does not have; `no` is no error.
-        said: a version, a place, or the reason and what to do.
+    It says a version, a place, or the reason and what to do.
     """
 
     name: str
@@ -237,8 +235,9 @@ def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
         "extras": check_extras,
         "imports": check_imports,
         "device": check_device,
-        "rasterizers": lambda: _check_with_parts("check_rasterizers"),
-        "weights": lambda: _check_with_parts("check_weights"),
+        # These need the package's own parts, which are imported only now.
+        "rasterizers": lambda: import_module(OWN_PARTS).check_rasterizers(),
+        "weights": lambda: import_module(OWN_PARTS).check_weights(),
         "data": lambda: check_data(conf_folder() / "data", place),
         "tools": lambda: check_tools(place),
     }
@@ -250,11 +249,6 @@ def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
         return list(check())
     except Exception as error:  # of any library: the other parts are looked at all the same
         return [Finding("check", "broken", one_line(error))]
-
-
-def _check_with_parts(name: str) -> Iterator[Finding]:
-    """A check that needs the package's own parts, which are imported only now."""
-    yield from getattr(import_module("completesplat.commands.doctor_checks"), name)()
 
 
 def show(findings: Mapping[str, Sequence[Finding]]) -> None:

@@ -77,11 +77,8 @@ def job_name(*keys: str, _root_: Any) -> str:
 def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     """Run one job in its own directory, leaving there what is needed to know what was run.
 
-    A job with `ckpt_path=last` whose directory holds its results is not repeated. `program` was started with the
-    arguments `given` behind the verb.
-
-    Raises:
-        CompleteSplatError: the directory holds other work.
+    A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
+    started with the arguments `given` behind the verb.
     """
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)

@@ -46,11 +46,7 @@ class PredictNumbers(TypedDict):
 
 
 def run(config: Any, out: Path) -> None:
-    """Write each photograph's files into `out/<its name>/`.
-
-    Raises:
-        CompleteSplatError: settings without a meaning, or at least one picture that failed.
-    """
+    """Write each photograph's files into `out/<its name>/`."""
     check_settings(PredictNumbers, config)
     pictures = find_pictures(config.image)
     if config.mask is not None and len(pictures) > 1:

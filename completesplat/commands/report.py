@@ -26,11 +26,7 @@ class Most(TypedDict):
 
 
 def tables(runs: str | None, out: Path) -> None:
-    """Write `tables.md`, `tables.csv` and `tables.tex`, and print the tables.
-
-    Args:
-        runs: the folder that is searched for results; None shows the published figures alone.
-    """
+    """Write `tables.md`, `.csv` and `.tex` of the results below `runs` (None: the published figures); print them."""
     tree = None if runs is None else find(Path(runs))
     made = published_tables(tree)
     write_tables(made, out)
@@ -40,15 +36,7 @@ def tables(runs: str | None, out: Path) -> None:
 
 
 def html(runs: str, most: Most, out: Path) -> None:
-    """Write `report.html` and print its size.
-
-    Args:
-        runs: the folder that is searched for runs, results and predictions.
-        most: how much is shown.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or nothing to show in it.
-    """
+    """Write `report.html`, the `page` on all below the folder `runs`, and print its size."""
     text, warnings = page(Path(runs), out, most, origin(out, levels=0))
     with atomic_path(out / "report.html") as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -46,9 +46,7 @@ def samplers(
 ) -> None:
     """Write `samplers.json` and `samplers.png`, print the table and the fewest steps that are enough.
 
-    Args:
-        samplers: configurations by name.
-        steps: numbers of steps, by the name of the sampler.
+    Configurations of samplers and numbers of steps are by the sampler's name; see `conf/report_task/samplers.yaml`.
 
     Raises:
         CompleteSplatError: steps of a sampler that is not there, or impossible ones, or weights outside of [0, 1].
@@ -78,10 +76,7 @@ def controls(
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
-    Args:
-        skip_weights, guidance_weights: all their pairs are measured, and the paper's three.
-        near_degrees: targets whose optical axes are at most this far from the reference's count as near.
-        shown: samples in the grid of renders.
+    All pairs of the weights are measured, and the paper's three; `conf/report_task/controls.yaml` explains the rest.
 
     Raises:
         CompleteSplatError: a weight outside of [0, 1].
@@ -104,9 +99,7 @@ def controls(
 def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[Run]) -> None:
     """Write `masked.png`: inputs with boxes over them, several completions of each.
 
-    Args:
-        boxes: [x0, y0, x1, y1] in shares of the picture; the scenes take turns.
-        views: besides the reference view.
+    Boxes are [x0, y0, x1, y1] in shares of the picture; `conf/report_task/masked.yaml` explains the rest.
 
     Raises:
         CompleteSplatError: a box without pixels or outside of the picture, or a weight outside of [0, 1].
@@ -129,12 +122,7 @@ def depth(
     out: Path,
     **run: Unpack[Run],
 ) -> None:
-    """Write `depth.json` and `depth.png`, and print the table.
-
-    Args:
-        skip_weight, guidance_weight: of the figure; measured as well, beside the paper's three settings.
-        shown_scenes, shown: scenes and samples in the figure.
-        far_degrees: targets whose optical axes are farther than this from the reference's count as far.
+    """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings.
 
     Raises:
         CompleteSplatError: a weight outside of [0, 1].
@@ -193,12 +181,7 @@ CONTROLS: list[Column] = [
     ("near object", "near_object_psnr", ".2f"),
     ("diversity", "diversity", ".4f"),
 ]
-DEPTH: list[Column] = [
-    *WEIGHTS,
-    ("reference", "reference_deviation", ".4f"),
-    ("object", "reference_object_deviation", ".4f"),
-    ("measured", "reference_measured", ".0%"),
-    ("far", "far_deviation", ".4f"),
-    ("object", "far_object_deviation", ".4f"),
-    ("measured", "far_measured", ".0%"),
-]
+DEPTH = [*WEIGHTS]
+for _view in ("reference", "far"):
+    DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]
+    DEPTH += [("measured", f"{_view}_measured", ".0%")]

@@ -28,12 +28,7 @@ ONLY_FOR_TRAINING = (
 class Trained:
     """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    Args:
-        ckpt: a checkpoint, whose run's directory holds the configuration of model and data.
-        overrides: changes to that configuration, as on the command line.
-        weights: a folder of weights, or a name of those in the package, instead of a checkpoint.
-        data, rasterizer: configurations that belong to `weights`.
-        sampler: configuration of another sampler than the model's own.
+    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`.
     """
 
     ckpt: str | None

@@ -211,7 +211,7 @@ def rows_of(title: str, rows: Sequence[Any]) -> Html:
     records = [row for row in rows if isinstance(row, Mapping)]
     keys = list(dict.fromkeys(str(key) for row in records for key, x in row.items() if isinstance(x, PLAIN)))
     body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
-    return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body, gaps=True))
+    return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body))
 
 
 def _grid(table: Table) -> Html:

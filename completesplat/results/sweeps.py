@@ -107,7 +107,7 @@ def _table(rows: Sequence[dict[str, Any]], remarks: list[str]) -> Table:
         for row, cells in zip(rows, figures(rows, shown), strict=True)
     ]
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, shown)]
-    return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks, gaps=True)
+    return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
 def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
-from completesplat.export.pictures import color_depth, enlarge, surface_depth, to_bytes
+from completesplat.export.pictures import color_depth, image_grid, surface_depth
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
 from completesplat.metrics.scoring import BEST, MODEL, Evaluation, Scores
@@ -87,8 +87,7 @@ def as_media(value: Any) -> Any:
 def strip(images: Float[Tensor, "view 3 height width"]) -> Image.Image:
     """Views side by side, each enlarged by a whole factor to about 128 px."""
     factor = max(1, round(READABLE_SIDE / max(images.shape[-2:])))
-    row = torch.cat(list(images.float().nan_to_num()), dim=-1)
-    return Image.fromarray(to_bytes(enlarge(row, factor)))
+    return image_grid(images.float().nan_to_num(), factor=factor)
 
 
 def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
