@@ -160,17 +160,16 @@ def check_data(conf: Path, place: Path) -> Iterator[Finding]:
     for path in sorted(conf.glob("*.yaml")):
         config = OmegaConf.to_container(OmegaConf.load(path))
         # One without a root of its own has another one's, or cannot be chosen.
-        if isinstance(config, dict) and "root" in config:
-            yield _data_set(path.stem, str(config["root"]), "data_seed" in config, place)
-
-
-def _data_set(name: str, root: str, procedural: bool, place: Path) -> Finding:
-    if root == "???":
-        return Finding(name, "no", f"has no place of its own: data={name} data.root=FOLDER")
-    if (place / root).is_dir():
-        return Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
-    said = "made there when it is first used" if procedural else f"data={name} data.root=FOLDER names another place"
-    return Finding(name, "no", f"not in {root}; {said}")
+        if not isinstance(config, dict) or "root" not in config:
+            continue
+        name, root = path.stem, str(config["root"])
+        if root == "???":
+            yield Finding(name, "no", f"has no place of its own: data={name} data.root=FOLDER")
+        elif (place / root).is_dir():
+            yield Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
+        else:
+            made, elsewhere = "made there when it is first used", f"data={name} data.root=FOLDER names another place"
+            yield Finding(name, "no", f"not in {root}; {made if 'data_seed' in config else elsewhere}")
 
 
 def check_tools(place: Path) -> Iterator[Finding]:

@@ -62,11 +62,7 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
 
 
 def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
-    """Give a model the protocol's metrics.
-
-    Raises:
-        CompleteSplatError: the protocol has several samples, the model gives one answer.
-    """
+    """Give a model the protocol's metrics; `CompleteSplatError` for several samples of one that gives one answer."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
@@ -138,9 +134,7 @@ def run_hidden_modes(
     """Write `hidden_modes.json`, `calibration.json`, `protocol.json` and `hidden_modes.png`, and print the table.
 
     Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
-
-    Raises:
-        CompleteSplatError: data whose hidden parts are not known, or no scene that can be used.
+    `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
     """
     tested = Trained(**trained)
     quieten()

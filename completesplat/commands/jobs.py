@@ -38,8 +38,7 @@ def one_of_several() -> bool:
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
     """Arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
 
-    Raises:
-        CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
+    `CompleteSplatError`: this is one of several processes that a launcher started, each of which would sweep.
     """
     if one_of_several():
         said = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
@@ -103,10 +102,9 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
 
 
 def start(verb: str, config: Any, out: Path) -> None:
-    """Call the function that the configuration names as its task, else the one of a verb that has a single task.
+    """Call the function that the configuration names as its task (settings are checked by `check_settings`).
 
-    Raises:
-        CompleteSplatError: a setting does not fit the function's signature.
+    A verb that has a single task calls its own.
     """
     if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
@@ -119,8 +117,7 @@ def start(verb: str, config: Any, out: Path) -> None:
 def is_finished(out: Path, config: Any) -> bool:
     """Whether a job's directory holds its results, for jobs that have something to continue (`ckpt_path`).
 
-    Raises:
-        CompleteSplatError: there is training in it that would be lost, or that had other settings.
+    `CompleteSplatError`: there is training in it that would be lost, or that had other settings.
     """
     begun = (out / LAST).is_file() or (out / METRICS).is_file()
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():

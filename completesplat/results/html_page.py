@@ -301,9 +301,7 @@ def page(folder: Path, out: Path, most: Mapping[str, Any], made: Mapping[str, st
 
     `most` are the numbers of `frames` of a turn, `samples` of a photograph, `predictions`, `runs` and `pictures` of a
     run's folder that are shown, and `megabytes` of all pictures; `made` are command, date and commit of the page.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or nothing to show in it.
+    `CompleteSplatError`: there is no such folder, or nothing to show in it.
     """
     tree, budget = find(folder), ByteBudget(most["megabytes"])
     found, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]

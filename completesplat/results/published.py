@@ -260,10 +260,7 @@ def tables(tree: RunTree | None) -> list[Table]:
     """The published tables with the runs that were found below a folder; the published figures alone for None.
 
     A run stands below published rows only if it was measured like them, else in a table of its own protocol. The jobs
-    of a sweep over ablations stand in the ablation tables alone.
-
-    Raises:
-        CompleteSplatError: there are no results.
+    of a sweep over ablations stand in the ablation tables alone. `CompleteSplatError`: there are no results.
     """
     if tree is None:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]

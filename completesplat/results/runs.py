@@ -28,11 +28,7 @@ HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises:
-        ValueError: there is no such file, it is not JSON, or it holds something else.
-    """
+    """The mapping in a JSON file; `ValueError`: there is no such file, it is not JSON, or it holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -76,11 +72,7 @@ class RunTree:
 
 
 def find(folder: Path) -> RunTree:
-    """Search a folder and all below it, hidden folders apart.
-
-    Raises:
-        CompleteSplatError: there is no such folder.
-    """
+    """Search a folder and all below it, hidden folders apart; `CompleteSplatError` where there is no such folder."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
     found, results = RunTree(folder), []

@@ -215,11 +215,7 @@ def measure(
 
 
 def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
-    """Of the first scenes (all by default) those that can be used, and why the others cannot.
-
-    Raises:
-        CompleteSplatError: none can.
-    """
+    """Of the first scenes (None: all) those that can be used, and why others cannot; `CompleteSplatError` if none."""
     found, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:

@@ -49,11 +49,7 @@ class SampleRenderer:
 
 
 def first_scenes(data: Any, count: int) -> list[SceneBatch]:
-    """The first test scenes of a data module, each as a batch of one.
-
-    Raises:
-        DataError: there are less.
-    """
+    """The first test scenes of a data module, each as a batch of one; `DataError` if there are less."""
     data.setup("test")
     all_scenes = (batch[i : i + 1] for batch in data.test_dataloader() for i in range(len(batch.names)))
     found = list(islice(all_scenes, count))

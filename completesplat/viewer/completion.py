@@ -46,7 +46,8 @@ class Completion:
         """Draw with the present settings, after the jobs that wait."""
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load a picture first"), client)
-        job = partial(self._draw, *self.photograph, self.controls.settings(), client)
+        settings = {name: getattr(self.controls, name).value for name in SLIDERS}
+        job = partial(self._draw, *self.photograph, settings, client)
         self.page.worker.submit("draw", job)
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
@@ -57,7 +58,7 @@ class Completion:
             self.page.tell(error, event.client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
-        steps: Any = self.controls.steps
+        steps = self.controls.steps
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
             steps.value = nearest  # calls this again
