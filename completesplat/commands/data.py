@@ -11,6 +11,7 @@ from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 
 logger = logging.getLogger(__name__)
+MOST_SHOWN = 8
 
 
 def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> None:
@@ -45,11 +46,10 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
 
 def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
     """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
-    from completesplat.studies.contact_sheet import MOST_SEQUENCES
     from completesplat.studies.contact_sheet import show as draw
 
-    if not 1 <= scenes <= MOST_SEQUENCES or pictures < 1:
-        raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SEQUENCES} and 1 <= pictures")
+    if not 1 <= scenes <= MOST_SHOWN or pictures < 1:
+        raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SHOWN} and 1 <= pictures")
     source = _sources(data, [split])[split]
     names = source.names
     chosen = [names[i * len(names) // scenes] for i in range(scenes)] if len(names) > scenes else names

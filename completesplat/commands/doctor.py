@@ -30,6 +30,7 @@ EXTRAS = {
     "colmap": "imports captures of your own",
     "slurm": "spreads sweeps over a cluster",
 }
+OWN_PARTS = "completesplat.commands.doctor_checks"
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100e6
 """Bytes: the files of a few predictions."""
@@ -37,12 +38,9 @@ LEAST_SPACE = 100e6
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found, is missing or is broken.
+    """One thing that was found, is missing, which is no error, or is broken: completing a photograph needs it.
 
-    Args:
-        name: of the thing.
-        state: `broken` is what completing a photograph needs and does not have; `no` is no error.
-        said: a version, a place, or the reason and what to do.
+    It says a version, a place, or the reason and what to do.
     """
 
     name: str
@@ -162,17 +160,16 @@ def check_data(conf: Path, place: Path) -> Iterator[Finding]:
     for path in sorted(conf.glob("*.yaml")):
         config = OmegaConf.to_container(OmegaConf.load(path))
         # One without a root of its own has another one's, or cannot be chosen.
-        if isinstance(config, dict) and "root" in config:
-            yield _data_set(path.stem, str(config["root"]), "data_seed" in config, place)
-
-
-def _data_set(name: str, root: str, procedural: bool, place: Path) -> Finding:
-    if root == "???":
-        return Finding(name, "no", f"has no place of its own: data={name} data.root=FOLDER")
-    if (place / root).is_dir():
-        return Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
-    said = "made there when it is first used" if procedural else f"data={name} data.root=FOLDER names another place"
-    return Finding(name, "no", f"not in {root}; {said}")
+        if not isinstance(config, dict) or "root" not in config:
+            continue
+        name, root = path.stem, str(config["root"])
+        if root == "???":
+            yield Finding(name, "no", f"has no place of its own: data={name} data.root=FOLDER")
+        elif (place / root).is_dir():
+            yield Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
+        else:
+            made, elsewhere = "made there when it is first used", f"data={name} data.root=FOLDER names another place"
+            yield Finding(name, "no", f"not in {root}; {made if 'data_seed' in config else elsewhere}")
 
 
 def check_tools(place: Path) -> Iterator[Finding]:
@@ -237,8 +234,9 @@ def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
         "extras": check_extras,
         "imports": check_imports,
         "device": check_device,
-        "rasterizers": lambda: _check_with_parts("check_rasterizers"),
-        "weights": lambda: _check_with_parts("check_weights"),
+        # These need the package's own parts, which are imported only now.
+        "rasterizers": lambda: import_module(OWN_PARTS).check_rasterizers(),
+        "weights": lambda: import_module(OWN_PARTS).check_weights(),
         "data": lambda: check_data(conf_folder() / "data", place),
         "tools": lambda: check_tools(place),
     }
@@ -250,11 +248,6 @@ def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
         return list(check())
     except Exception as error:  # of any library: the other parts are looked at all the same
         return [Finding("check", "broken", one_line(error))]
-
-
-def _check_with_parts(name: str) -> Iterator[Finding]:
-    """A check that needs the package's own parts, which are imported only now."""
-    yield from getattr(import_module("completesplat.commands.doctor_checks"), name)()
 
 
 def show(findings: Mapping[str, Sequence[Finding]]) -> None:

@@ -1,21 +1,28 @@
-"""`completesplat test`: images of a trained model against true ones; `fit` scores in the same way."""
+"""`completesplat test`: images of a trained model against true ones, as `fit` scores them, too; and hidden modes."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
 
+import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import OmegaConf
+from rich.console import Console
+from rich.progress import track
 
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
-from completesplat.commands.protocol import protocol, write_json
+from completesplat.commands.protocol import drawing, protocol, provenance, write_json
+from completesplat.commands.schema import Natural, Positive, Range
 from completesplat.commands.trained import Trained
+from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.errors import CompleteSplatError
-from completesplat.results.tables import evaluation_table, show
-from completesplat.results.wandb import begin, log_test
+from completesplat.results.tables import Column, evaluation_table, show, table
+from completesplat.results.wandb import begin, log_modes, log_test
+from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
 from completesplat.training.loggers import finished
 
 
@@ -55,19 +62,10 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
 
 
 def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
-    """Give a model the protocol's metrics.
-
-    Raises:
-        CompleteSplatError: the protocol has several samples, the model gives one answer.
-    """
+    """Give a model the protocol's metrics; `CompleteSplatError` for several samples of one that gives one answer."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
-
-
-def scoring_trainer(trainer: Mapping[str, Any], evaluation: Mapping[str, Any], **settings: Any) -> Any:
-    """A trainer, with further settings, that tests in the protocol's precision, whatever the networks trained in."""
-    return instantiate(trainer, precision=evaluation["precision"], **settings, _convert_="all")
 
 
 def run(
@@ -82,9 +80,6 @@ def run(
     Args:
         trained: the arguments of `Trained`.
         evaluation, trainer, logger: configurations of the protocol, the trainer (without precision), loggers by name.
-
-    Raises:
-        CompleteSplatError: model, data and protocol do not go together, or some of them are missing.
     """
     tested = Trained(**trained)
     run_config = tested.configuration()
@@ -94,7 +89,7 @@ def run(
     module = tested.open_module(run_config)
     set_scoring(module, evaluation)
     loggers = list(instantiate(logger or {}, _convert_="all").values())
-    testing = scoring_trainer(trainer, evaluation, logger=loggers)
+    testing = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
     with finished(loggers):
         shown = begin(module, testing, OmegaConf.load(out / CONFIG), out)
         testing.test(module, datamodule=data, verbose=False)
@@ -107,3 +102,86 @@ def run(
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
+
+
+class HiddenModesEvaluation(TypedDict):
+    """Numbers of samples, scenes and views; `conf/evaluation/hidden_modes.yaml` explains each."""
+
+    name: str
+    samples: Annotated[int, Range(2)]
+    scenes: Positive | None
+    views: Positive
+    spread_views: Natural
+    shown_scenes: Positive
+    shown_samples: Positive
+    batch: Positive
+    seed: Natural
+
+
+FORMATS = {"method": "", **dict.fromkeys(("coverage", "total_variation", "sharpness", "rejected"), ".3f")}
+FORMATS |= dict.fromkeys(("energy_hidden", "energy_visible"), ".4f")
+FORMATS |= {"scenes": "d", "samples": "d"}
+COLUMNS: list[Column] = [(name.replace("_", " "), name, form) for name, form in FORMATS.items()]
+
+
+def run_hidden_modes(
+    trained: Mapping[str, Any],
+    evaluation: HiddenModesEvaluation,
+    trainer: Mapping[str, Any],
+    logger: Mapping[str, Any] | None,
+    out: Path,
+) -> None:
+    """Write `hidden_modes.json`, `calibration.json`, `protocol.json` and `hidden_modes.png`, and print the table.
+
+    Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
+    `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
+    """
+    tested = Trained(**trained)
+    quieten()
+    module, data = tested.open()
+    data.prepare_data()
+    data.setup("test")
+    device = torch.device("cuda" if trainer["accelerator"] != "cpu" and torch.cuda.is_available() else "cpu")
+    module.to(device).eval()
+    samples = evaluation["samples"]
+    scenes, skipped = usable(hidden_modes(data, evaluation["views"], evaluation["spread_views"]), evaluation["scenes"])
+    progress = partial(track, description="Hidden modes", console=Console(stderr=True))
+    measured = measure(
+        predictors(module, samples, evaluation["batch"]),
+        [scene.to(device) for scene in scenes],
+        samples,
+        evaluation["seed"],
+        evaluation["shown_scenes"],
+        evaluation["shown_samples"],
+        progress,
+    )
+    results, calibration = measured.results(samples), measured.calibration()
+    write_json(out / "hidden_modes.json", results)
+    write_json(out / "calibration.json", calibration)
+    used = {"scenes": measured.names, "skipped": skipped}
+    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used))
+    draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
+    loggers = list(instantiate(logger or {}, _convert_="all").values())
+    with finished(loggers):
+        log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
+    title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
+    Console(width=140).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
+    if skipped:
+        print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
+
+
+def _hidden_modes_protocol(
+    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]]
+) -> dict[str, Any]:
+    """The statement of what was measured and how, with the names of the scenes."""
+    return {
+        "name": evaluation["name"],
+        "method": module.method,
+        **data.describe(),
+        "image_size": data.image_size,
+        **scenes,
+        **{key: evaluation[key] for key in ("samples", "views", "spread_views", "seed")},
+        **drawing(module),
+        **provenance(data),
+        **tested.facts(),
+    }

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from torch import nn
 
 from completesplat.commands import quieten
-from completesplat.commands.evaluate import scored_data, scoring_trainer, set_scoring
+from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.distributed import batch_per_process
@@ -23,8 +23,7 @@ from completesplat.training.loggers import finished
 
 logger = logging.getLogger(__name__)
 
-OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}
-"""Settings of weights to start from."""
+OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}  # settings of weights to start from
 EXAMPLES = {
     "root": "DIR",
     "pretrained": "stabilityai/sd-vae-ft-mse, or null for random weights",
@@ -94,10 +93,9 @@ def _parts(config: Any) -> list[Any]:
 
 
 def checkpoint_to_continue(config: Any, out: Path) -> str | None:
-    """The checkpoint that the run starts from, if any; the other weights that the configuration names are not needed.
+    """The checkpoint that the run starts from, if any; `WeightsError` if one that is named does not exist.
 
-    Raises:
-        WeightsError: it does not exist.
+    The other weights that the configuration names are not needed then.
     """
     path: str | None = str(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
     if path is None or not Path(path).is_file():
@@ -111,11 +109,7 @@ def checkpoint_to_continue(config: Any, out: Path) -> str | None:
 
 
 def refuse_missing(config: Any) -> None:
-    """Refuse settings that data and model need and that are not given; one line shows what to give.
-
-    Raises:
-        CompleteSplatError: there is one.
-    """
+    """`CompleteSplatError` for a setting that data or model need and that is not given; it shows what to give."""
     for part in (config.data, config.model):
         for key in sorted(OmegaConf.missing_keys(part)):
             example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
@@ -134,10 +128,10 @@ def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict
 
 
 def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
-    """Score as `completesplat test` does; everything that was logged."""
+    """Score as `completesplat test` does, in the protocol's precision; everything that was logged."""
     progress = instantiate(config.callbacks.progress, _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
-    trainer = scoring_trainer(config.trainer, config.evaluation, **settings)
+    trainer = instantiate(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 

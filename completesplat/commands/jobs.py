@@ -38,8 +38,7 @@ def one_of_several() -> bool:
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
     """Arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
 
-    Raises:
-        CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
+    `CompleteSplatError`: this is one of several processes that a launcher started, each of which would sweep.
     """
     if one_of_several():
         said = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
@@ -77,11 +76,8 @@ def job_name(*keys: str, _root_: Any) -> str:
 def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     """Run one job in its own directory, leaving there what is needed to know what was run.
 
-    A job with `ckpt_path=last` whose directory holds its results is not repeated. `program` was started with the
-    arguments `given` behind the verb.
-
-    Raises:
-        CompleteSplatError: the directory holds other work.
+    A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
+    started with the arguments `given` behind the verb.
     """
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
@@ -106,10 +102,9 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
 
 
 def start(verb: str, config: Any, out: Path) -> None:
-    """Call the function that the configuration names as its task, else the one of a verb that has a single task.
+    """Call the function that the configuration names as its task (settings are checked by `check_settings`).
 
-    Raises:
-        CompleteSplatError: a setting does not fit the function's signature.
+    A verb that has a single task calls its own.
     """
     if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
@@ -122,8 +117,7 @@ def start(verb: str, config: Any, out: Path) -> None:
 def is_finished(out: Path, config: Any) -> bool:
     """Whether a job's directory holds its results, for jobs that have something to continue (`ckpt_path`).
 
-    Raises:
-        CompleteSplatError: there is training in it that would be lost, or that had other settings.
+    `CompleteSplatError`: there is training in it that would be lost, or that had other settings.
     """
     begun = (out / LAST).is_file() or (out / METRICS).is_file()
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():

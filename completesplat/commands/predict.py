@@ -46,11 +46,7 @@ class PredictNumbers(TypedDict):
 
 
 def run(config: Any, out: Path) -> None:
-    """Write each photograph's files into `out/<its name>/`.
-
-    Raises:
-        CompleteSplatError: settings without a meaning, or at least one picture that failed.
-    """
+    """Write each photograph's files into `out/<its name>/`."""
     check_settings(PredictNumbers, config)
     pictures = find_pictures(config.image)
     if config.mask is not None and len(pictures) > 1:
@@ -81,10 +77,9 @@ def find_pictures(image: Any) -> list[Path]:
 
 
 def wanted_files(config: Any) -> Wanted:
-    """What to write of each picture; looks for the converter if a format needs it.
+    """What to write of each picture.
 
-    Raises:
-        CompleteSplatError: no such format or camera path, no format at all, or no converter.
+    `CompleteSplatError`: no such format or camera path, no format at all, or no converter for one that needs it.
     """
     formats = _chosen("formats", config.formats, FORMATS)
     if not formats:
@@ -112,8 +107,7 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
 def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
-    Raises:
-        CompleteSplatError: the only picture failed, or some of several, which it names.
+    `CompleteSplatError`: the only picture failed, or some of several, which it names.
     """
     console, failed = Console(), []
     rasterizer = instantiate(config.rasterizer, _convert_="all")

@@ -10,7 +10,7 @@ from typing import Any
 from completesplat import __version__
 from completesplat.atomic import write_text
 from completesplat.results.machine import machine
-from completesplat.weights import WEIGHTS_FILE, sha256_of, weights_folder
+from completesplat.weights import sha256_of
 
 
 def write_json(path: Path, content: Mapping[str, Any], allow_nan: bool = False) -> None:
@@ -91,9 +91,3 @@ def checkpoint_facts(path: Path) -> dict[str, Any]:
     contents = read_checkpoint(path)
     facts = {"path": str(path), "sha256": sha256_of(path), "step": contents.get("global_step")}
     return {"checkpoint": facts, "ema": "averaging_state" in contents}
-
-
-def weights_facts(weights: str) -> dict[str, Any]:
-    """The same for a folder of weights (`completesplat.weights`), which does not say how training ended."""
-    digest = sha256_of(weights_folder(weights) / WEIGHTS_FILE)
-    return {"checkpoint": {"path": weights, "sha256": digest, "step": None}, "ema": None}

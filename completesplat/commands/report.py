@@ -6,7 +6,7 @@ from typing import Annotated, TypedDict
 
 from completesplat.atomic import atomic_path
 from completesplat.commands.schema import Positive, Range
-from completesplat.results.html_page import Limits, page
+from completesplat.results.html_page import page
 from completesplat.results.published import tables as published_tables
 from completesplat.results.runs import find, origin
 from completesplat.results.tables import show, write_tables
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 
 
 class Most(TypedDict):
-    """The fields of `Limits`, none of which may be zero."""
+    """How much a page holds; `conf/report_task/html.yaml` explains each."""
 
     frames: Positive
     samples: Positive
@@ -26,11 +26,7 @@ class Most(TypedDict):
 
 
 def tables(runs: str | None, out: Path) -> None:
-    """Write `tables.md`, `tables.csv` and `tables.tex`, and print the tables.
-
-    Args:
-        runs: the folder that is searched for results; None shows the published figures alone.
-    """
+    """Write `tables.md`, `.csv` and `.tex` of the results below `runs` (None: the published figures); print them."""
     tree = None if runs is None else find(Path(runs))
     made = published_tables(tree)
     write_tables(made, out)
@@ -40,16 +36,8 @@ def tables(runs: str | None, out: Path) -> None:
 
 
 def html(runs: str, most: Most, out: Path) -> None:
-    """Write `report.html` and print its size.
-
-    Args:
-        runs: the folder that is searched for runs, results and predictions.
-        most: how much is shown.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or nothing to show in it.
-    """
-    text, warnings = page(Path(runs), out, Limits(**most), origin(out, levels=0))
+    """Write `report.html`, the `page` on all below the folder `runs`, and print its size."""
+    text, warnings = page(Path(runs), out, most, origin(out, levels=0))
     with atomic_path(out / "report.html") as temporary:
         temporary.write_text(text, encoding="utf-8")
     for warning in warnings:

@@ -27,7 +27,10 @@ Numbers = Annotated[Sequence[float], Filled()]
 
 
 class Run(TypedDict):
-    """A run (`Trained`), and how many samples are drawn of how many of its first test scenes."""
+    """A run (`Trained`), and how many samples are drawn of how many of its first test scenes.
+
+    What is drawn refuses weights outside of [0, 1] and runs that are missing or draw nothing (`_open`).
+    """
 
     ckpt: str
     overrides: Sequence[str]
@@ -46,12 +49,8 @@ def samplers(
 ) -> None:
     """Write `samplers.json` and `samplers.png`, print the table and the fewest steps that are enough.
 
-    Args:
-        samplers: configurations by name.
-        steps: numbers of steps, by the name of the sampler.
-
-    Raises:
-        CompleteSplatError: steps of a sampler that is not there, or impossible ones, or weights outside of [0, 1].
+    Configurations of samplers and numbers of steps are by the sampler's name; see `conf/report_task/samplers.yaml`.
+    `CompleteSplatError`: steps of a sampler that is not there, or impossible ones.
     """
     for name in steps:
         if name not in samplers:
@@ -78,13 +77,7 @@ def controls(
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
-    Args:
-        skip_weights, guidance_weights: all their pairs are measured, and the paper's three.
-        near_degrees: targets whose optical axes are at most this far from the reference's count as near.
-        shown: samples in the grid of renders.
-
-    Raises:
-        CompleteSplatError: a weight outside of [0, 1].
+    All pairs of the weights are measured, and the paper's three; `conf/report_task/controls.yaml` explains the rest.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
     renderer, scenes, settings = _open(run)
@@ -104,12 +97,8 @@ def controls(
 def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[Run]) -> None:
     """Write `masked.png`: inputs with boxes over them, several completions of each.
 
-    Args:
-        boxes: [x0, y0, x1, y1] in shares of the picture; the scenes take turns.
-        views: besides the reference view.
-
-    Raises:
-        CompleteSplatError: a box without pixels or outside of the picture, or a weight outside of [0, 1].
+    Boxes are [x0, y0, x1, y1] in shares of the picture, as `check_box` has them; `conf/report_task/masked.yaml`
+    explains the rest.
     """
     for box in boxes:
         masked_study.check_box(box)
@@ -129,16 +118,7 @@ def depth(
     out: Path,
     **run: Unpack[Run],
 ) -> None:
-    """Write `depth.json` and `depth.png`, and print the table.
-
-    Args:
-        skip_weight, guidance_weight: of the figure; measured as well, beside the paper's three settings.
-        shown_scenes, shown: scenes and samples in the figure.
-        far_degrees: targets whose optical axes are farther than this from the reference's count as far.
-
-    Raises:
-        CompleteSplatError: a weight outside of [0, 1].
-    """
+    """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
     weights = controls_study.grid([skip_weight], [guidance_weight])
     renderer, scenes, settings = _open(run)
     drawn = scenes[:shown_scenes]
@@ -156,9 +136,7 @@ def depth(
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
     """What draws a run's samples, the first test scenes, and the settings that are written beside what is found.
 
-    Raises:
-        WeightsError: the checkpoint or its run's configuration is missing or does not fit.
-        CompleteSplatError: it is no latent diffusion model, or there are too few scenes.
+    Refused as by `Trained.open`, `diffusion_of` and `first_scenes`.
     """
     quieten()
     module, data = Trained(run["ckpt"], run["overrides"]).open()
@@ -193,12 +171,7 @@ CONTROLS: list[Column] = [
     ("near object", "near_object_psnr", ".2f"),
     ("diversity", "diversity", ".4f"),
 ]
-DEPTH: list[Column] = [
-    *WEIGHTS,
-    ("reference", "reference_deviation", ".4f"),
-    ("object", "reference_object_deviation", ".4f"),
-    ("measured", "reference_measured", ".0%"),
-    ("far", "far_deviation", ".4f"),
-    ("object", "far_object_deviation", ".4f"),
-    ("measured", "far_measured", ".0%"),
-]
+DEPTH = [*WEIGHTS]
+for _view in ("reference", "far"):
+    DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]
+    DEPTH += [("measured", f"{_view}_measured", ".0%")]

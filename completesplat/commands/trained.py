@@ -9,9 +9,9 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from completesplat.commands.protocol import checkpoint_facts, weights_facts
+from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.weights import CONFIG_FILE, in_the_box, weights_folder
+from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -28,12 +28,7 @@ ONLY_FOR_TRAINING = (
 class Trained:
     """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    Args:
-        ckpt: a checkpoint, whose run's directory holds the configuration of model and data.
-        overrides: changes to that configuration, as on the command line.
-        weights: a folder of weights, or a name of those in the package, instead of a checkpoint.
-        data, rasterizer: configurations that belong to `weights`.
-        sampler: configuration of another sampler than the model's own.
+    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`.
     """
 
     ckpt: str | None
@@ -83,8 +78,11 @@ class Trained:
         return module
 
     def facts(self) -> dict[str, Any]:
-        """Path and checksum of the weights, for the protocol of a measurement."""
-        return checkpoint_facts(Path(self.ckpt)) if self.ckpt is not None else weights_facts(str(self.weights))
+        """As `checkpoint_facts`; a folder of weights does not say how training ended."""
+        if self.ckpt is not None:
+            return checkpoint_facts(Path(self.ckpt))
+        digest = sha256_of(weights_folder(str(self.weights)) / WEIGHTS_FILE)
+        return {"checkpoint": {"path": str(self.weights), "sha256": digest, "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
         """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
@@ -105,11 +103,7 @@ class Trained:
 
 
 def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, saying if these are the package's own, with `config.sampler` if given.
-
-    Raises:
-        WeightsError: no weights, or not readable.
-    """
+    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given; errors are `from_pretrained`'s."""
     from completesplat.generation import CompleteSplat
 
     if config.weights in in_the_box():
@@ -122,11 +116,7 @@ def open_generator(config: Any) -> Any:
 
 
 def diffusion_of(module: Any) -> Any:
-    """The generator of a latent diffusion model.
-
-    Raises:
-        CompleteSplatError: the model is another one.
-    """
+    """The generator of a latent diffusion model; `CompleteSplatError` for another model."""
     from completesplat.training.latent_diffusion import LatentDiffusion
 
     if not isinstance(module, LatentDiffusion):
@@ -135,11 +125,7 @@ def diffusion_of(module: Any) -> Any:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
-    """The configuration saved beside a checkpoint's folder, with changes.
-
-    Raises:
-        WeightsError: the checkpoint or its run's configuration is missing.
-    """
+    """The configuration saved beside a checkpoint's folder, with changes; `WeightsError` if one of both is missing."""
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")

@@ -68,11 +68,7 @@ def run(config: Any, out: Path) -> None:
 
 
 def settings_of(path: Path) -> dict[str, str]:
-    """The setting that a path stands for: `scene`, `image` or `weights`.
-
-    Raises:
-        CompleteSplatError: nothing there, or a folder with nothing to show.
-    """
+    """The setting that a path stands for: `scene`, `image` or `weights`; `CompleteSplatError` for none of these."""
     if path.is_file():
         return {"scene" if path.suffix.lower() == ".ply" else "image": str(path)}
     if not path.is_dir():
@@ -98,6 +94,7 @@ def make_page(config: Any, out: Path) -> Any:
     from completesplat.commands.trained import open_generator
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page, Saver, start_server, stop_server
+    from completesplat.viewer.panel import SLIDERS
     from completesplat.viewer.sample import read_scene
     from completesplat.viewer.stage import Stage
 
@@ -113,11 +110,10 @@ def make_page(config: Any, out: Path) -> Any:
         rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
         saver = Saver(out, stage, rasterizer, config.frames, config.background)
         if model is None:
-            return Page(server, stage, saver, stage.layers)
+            return Page(server, stage, saver, max(sample.layers for sample in samples))
         page = Page(server, stage, saver, model.autoreconstructor.reconstructor.parameterization.layers)
-        names = ("samples", "skip_weight", "guidance_weight", "steps", "seed")
         steps = model.sampler.steps if config.steps is None else config.steps
-        completion = Completion(page, model, {name: config[name] for name in names} | {"steps": steps})
+        completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
         if photograph is not None:
             completion.load(Path(config.image).name, photograph)
         return page
@@ -129,8 +125,7 @@ def make_page(config: Any, out: Path) -> Any:
 def data_cameras(config: Any) -> Any:
     """Cameras of the first training sequence that can be read, in the frame of its first one: at most 24, evenly.
 
-    Raises:
-        DataError: no sequence can be read.
+    `DataError`: no sequence can be read.
     """
     import torch
     from hydra.utils import instantiate
@@ -149,11 +144,7 @@ def data_cameras(config: Any) -> Any:
 
 
 def export(page: Any, path: Path) -> None:
-    """Write what the page shows when its work is done.
-
-    Raises:
-        CompleteSplatError: it shows nothing.
-    """
+    """Write what the page shows when its work is done; `CompleteSplatError` if it shows nothing."""
     from completesplat.viewer.page import write_page
 
     page.worker.wait()

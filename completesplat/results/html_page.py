@@ -194,19 +194,6 @@ HINT = (
 )
 
 
-@dataclass(frozen=True)
-class Limits:
-    """How much a page holds: frames of a turn, samples of a photograph, photographs, runs, pictures of a run's folder,
-    and all pictures together."""
-
-    frames: int
-    samples: int
-    predictions: int
-    runs: int
-    pictures: int
-    megabytes: float
-
-
 def comparison(table: Table) -> Html:
     """A table with what stands below it; without a result of ours it is folded."""
     below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
@@ -224,7 +211,7 @@ def rows_of(title: str, rows: Sequence[Any]) -> Html:
     records = [row for row in rows if isinstance(row, Mapping)]
     keys = list(dict.fromkeys(str(key) for row in records for key, x in row.items() if isinstance(x, PLAIN)))
     body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
-    return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body, gaps=True))
+    return _grid(Table(title, title, [Heading(key.replace("_", " ")) for key in keys], body))
 
 
 def _grid(table: Table) -> Html:
@@ -288,49 +275,47 @@ def _more(count: int, what: str) -> list[Html]:
     return [left_out(f"{count} {what} left out")] if count > 0 else []
 
 
-def prediction_section(path: Path, name: str, limits: Limits, budget: ByteBudget) -> Html:
+def prediction_section(path: Path, name: str, most: Mapping[str, Any], budget: ByteBudget) -> Html:
     """A section of one photograph: how its samples were made, each of them turning, and the sheet."""
     settings = mapping_or_empty(path / SCENE).get("settings")
     settings = settings if isinstance(settings, dict) else {}
     image = str(settings.get("image") or name)
     videos = sorted(path.glob("orbit_*.mp4"))
     turning = [
-        turntable(video, image, video.stem.replace("orbit_", "sample "), limits.frames, budget)
-        for video in videos[: limits.samples]
+        turntable(video, image, video.stem.replace("orbit_", "sample "), most["frames"], budget)
+        for video in videos[: most["samples"]]
     ]
     said = [f"{told} {_said(settings[key])}" for key, told in NAMED.items() if settings.get(key) is not None]
     parts = [element("h3", name), described({"settings": ", ".join(said), **origin(path)})]
     if turning:
         parts.append(element("div", *turning, class_="samples"))
-    parts += _more(len(videos) - limits.samples, "more samples")
+    parts += _more(len(videos) - most["samples"], "more samples")
     if (path / "sheet.png").is_file():
         sheet = picture(path / "sheet.png", f"{image}: input, and views around each sample", budget)
         parts.append(folded("Contact sheet", sheet, open_=not turning))
     return element("section", *parts, aria_label=f"Prediction {name}")
 
 
-def page(folder: Path, out: Path, limits: Limits, made: Mapping[str, str]) -> tuple[str, list[str]]:
+def page(folder: Path, out: Path, most: Mapping[str, Any], made: Mapping[str, str]) -> tuple[str, list[str]]:
     """The page on all below a folder but what lies in `out`, and a line for each file of results that is of no use.
 
-    `made` are command, date and commit of the page itself.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or nothing to show in it.
+    `most` are the numbers of `frames` of a turn, `samples` of a photograph, `predictions`, `runs` and `pictures` of a
+    run's folder that are shown, and `megabytes` of all pictures; `made` are command, date and commit of the page.
+    `CompleteSplatError`: there is no such folder, or nothing to show in it.
     """
-    tree, budget = find(folder), ByteBudget(limits.megabytes)
+    tree, budget = find(folder), ByteBudget(most["megabytes"])
     found, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]
     if not found and not predicted:
         raise CompleteSplatError(
             f"runs={folder}: nothing to show in it or below it; `completesplat fit`, `test`, `predict` and `report` "
             "write what a page is made of"
         )
-    predictions = [
-        prediction_section(path, _name(path, folder), limits, budget) for path in predicted[: limits.predictions]
-    ]
+    shown = predicted[: most["predictions"]]
+    predictions = [prediction_section(path, _name(path, folder), most, budget) for path in shown]
     few = len(found) <= UNFOLDED
-    runs = [run_section(run, limits.pictures, budget, few or "" in run.figures) for run in found[: limits.runs]]
-    predictions += _more(len(predicted) - limits.predictions, "more predictions")
-    runs += _more(len(found) - limits.runs, "more runs")
+    runs = [run_section(run, most["pictures"], budget, few or "" in run.figures) for run in found[: most["runs"]]]
+    predictions += _more(len(predicted) - len(shown), "more predictions")
+    runs += _more(len(found) - len(runs), "more runs")
     tables = compared(tree) if tree.scores or tree.modes or tree.warnings else []
     sections = {
         "Predictions": [element("p", HINT), *predictions] if predictions else [],

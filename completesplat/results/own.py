@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from completesplat.results.runs import Result
-from completesplat.results.scores import MODEL, Entry, described
+from completesplat.results.scores import LEADING, MODEL, Entry, described, leading_headings
 from completesplat.results.tables import (
     LEGEND,
     METRICS,
@@ -29,8 +29,7 @@ SAID += ["precision"]
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
 """The scores that a table shows where a run has them."""
-IDENTITY = [Heading("method", figures=False), Heading("inference", "time per sequence")]
-IDENTITY += [Heading("rendering", "time per sequence"), Heading("scenes"), Heading("pixels")]
+IDENTITY = [key for key in LEADING if key != "speed"]
 
 SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
 SCORES |= {"rejected": "rejected ↓"}
@@ -80,14 +79,14 @@ def _table(name: str, entries: Sequence[Entry]) -> Table:
     marked = {name: marks([entry.value(name) for entry in kept], competing, name) for name in shown}
     rows = []
     for index, entry in enumerate(kept):
-        size = [Cell(str(protocol[key])) for key in ("scenes", "resolution")]
-        cells = [entry.method(notes), entry.time("inference"), entry.time("rendering"), *size]
+        leading = entry.leading(notes)
+        cells = [leading[key] for key in IDENTITY]
         cells += [replace(entry.cell(name, notes), mark=marked[name][index]) for name in shown]
         rows.append(TableRow("ours" if entry.own else "naive", cells))
     title = f"{protocol['data_set']}, {protocol.get('name', 'scores')}, {protocol['resolution']} pixels"
     remarks = ["Ours, best in bold and second best underlined; not by the protocol of any published table."]
     remarks += [protocol_said(protocol), LEGEND]
-    return Table(name, title, [*IDENTITY, *map(score_heading, shown)], rows, remarks, notes)
+    return Table(name, title, [*leading_headings(IDENTITY), *map(score_heading, shown)], rows, remarks, notes)
 
 
 def _known(entry: Entry, column: str) -> bool:

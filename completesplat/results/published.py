@@ -11,7 +11,18 @@ from omegaconf import OmegaConf
 from completesplat.errors import CompleteSplatError
 from completesplat.results.own import alike, mode_tables, own_tables, protocol_said
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
-from completesplat.results.scores import BEST_OF_K, MODEL, Entry, entries, figures, rows, time_cell
+from completesplat.results.scores import (
+    BEST_OF_K,
+    COST,
+    LEADING,
+    MODEL,
+    Entry,
+    entries,
+    figures,
+    leading_headings,
+    rows,
+    time_cell,
+)
 from completesplat.results.tables import (
     ABSENT,
     BEST,
@@ -32,9 +43,6 @@ MARKS = ("best", "second", "dagger", "star")
 METRICS = ("psnr", "lpips", "fid", "kid")
 
 SIGNS = {"dagger": "†", "star": "★"}
-IDENTITY = {"method": "method", "speed": "rendering speed"}
-COST = {"inference": "inference", "rendering": "rendering"}
-LEADING = {**IDENTITY, **COST, "scenes": "scenes", "resolution": "pixels"}
 VIEWS = (
     "The paper names both reference and novel views in its protocol and does not say how it weighs them; "
     "our rows are of novel views."
@@ -85,10 +93,6 @@ class PublishedTable:
     remarks: list[str] = field(default_factory=list)
     options: Mapping[str, str] = field(default_factory=dict)
 
-    def data_sets(self) -> list[str]:
-        """The data sets whose figures the table holds."""
-        return list(dict.fromkeys(column.data_set for column in self.columns if column.key in METRICS))
-
 
 def published() -> list[PublishedTable]:
     """All tables, in the paper's order."""
@@ -111,9 +115,8 @@ def parse(cell: str) -> PrintedCell:
 
 @cache
 def _content() -> dict[str, Any]:
-    content = OmegaConf.to_container(OmegaConf.load(FILE))
-    assert isinstance(content, dict)
-    return {str(key): value for key, value in content.items()}
+    content: Any = OmegaConf.to_container(OmegaConf.load(FILE))
+    return dict(content)
 
 
 def _table(entry: Mapping[str, Any]) -> PublishedTable:
@@ -133,16 +136,13 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
     has_speed = any(column.key == "speed" for column in table.columns)
     keys = [key for key in LEADING if key != "speed" or has_speed]
     scored = [column for column in table.columns if column.key in METRICS]
-    headings = [Heading(LEADING[key], "time per sequence" if key in COST else "", key not in IDENTITY) for key in keys]
-    headings += [Heading(column.heading) for column in scored]
+    headings = [*leading_headings(keys), *(Heading(column.heading) for column in scored)]
     rows = [TableRow("paper", _published(table, row, keys)) for row in table.rows]
     for entry in (entry for entry in entries if belongs(table, entry)):
-        protocol = entry.run.protocol
-        own = {"method": entry.method(notes), "speed": Cell(ABSENT)} | {key: entry.time(key) for key in COST}
-        own |= {key: Cell(str(protocol[key])) for key in ("scenes", "resolution")}
-        cells = [own[key] for key in keys]
+        leading = entry.leading(notes)
+        cells = [leading[key] for key in keys]
         for column in scored:
-            fits = column.data_set == protocol["data_set"]
+            fits = column.data_set == entry.run.protocol["data_set"]
             cells.append(entry.cell(f"{table.region}_{table.view}_{column.key}", notes) if fits else Cell(ABSENT))
         rows.append(TableRow("ours", cells))
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
@@ -161,7 +161,8 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     protocol = entry.run.protocol
     if protocol.get("name") not in table.evaluations:
         return False
-    if protocol["data_set"] not in table.data_sets() or protocol.get("skipped") or entry.upper_bound:
+    data_sets = {column.data_set for column in table.columns if column.key in METRICS}
+    if protocol["data_set"] not in data_sets or protocol.get("skipped") or entry.upper_bound:
         return False
     if table.subset and protocol.get("subset") != table.subset:
         return False
@@ -221,10 +222,17 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
     printed = {row[0].text: [shown(cell) for cell in row] for row in table.rows}
     order = [*printed, ""]
     own = sorted(rows(jobs), key=lambda row: order.index(_option(row["ablation"], table)))
-    body = [
-        TableRow("naive" if row["seeds"] is None else "ours", _ablation(row, cells, table, printed, jobs, notes))
-        for row, cells in zip(own, figures(own, COLUMNS), strict=True)
-    ]
+    reasons = protocol.get("missing") or {}
+    body = []
+    for row, scores in zip(own, figures(own, COLUMNS), strict=True):
+        published = printed.get(_option(row["ablation"], table), [Cell(ABSENT)] * len(table.columns))
+        counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
+        cells = [Cell(row["ablation"]), *published, *counts, *_mean_times(jobs, row["ablation"])]
+        for column, cell in zip(COLUMNS, scores, strict=True):
+            score = column.rpartition("_")[2]
+            reason = f"{score}: {reasons.get(score, 'not measured in all jobs of this row')}"
+            cells.append(cell if cell.text else notes.missing(reason))
+        body.append(TableRow("naive" if row["seeds"] is None else "ours", cells))
     ours = {_option(row["ablation"], table) for row in own}
     absent = [Cell(ABSENT)] * (4 + len(COLUMNS))
     body += [TableRow("paper", [Cell(ABSENT), *row, *absent]) for method, row in printed.items() if method not in ours]
@@ -237,27 +245,10 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
     return Table(f"ablations_{name}", title, headings, body, [*remarks, APART, LEGEND], notes)
 
 
-def _ablation(
-    row: dict[str, Any],
-    scores: Sequence[Cell],
-    table: PublishedTable,
-    printed: Mapping[str, list[Cell]],
-    jobs: Sequence[Job],
-    notes: Notes,
-) -> list[Cell]:
-    label, reasons = row["ablation"], jobs[0].protocol.get("missing") or {}
-    published = printed.get(_option(label, table), [Cell(ABSENT)] * len(table.columns))
-    counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
-    cells = [Cell(label), *published, *counts]
+def _mean_times(jobs: Sequence[Job], label: str) -> list[Cell]:
     seconds = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs if job.label == label]
-    for part in COST:
-        measured = [found[part] for found in seconds if found.get(part) is not None]
-        cells.append(time_cell(sum(measured) / len(measured) if measured else None))
-    for column, cell in zip(COLUMNS, scores, strict=True):
-        name = column.rpartition("_")[2]
-        reason = f"{name}: {reasons.get(name, 'not measured in all jobs of this row')}"
-        cells.append(cell if cell.text else notes.missing(reason))
-    return cells
+    measured = [[found[part] for found in seconds if found.get(part) is not None] for part in COST]
+    return [time_cell(sum(times) / len(times) if times else None) for times in measured]
 
 
 def _option(label: str, table: PublishedTable) -> str:
@@ -269,16 +260,14 @@ def tables(tree: RunTree | None) -> list[Table]:
     """The published tables with the runs that were found below a folder; the published figures alone for None.
 
     A run stands below published rows only if it was measured like them, else in a table of its own protocol. The jobs
-    of a sweep over ablations stand in the ablation tables alone.
-
-    Raises:
-        CompleteSplatError: there are no results.
+    of a sweep over ablations stand in the ablation tables alone. `CompleteSplatError`: there are no results.
     """
     if tree is None:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
     made: list[Table] = []
+    placed = [table for table in published() if not table.options]
     (ablations,) = (table for table in published() if table.options)
     names = {folder: str(folder.relative_to(tree.folder)) for folder in tree.sweeps}
     compared = {folder: sweep_beside(ablations, collect(folder), name) for folder, name in names.items()}
@@ -288,6 +277,5 @@ def tables(tree: RunTree | None) -> list[Table]:
             made += [one for found in compared.values() for one in found] or [published_ablations(table)]
         else:
             made.append(beside(table, single))
-    placed = [table for table in published() if not table.options]
     elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
     return [*made, *own_tables(elsewhere), *mode_tables(tree.modes)]

@@ -28,11 +28,7 @@ HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises:
-        ValueError: there is no such file, it is not JSON, or it holds something else.
-    """
+    """The mapping in a JSON file; `ValueError`: there is no such file, it is not JSON, or it holds something else."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -76,11 +72,7 @@ class RunTree:
 
 
 def find(folder: Path) -> RunTree:
-    """Search a folder and all below it, hidden folders apart.
-
-    Raises:
-        CompleteSplatError: there is no such folder.
-    """
+    """Search a folder and all below it, hidden folders apart; `CompleteSplatError` where there is no such folder."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
     found, results = RunTree(folder), []
@@ -189,8 +181,7 @@ def planned(folder: Path) -> list[list[str]]:
     """
     if not (folder / PLAN).is_file():
         return []
-    given = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
-    assert isinstance(given, list)
+    given: Any = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
     overrides = OverridesParser.create().parse_overrides(given)
     if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
         return []
@@ -214,13 +205,11 @@ def _job(folder: Path) -> Job:
     record = mapping_or_empty(folder / RECORD)
     if not record:
         return Job(folder.name)
-    config = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
-    assert isinstance(config, dict)
-    named = {str(key): value for key, value in config.items()}
+    config: Any = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
     metrics = mapping_or_empty(folder / SCORES) or None
     test: dict[str, Any] = dict((metrics or {}).get("test", {}))
     protocol = test.pop(PROTOCOL, {})
-    return Job(folder.name, _pairs(record["overrides"]), named, record, metrics, test, protocol)
+    return Job(folder.name, _pairs(record["overrides"]), config, record, metrics, test, protocol)
 
 
 def _labelled(jobs: Sequence[Job]) -> list[Job]:

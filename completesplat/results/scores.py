@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from completesplat.results.runs import SEED, Job, Result
-from completesplat.results.tables import ABSENT, FORMATS, Cell, Notes, by_name, marks
+from completesplat.results.tables import ABSENT, FORMATS, Cell, Heading, Notes, by_name, marks
 
 MODEL, BEST_OF_K, MEAN_OF_K = "model", "best_of_k", "mean_of_k"
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
@@ -17,6 +17,9 @@ AGREEMENT = 1e-4  # how far, relatively, a naive predictor's scores may lie apar
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
 WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]  # scores in the table of a sweep
 
+COST = {"inference": "inference", "rendering": "rendering"}
+LEADING = {"method": "method", "speed": "rendering speed", **COST, "scenes": "scenes", "resolution": "pixels"}
+"""The columns before the scores, and their headings."""
 OURS = "completesplat: "  # not "ours": so the paper calls its own rows
 DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
 DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
@@ -166,9 +169,18 @@ class Entry:
         reasons = self.run.protocol.get("missing") or {}
         return notes.missing(f"{metric}: {reasons.get(metric, f'not measured for {self.predictor}')}")
 
-    def time(self, part: str) -> Cell:
-        """The time of one sequence: `inference` or `rendering`."""
-        return time_cell((self.scores.get("seconds") or {}).get(part))
+    def leading(self, notes: Notes) -> dict[str, Cell]:
+        """The cells before the scores, by the keys of `LEADING`; what is not known of an entry is absent."""
+        seconds, protocol = self.scores.get("seconds") or {}, self.run.protocol
+        cells = {"method": self.method(notes), "speed": Cell(ABSENT)}
+        cells |= {part: time_cell(seconds.get(part)) for part in COST}
+        return cells | {key: Cell(str(protocol[key])) for key in ("scenes", "resolution")}
+
+
+def leading_headings(keys: Iterable[str]) -> list[Heading]:
+    """Headings for some keys of `LEADING`."""
+    named = [(key, "time per sequence" if key in COST else "") for key in keys]
+    return [Heading(LEADING[key], group, key not in ("method", "speed")) for key, group in named]
 
 
 def entries(runs: Sequence[Result]) -> list[Entry]:

@@ -107,11 +107,13 @@ def _table(rows: Sequence[dict[str, Any]], remarks: list[str]) -> Table:
         for row, cells in zip(rows, figures(rows, shown), strict=True)
     ]
     headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, shown)]
-    return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks, gaps=True)
+    return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
 def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
     """Sentences: how many jobs have finished, which have not, what must not be compared, commit, machine and date."""
+    from completesplat.results.scores import disagreeing
+
     finished = [job for job in jobs if job.metrics is not None]
     said = [f"{len(finished)} of {len(jobs)} jobs have finished."]
     missing = []
@@ -120,26 +122,19 @@ def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
         missing.append(job.name or ", ".join([job.label, *seed]))  # there is no folder before a job starts
     if missing:
         said.append(f"Not finished: {'; '.join(missing)}.")
-    commits = list(dict.fromkeys(job.record["commit"] or "unknown" for job in jobs if job.record))
-    said += _incomparable(finished, rows)
-    said.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
-    here = machine()
-    hardware = ", ".join([here["processor"], f"{here['cores']} cores", *([here["gpu"]] if "gpu" in here else [])])
-    software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
-    return [*said, f"Summary of {here['date']}, made on {hardware}, {software}."]
-
-
-def _incomparable(finished: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
-    from completesplat.results.scores import disagreeing
-
     mixed = [row for row in rows if isinstance(row["scenes"], str) and row["seeds"] is not None]
-    said = [f"{row['ablation']} has seen the views that it is scored on." for row in rows if row["upper_bound"]]
+    said += [f"{row['ablation']} has seen the views that it is scored on." for row in rows if row["upper_bound"]]
     said += [f"{row['ablation']}: its jobs were tested on different scenes ({row['scenes']})." for row in mixed]
     if len({row["scenes"] for row in rows if row["seeds"] is not None}) > 1:
         said.append("The rows were not tested on equally many scenes and do not compare.")
     for predictor in disagreeing(finished):
         said.append(f"{predictor} does not score the same in all jobs, so they differ in their test data; its mean.")
-    return said
+    commits = list(dict.fromkeys(job.record["commit"] or "unknown" for job in jobs if job.record))
+    said.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
+    here = machine()
+    hardware = ", ".join([here["processor"], f"{here['cores']} cores", *([here["gpu"]] if "gpu" in here else [])])
+    software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
+    return [*said, f"Summary of {here['date']}, made on {hardware}, {software}."]
 
 
 def write_summary(folder: Path) -> Summary:

@@ -127,14 +127,6 @@ class Table:
     rows: list[TableRow]
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
-    gaps: bool = False  # whether cells may be empty
-
-    def __post_init__(self) -> None:
-        """Refuse a row that does not fit the headings, and an empty cell unless there may be gaps."""
-        for row in self.rows:
-            complete = self.gaps or all(cell.text for cell in row.cells)
-            if len(row.cells) != len(self.headings) or not complete:
-                raise ValueError(f"{self.name}: {[cell.text for cell in row.cells]} in {len(self.headings)} columns")
 
     def groups(self) -> list[tuple[str, int]]:
         """The headings above those of the columns, and how many columns each spans; empty where there are none."""
@@ -168,7 +160,7 @@ def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any
     for record in records:
         values = [(record.get(key), form) for _, key, form in columns]
         rows.append(TableRow("", [Cell("" if value is None else format(value, form)) for value, form in values]))
-    return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows, gaps=True)
+    return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows)
 
 
 def by_name(entry: dict[str, Any]) -> dict[str, float]:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
-from completesplat.export.pictures import color_depth, enlarge, surface_depth, to_bytes
+from completesplat.export.pictures import color_depth, image_grid, surface_depth
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
 from completesplat.metrics.scoring import BEST, MODEL, Evaluation, Scores
@@ -37,10 +37,7 @@ class SceneTable:
 
     def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
         self.module, self.folder, self.most = module, folder, most
-        self.columns: list[str | int] = []
-        self.rows: list[list[Any]] = []
-        self.videos: list[Path] = []
-        self.names: list[str] = []
+        self.rows: list[dict[str, Any]] = []
 
     @torch.no_grad()
     def add(self, scene: ScoredScene) -> None:
@@ -54,11 +51,8 @@ class SceneTable:
         with torch.autocast(self.module.device.type, enabled=False):
             seen = self.module.rasterizer(scene.gaussians[:1], scene.cameras[views][None])
             row["depth"] = strip(color_depth(surface_depth(seen)[0])[0])
-            self.videos.append(self._turntable(scene))
-        row |= {"turntable": self.videos[-1], **scores_of(self.module.evaluation, scene.name)}
-        self.names.append(scene.name)
-        self.columns = list(row)
-        self.rows.append(list(row.values()))
+            row["turntable"] = self._turntable(scene)
+        self.rows.append(row | scores_of(self.module.evaluation, scene.name))
 
     def _turntable(self, scene: ScoredScene) -> Path:
         module, gaussians, reference = self.module, scene.gaussians[0], scene.cameras[0]
@@ -76,8 +70,8 @@ class SceneTable:
 
         if not self.rows:
             return {}
-        table = wandb.Table(self.columns, [[as_media(value) for value in row] for row in self.rows])
-        videos = [wandb.Video(str(p), caption=name) for p, name in zip(self.videos, self.names, strict=True)]
+        table = wandb.Table(list(self.rows[-1]), [[as_media(value) for value in row.values()] for row in self.rows])
+        videos = [wandb.Video(str(row["turntable"]), caption=row["scene"]) for row in self.rows]
         return {"test/scenes": table, "test/turntables": videos}
 
 
@@ -93,8 +87,7 @@ def as_media(value: Any) -> Any:
 def strip(images: Float[Tensor, "view 3 height width"]) -> Image.Image:
     """Views side by side, each enlarged by a whole factor to about 128 px."""
     factor = max(1, round(READABLE_SIDE / max(images.shape[-2:])))
-    row = torch.cat(list(images.float().nan_to_num()), dim=-1)
-    return Image.fromarray(to_bytes(enlarge(row, factor)))
+    return image_grid(images.float().nan_to_num(), factor=factor)
 
 
 def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:

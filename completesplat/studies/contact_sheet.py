@@ -14,7 +14,6 @@ from completesplat.errors import DataError
 from completesplat.export.pictures import GAP, INK, LINE, MARGIN, PAPER
 from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
 
-MOST_SEQUENCES = 8
 CELL, TEXT, NAME, TITLE = 216, 13, 15, 18
 GREY, MASK = (190, 190, 190), (255, 220, 0)
 DRAWINGS = ("from above", "from the side")
@@ -26,17 +25,12 @@ LEGEND = (
 )
 
 
-def show(sequences: Sequence[PosedSequence], path: Path, pictures: int = 6, title: str = "") -> None:
+def show(sequences: Sequence[PosedSequence], path: Path, pictures: int, title: str) -> None:
     """Write a PNG with a row for each sequence: some pictures, and its cameras from above and from the side.
 
     The pictures are evenly spaced, the first and the last frame among them. One that cannot be read is a grey cell
     with the kind of its `DataError`.
-
-    Raises:
-        ValueError: no sequences, more than `MOST_SEQUENCES`, or no pictures.
     """
-    if not 0 < len(sequences) <= MOST_SEQUENCES or pictures < 1:
-        raise ValueError(f"a sheet has 1 to {MOST_SEQUENCES} sequences and 1 picture of each or more")
     width = _left(pictures + len(DRAWINGS)) - GAP + MARGIN
     legend = [line for text in LEGEND for line in _wrapped(text, width - 2 * MARGIN)]
     top = MARGIN + int(1.5 * LINE)

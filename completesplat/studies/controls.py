@@ -25,11 +25,7 @@ PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
 
 
 def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
-    """All pairs of (skip weight, guidance weight), the paper's three included.
-
-    Raises:
-        CompleteSplatError: a weight outside of [0, 1].
-    """
+    """All pairs of (skip weight, guidance weight) and the paper's three; `CompleteSplatError` outside of [0, 1]."""
     pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
     for skip_weight, guidance_weight in pairs:
         allowed_skip_weight(skip_weight)

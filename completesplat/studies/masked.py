@@ -15,11 +15,7 @@ from completesplat.studies.samples import SampleRenderer
 
 
 def check_box(box: Sequence[float]) -> None:
-    """Refuse what is no box in shares of a picture.
-
-    Raises:
-        CompleteSplatError: it has no pixels, or it reaches out of the picture.
-    """
+    """`CompleteSplatError` for what is no box in shares of a picture, has no pixels, or reaches out of the picture."""
     if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
         raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
 

@@ -116,13 +116,9 @@ REGIONS = ("hidden", "visible")
 
 @dataclass(frozen=True)
 class Shown:
-    """A scene's pictures for the figure, from the view that shows the modes best, and the samples' classes."""
+    """A scene for the figure; samples from the view that shows the modes best, and their classes."""
 
-    name: str
-    reference: Float[Tensor, "3 height width"]
-    truths: Float[Tensor, "mode 3 height width"]
-    modes: tuple[str, ...]
-    true_mode: int
+    scene: HiddenModes
     samples: Float[Tensor, "sample 3 height width"]
     classes: tuple[int, ...]
 
@@ -137,7 +133,7 @@ class Measured:
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
     energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
-    shown: dict[str, list[Shown]] = field(default_factory=dict)
+    shown: list[Shown] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
@@ -158,21 +154,11 @@ class Measured:
         for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
             found[name] = found.get(name, 0) + bin_sums(variance, error, region)
 
-    def show(self, method: str, images: Renders, scene: HiddenModes, count: int) -> None:
+    def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
         """Keep pictures and classes of some samples."""
         pixels, modes = in_region(images[:count], scene.region), in_region(scene.truths, scene.region)
         classes = classify(pixels, modes, scene.probabilities)
-        reference, truths = scene.scene.reference.images[0].cpu(), scene.truths[:, 0].cpu()
-        shown = Shown(
-            scene.scene.names[0],
-            reference,
-            truths,
-            scene.modes,
-            scene.true_mode,
-            images[:count, 0].cpu(),
-            tuple(classes.tolist()),
-        )
-        self.shown.setdefault(method, []).append(shown)
+        self.shown.append(Shown(scene, images[:count, 0], tuple(classes.tolist())))
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Means over the scenes by method."""
@@ -209,7 +195,8 @@ def measure(
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
-    their mean. The other scene that a predictor gets is the one before (before the first: the last).
+    their mean. The other scene that a predictor gets is the one before (before the first: the last). Samples of `model`
+    are shown.
     """
     measured = Measured()
     for index, scene in enumerate(progress(scenes)):
@@ -221,18 +208,14 @@ def measure(
             own = renders[:, list(scene.views)]
             measured.add(method, own, scene)
             measured.add_calibration(method, renders, scene)
-            if len(measured.names) < shown_scenes:
-                measured.show(method, own, scene, shown_samples)
+            if method == "model" and index < shown_scenes:
+                measured.show(own, scene, shown_samples)
         measured.names.append(scene.scene.names[0])
     return measured
 
 
 def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
-    """Of the first scenes (all by default) those that can be used, and why the others cannot.
-
-    Raises:
-        CompleteSplatError: none can.
-    """
+    """Of the first scenes (None: all) those that can be used, and why others cannot; `CompleteSplatError` if none."""
     found, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:
@@ -261,7 +244,7 @@ def draw(
     path: Path,
 ) -> None:
     """Write a PNG: a row of pictures for each scene, and beside them the scores and the calibration by method."""
-    count = 1 + len(shown[0].modes) + len(shown[0].samples)
+    count = 1 + len(shown[0].scene.modes) + len(shown[0].samples)
     height = max(5.4, (SIDE + 0.3) * len(shown) + 0.8)
     width = (SIDE + GAP) * count + 0.3 + CHARTS
     split, top = 1 - CHARTS / width, 1 - 0.7 / height
@@ -282,12 +265,13 @@ def draw(
 
 
 def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:
-    for panels, scene in zip(rows, shown, strict=True):
-        panels[0].set_ylabel(scene.name, fontsize=7)
+    for panels, row in zip(rows, shown, strict=True):
+        scene = row.scene
+        panels[0].set_ylabel(scene.scene.names[0], fontsize=7)
         labels = [("input", "k")]
         labels += [(name, "g" if mode == scene.true_mode else "k") for mode, name in enumerate(scene.modes)]
-        labels += [("rejected", "0.5") if n == REJECTED else (scene.modes[n], "C1") for n in scene.classes]
-        images = [scene.reference, *scene.truths, *scene.samples]
+        labels += [("rejected", "0.5") if n == REJECTED else (scene.modes[n], "C1") for n in row.classes]
+        images = [scene.scene.reference.images[0], *scene.truths[:, 0], *row.samples]
         for panel, image, (label, color) in zip(panels, images, labels, strict=True):
             panel.imshow(to_bytes(image), interpolation="nearest")
             panel.set(xticks=[], yticks=[])

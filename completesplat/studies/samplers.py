@@ -47,12 +47,12 @@ def _row(
     renderer: SampleRenderer, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]
 ) -> dict[str, Any]:
     """Measures of one sampler; its renders are appended to `settled` if they are the first."""
-    measured, times, first, watch = [], [], not settled, Watch(renderer.model)
+    measured, times, watch = [], [], Watch(renderer.model)
     for index, scene in enumerate(scenes):
         with watch:
             images = renderer(scene, **settings)[:, 1:]
         times.append(watch.seconds)
-        if first:
+        if index == len(settled):
             settled.append(images)
         flat, true = images.flatten(0, 1), scene.targets.images.expand_as(images).flatten(0, 1)
         row = {

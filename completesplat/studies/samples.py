@@ -1,8 +1,9 @@
 """Samples of a trained model, scene by scene: drawn, rendered and measured."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import torch
@@ -47,22 +48,14 @@ class SampleRenderer:
         return self.rasterizer(gaussians, cameras)
 
 
-def first_scenes(data: Any, count: int) -> Iterator[SceneBatch]:
-    """The first test scenes of a data module, each as a batch of one.
-
-    Raises:
-        DataError: there are less.
-    """
+def first_scenes(data: Any, count: int) -> list[SceneBatch]:
+    """The first test scenes of a data module, each as a batch of one; `DataError` if there are less."""
     data.setup("test")
-    found = 0
-    for batch in data.test_dataloader():
-        for index in range(len(batch.names)):
-            if found < count:
-                yield batch[index : index + 1]
-            found += 1
-        if found >= count:
-            return
-    raise DataError(f"there are {found} test scenes, not scenes={count}", str(data.root))
+    all_scenes = (batch[i : i + 1] for batch in data.test_dataloader() for i in range(len(batch.names)))
+    found = list(islice(all_scenes, count))
+    if len(found) < count:
+        raise DataError(f"there are {len(found)} test scenes, not scenes={count}", str(data.root))
+    return found
 
 
 def object_psnr(

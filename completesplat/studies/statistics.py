@@ -141,12 +141,11 @@ PANELS = [
 DASHES = ["-", "--", ":"]
 
 
-def plot_statistics(results: dict[str, Any], path: Path, title: str = "") -> None:
+def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
     """Write a PNG with a histogram over the sequences for six measures of `statistics`, one line for each split."""
     total = {split: summary["sequences"] for split, summary in results["splits"].items()}
     numbers = ", ".join(f"{count:,} {split}" for split, count in total.items())
-    title = f"{title}: sequences {numbers}" if title else f"Sequences: {numbers}"
-    with written_figure(path, title, (13, 7)) as figure:
+    with written_figure(path, f"{title}: sequences {numbers}", (13, 7)) as figure:
         for panel, (key, heading, label) in zip(figure.subplots(2, 3).flat, PANELS, strict=True):
             histogram = results["histograms"][key]
             for index, (split, count) in enumerate(total.items()):

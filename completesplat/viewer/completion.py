@@ -14,7 +14,6 @@ from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
-from completesplat.geometry.cameras import Cameras
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
 from completesplat.viewer.sample import Sample
@@ -47,7 +46,8 @@ class Completion:
         """Draw with the present settings, after the jobs that wait."""
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load a picture first"), client)
-        job = partial(self._draw, *self.photograph, self.controls.settings(), client)
+        settings = {name: getattr(self.controls, name).value for name in SLIDERS}
+        job = partial(self._draw, *self.photograph, settings, client)
         self.page.worker.submit("draw", job)
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
@@ -58,7 +58,7 @@ class Completion:
             self.page.tell(error, event.client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
-        steps: Any = self.controls.steps
+        steps = self.controls.steps
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
             steps.value = nearest  # calls this again
@@ -72,8 +72,14 @@ class Completion:
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
-        arranged = partial(self._arranged, earlier, self.model.camera(photograph), {**settings, "image": name})
-        last_shown = 0.0
+        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
+        reference, last_shown = self.model.camera(photograph), 0.0
+
+        def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
+            """The new samples behind the earlier ones, as many as there is room for."""
+            told = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
+            new = [Sample(x, layers, reference, said, finished, True) for x, said in zip(scenes, told, strict=True)]
+            return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:
             nonlocal last_shown
@@ -91,19 +97,6 @@ class Completion:
             self.page.tell(error, client)
         finally:
             progress.visible = False
-
-    def _arranged(
-        self,
-        earlier: Sequence[Sample],
-        reference: Cameras,
-        settings: dict[str, Any],
-        scenes: Sequence[Gaussians],
-        finished: bool,
-    ) -> list[Sample]:
-        """The new samples behind the earlier ones, as many as there is room for."""
-        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
-        new = (Sample(x, layers, reference, {**settings, "sample": i}, finished, True) for i, x in enumerate(scenes))
-        return [*earlier, *new][-MOST_SAMPLES:]
 
 
 def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:

@@ -5,7 +5,7 @@ import io
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +102,7 @@ class Saver:
         self, folder: Path, stage: Stage, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
     ) -> None:
         self.folder, self.stage, self.frames, self.background = folder, stage, frames, background
-        self._make_rasterizer = make_rasterizer
-
-    @cached_property
-    def rasterizer(self) -> Rasterizer:
-        return self._make_rasterizer()
+        self._rasterizer = cache(make_rasterizer)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
         """Write these samples as `ply` or `video`, or the page as it stands as `html`."""
@@ -128,7 +124,7 @@ class Saver:
         camera = sample.reference
         up = camera.intrinsics.new_tensor(self.stage.up.tolist())
         scene, pivot = sample.gaussians, sample.pivot()
-        frames, _ = orbit_views(self.rasterizer, scene, camera, pivot, self.frames, self.background, up)
+        frames, _ = orbit_views(self._rasterizer(), scene, camera, pivot, self.frames, self.background, up)
         write_video(path, frames)
         return path
 

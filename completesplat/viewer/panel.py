@@ -1,6 +1,6 @@
 """The controls of the page: what completes a photograph, what is shown of the samples, what is saved."""
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,73 +16,41 @@ SIDE_BY_SIDE = "all, side by side"
 KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
 
 
-@dataclass(frozen=True)
-class CompletionControls:
-    """The photograph, and the settings of its completion."""
-
-    upload: viser.GuiUploadButtonHandle
-    preview: viser.GuiImageHandle
-    samples: viser.GuiSliderHandle[int]
-    skip_weight: viser.GuiSliderHandle[float]
-    guidance_weight: viser.GuiSliderHandle[float]
-    steps: viser.GuiSliderHandle[int]
-    seed: viser.GuiSliderHandle[int]
-    live: viser.GuiCheckboxHandle
-    forming: viser.GuiCheckboxHandle
-    keep: viser.GuiCheckboxHandle
-    draw: viser.GuiButtonHandle
-    progress: Any
-
-    def settings(self) -> dict[str, Any]:
-        """Arguments of `CompleteSplat`."""
-        return {name: getattr(self, name).value for name in SLIDERS}
-
-
-def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> CompletionControls:
-    """The folders `Photograph` and `Completion`; `start` says by name where the sliders stand at first."""
+def add_drawing(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> SimpleNamespace:
+    """The folders `Photograph` and `Completion`: viser's handles; `start` says where the `SLIDERS` stand at first."""
     blank = np.full((model.image_size, model.image_size, 3), 230, np.uint8)
     steps, first_steps = possible_steps(model.sampler), nearest_steps(model.sampler, start["steps"])
     with gui.add_folder("Photograph", order=1):
         upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_image(blank, label="none yet", format="png")
     with gui.add_folder("Completion", order=2):
-        return CompletionControls(
-            upload,
-            preview,
-            gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
-            gui.add_slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint="1: most faithful, 0: most free"),
-            gui.add_slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint="more: more diverse"),
-            gui.add_slider("Steps", 1, steps[-1], 1, first_steps, hint="denoising steps"),
-            gui.add_slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
-            gui.add_checkbox("Draw when a slider moves", True),
-            gui.add_checkbox("Show it forming", True, hint="costs a little time at each step"),
-            gui.add_checkbox("Keep earlier samples", False, hint="to compare settings, up to 8 samples"),
-            gui.add_button("Draw samples", color="blue"),
-            gui.add_progress_bar(0.0, visible=False),
+        free, diverse = "1: most faithful, 0: most free", "more: more diverse"
+        return SimpleNamespace(
+            upload=upload,
+            preview=preview,
+            samples=gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
+            skip_weight=gui.add_slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
+            guidance_weight=gui.add_slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
+            steps=gui.add_slider("Steps", 1, steps[-1], 1, first_steps, hint="denoising steps"),
+            seed=gui.add_slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
+            live=gui.add_checkbox("Draw when a slider moves", True),
+            forming=gui.add_checkbox("Show it forming", True, hint="costs a little time at each step"),
+            keep=gui.add_checkbox("Keep earlier samples", False, hint="to compare settings, up to 8 samples"),
+            draw=gui.add_button("Draw samples", color="blue"),
+            progress=gui.add_progress_bar(0.0, visible=False),
         )
 
 
-@dataclass(frozen=True)
-class ViewControls:
-    """Which samples, layers and cameras are shown, and in which colours."""
-
-    chosen: viser.GuiDropdownHandle[str]
-    layers: list[viser.GuiCheckboxHandle]
-    depth: viser.GuiCheckboxHandle
-    cameras: dict[str, viser.GuiCheckboxHandle]
-    front: viser.GuiButtonHandle
-
-
-def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> ViewControls:
-    """The folder `View`."""
+def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNamespace:
+    """The folder `View`: handles of what is `chosen`, of `layers` by number and of `cameras` by name."""
     names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
     with gui.add_folder("View", order=3):
-        return ViewControls(
-            gui.add_dropdown("Show", (SIDE_BY_SIDE,)),
-            [gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
-            gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
-            {name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
-            gui.add_button("Look from the front"),
+        return SimpleNamespace(
+            chosen=gui.add_dropdown("Show", (SIDE_BY_SIDE,)),
+            layers=[gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
+            depth=gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
+            cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
+            front=gui.add_button("Look from the front"),
         )
 
 

@@ -92,23 +92,14 @@ class Stage:
         self._splats: dict[str, viser.GaussianSplatHandle] = {}
         self._frusta: list[viser.CameraFrustumHandle] = []
         self._lock = threading.RLock()
-        self.set_up(up)
-
-    def set_up(self, up: Sequence[float]) -> None:
-        """Turn the page so that this direction is up."""
         self.up = np.asarray(up, float)
-        self.server.scene.set_up_direction(self.up)
+        server.scene.set_up_direction(self.up)
 
     @property
     def shown(self) -> list[Sample]:
         """All samples, or the chosen one."""
         samples, chosen = self.samples, self.chosen
         return samples if chosen is None or chosen >= len(samples) else [samples[chosen]]
-
-    @property
-    def layers(self) -> int:
-        """Of the sample that has most."""
-        return max((sample.layers for sample in self.samples), default=0)
 
     def show(self, samples: Sequence[Sample]) -> None:
         """These samples from now on, and all of them if there is none with the chosen number."""

@@ -33,7 +33,16 @@ def weights_folder(weights: Path | str) -> Path:
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if not (folder / name).is_file():
             raise WeightsError(f"{folder}: no {name} here; give the folder that training wrote as `weights`")
-    _check_sums(folder)
+    sums = folder / SUMS_FILE
+    if not sums.is_file():
+        return folder
+    known = sums.read_text(errors="replace").splitlines()
+    for name in (CONFIG_FILE, WEIGHTS_FILE):
+        if f"{sha256_of(folder / name)}  {name}" not in known:
+            raise WeightsError(
+                f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
+                f"if the change is meant, remove {SUMS_FILE}"
+            )
     return folder
 
 
@@ -62,19 +71,6 @@ def _download(hub_id: str) -> Path:
     except Exception as error:  # of the hub, of its HTTP library and of the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(f"{hub_id}: no folder here, and not to be had from the hub ({reason})") from error
-
-
-def _check_sums(folder: Path) -> None:
-    sums = folder / SUMS_FILE
-    if not sums.is_file():
-        return
-    lines = sums.read_text(errors="replace").splitlines()
-    for name in (CONFIG_FILE, WEIGHTS_FILE):
-        if f"{sha256_of(folder / name)}  {name}" not in lines:
-            raise WeightsError(
-                f"{folder / name}: damaged or changed, its SHA-256 is not the one in {SUMS_FILE}; "
-                f"if the change is meant, remove {SUMS_FILE}"
-            )
 
 
 def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: str) -> Path:

@@ -8,11 +8,12 @@ import pytest
 from PIL import Image
 from report_pages import FRAMES, grey, write_results
 
-from completesplat.results.html_page import Limits, page
+from completesplat.results.html_page import page
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
+MOST = {"frames": FRAMES, "samples": 8, "predictions": 8, "runs": 8, "pictures": 8, "megabytes": 40}
 SIZES = {"phone": (390, 844), "desktop": (1440, 900)}
 
 pytestmark = pytest.mark.browser
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.browser
 def file(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     write_results(folder)
-    text, _ = page(folder, folder / "out", Limits(FRAMES, 8, 8, 8, 8, 40), {})
+    text, _ = page(folder, folder / "out", MOST, {})
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(text, encoding="utf-8")
     return path

@@ -1,14 +1,13 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
 from completesplat.data.sequences import Picture
 from completesplat.data.validation import BadPicture, OutsidePath
 from completesplat.geometry.cameras import project
-from completesplat.studies.contact_sheet import CELL, GAP, MARGIN, MASK, MOST_SEQUENCES, show
+from completesplat.studies.contact_sheet import CELL, GAP, MARGIN, MASK, show
 from completesplat.studies.frusta import CROSS_COLORS, place_cross
 
 SIZE = 24
@@ -100,9 +99,3 @@ def test_nothing_is_written_beyond_the_margins(orbit, tmp_path):
         assert (sheet[:, : MARGIN - 1] == 255).all()
         assert (sheet[:, -MARGIN:] == 255).all()
         assert (sheet[-MARGIN // 2 :] == 255).all()
-
-
-def test_more_sequences_than_fit_are_refused(orbit, tmp_path):
-    for sequences, pictures in [([], 3), ([orbit(2)] * (MOST_SEQUENCES + 1), 3), ([orbit(2)], 0)]:
-        with pytest.raises(ValueError, match="sheet"):
-            show(sequences, tmp_path / "show.png", pictures)

@@ -80,8 +80,8 @@ def test_the_error_of_wrong_modes_is_in_the_hidden_region():
 
 
 def test_the_figure_shows_the_class_of_each_sample():
-    (shown,) = measured([3, 0, 1, 1]).shown["model"]
-    assert (shown.name, shown.classes) == ("scene 0", (3, 0, 1))
+    (shown,) = measured([3, 0, 1, 1]).shown
+    assert (shown.scene, shown.classes) == (SCENES[0], (3, 0, 1))
     assert torch.equal(shown.samples, SCENES[0].truths[[3, 0, 1], 0])
 
 
