@@ -1,5 +1,7 @@
 """The weights that come with the package: whole, small, and better than guessing on scenes never seen."""
 
+import os
+
 import pytest
 import torch
 from support import strict_json
@@ -21,8 +23,9 @@ def test_they_are_small_and_complete():
     assert weights_folder(NAME) == BOX / NAME
 
 
-def test_samples_fit_the_picture_they_are_drawn_for(tmp_path):
+def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
     """Two scenes of another seed than training's: the reference view is met, the naive answers are beaten."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
     size = {"scenes": 20, "frames": 4, "image_size": 64}
     data = ToyObjectsDataModule(str(tmp_path), **size, data_seed=77, evaluation_batch_size=2)
     data.prepare_data()

@@ -57,7 +57,7 @@ OF_THE_SEQUENCE: dict[str, Callable[[Path, list[dict]], object]] = {
 @pytest.fixture(scope="module")
 def intact(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("intact")
-    write_objects(root, scenes=SCENES, frames=3, size=16, seed=0, progress=False)
+    write_objects(root, scenes=SCENES, frames=3, size=16, seed=0, workers=1, progress=False)
     return root
 
 

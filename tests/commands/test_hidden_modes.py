@@ -5,16 +5,8 @@ import pytest
 from support import refused, strict_json
 
 FEW = [f"evaluation.{few}" for few in ("samples=3", "batch=2", "views=1", "spread_views=2", "shown_samples=2")]
-FIGURES = {
-    "coverage",
-    "total_variation",
-    "sharpness",
-    "rejected",
-    "scenes",
-    "samples",
-    "energy_hidden",
-    "energy_visible",
-}
+FIGURES = {"coverage", "total_variation", "sharpness", "rejected", "scenes", "samples"}
+FIGURES |= {"energy_hidden", "energy_visible"}
 METHODS = {"model", "posterior_mean", "posterior_samples", "other_scene"}
 
 

@@ -1,7 +1,6 @@
 import math
 
 import pytest
-import scoringrules
 import torch
 
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram
@@ -38,6 +37,8 @@ def test_noise_around_the_mean_does_not_improve_the_energy_score():
 
 
 def test_scores_are_those_of_an_independent_implementation():
+    import scoringrules  # compiles for seconds when it is loaded: not in every process that collects the tests
+
     samples = torch.rand(6, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     truth = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     each = scoringrules.crps_ensemble(truth.numpy(), samples.numpy(), m_axis=0, estimator="fair")

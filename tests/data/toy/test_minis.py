@@ -1,5 +1,6 @@
 """Minis: what their back could be is known, and what the front says about it."""
 
+import os
 from collections import Counter
 from dataclasses import replace
 
@@ -53,7 +54,8 @@ def recolored(scene, color):
 
 
 @pytest.mark.parametrize("category", ["toy_minis", "toy_marked_minis"])
-def test_hidden_modes_of_written_minis_are_known_with_their_probabilities(tmp_path, category):
+def test_hidden_modes_of_written_minis_are_known_with_their_probabilities(tmp_path, monkeypatch, category):
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
     data = ToyObjectsDataModule(str(tmp_path), scenes=20, frames=12, category=category, image_size=32)
     data.prepare_data()
     scenes = data.hidden_modes(views=2, spread_views=2)
