@@ -22,7 +22,6 @@ from completesplat.data.packed.manifest import is_packed
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_modes, log_test
-from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
 from completesplat.training.loggers import finished
 
 
@@ -136,6 +135,8 @@ def run_hidden_modes(
     Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
     `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
     """
+    from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
+
     tested = Trained(**trained)
     quieten()
     module, data = tested.open()
