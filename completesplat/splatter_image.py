@@ -25,7 +25,10 @@ SH_C0 = 0.28209479177387814
 
 
 class Group(NamedTuple):
-    """Raw values that belong together: their number, and gain and bias of Splatter Image's head (`initialize_head`)."""
+    """Raw values that belong together: their number, and gain and bias of Splatter Image's head (`initialize_head`).
+
+    Depth and scale start where the `Parameterization` says.
+    """
 
     channels: int
     gain: float
@@ -36,7 +39,7 @@ GROUPS = {
     "depth": Group(1, 1.0, 0.0),
     "offset": Group(3, 0.1, 0.0),
     "opacity": Group(1, 1.0, -2.0),
-    "scale": Group(3, 0.003, math.log(0.02)),
+    "scale": Group(3, 0.003, 0.0),
     "rotation": Group(4, 1.0, 0.0),
     "color": Group(3, 5.0, 0.0),
 }
@@ -77,6 +80,8 @@ class Parameterization:
         layer_depths: relation between the depths of one pixel's layers, a key of `LAYER_DEPTHS`.
         first_depth: where in the depth range, as a share of it, Gaussians start. One half is the object's distance in
             Splatter Image, whose range lies evenly around it.
+        first_scale: standard deviation that Gaussians start with, in scene units; 0.02 in Splatter Image, a pixel or so
+            of an object seen in 128.
         layer_step: how far behind the last a layer starts with incremental depths, in scene units.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
             (the paper does not state one; the clamp has no gradient outside, full gradient inside).
@@ -85,6 +90,7 @@ class Parameterization:
     layers: int = 2
     layer_depths: str = "independent"
     first_depth: float = 0.5
+    first_scale: float = 0.02
     layer_step: float = 1.0
     smallest_scale: float = 1e-4
     largest_scale: float = 2.0
@@ -151,18 +157,16 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
     assert head.bias is not None
     inputs = head.weight[0].numel()
     first = math.log(parameterization.first_depth / (1 - parameterization.first_depth))
+    starts = {"scale": math.log(parameterization.first_scale)}
     row = 0
     for layer in range(parameterization.layers):
-        depth = (
-            first
-            if layer == 0 or parameterization.layer_depths == "independent"
-            else math.log(parameterization.layer_step)
-        )
+        behind = layer > 0 and parameterization.layer_depths == "incremental"
+        starts["depth"] = math.log(parameterization.layer_step) if behind else first
         for name, group in GROUPS.items():
             rows, row = slice(row, row + group.channels), row + group.channels
             bound = math.sqrt(3 * _upstream_variance(group) / inputs)
             nn.init.uniform_(head.weight[rows], -bound, bound)
-            nn.init.constant_(head.bias[rows], depth if name == "depth" else group.bias)
+            nn.init.constant_(head.bias[rows], starts.get(name, group.bias))
 
 
 def _upstream_variance(group: Group) -> float:

@@ -12,14 +12,17 @@ from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.splatter_image import CHANNELS, GROUPS, SH_C0, Parameterization, SplatterImage
 
 SIZE = 6
+FIRST = {"scale": math.log(0.02)}  # Splatter Image's
 CAMERA = Cameras(torch.eye(4)[None], pinhole(50.0, SIZE)[None], (SIZE, SIZE))
 RANGE = torch.tensor([[1.0, 5.0]])
 
 
 def image_of(layers: int = 2, depths: str = "independent", **raw: torch.Tensor | float) -> SplatterImage:
-    """A Splatter Image whose groups have the given raw values, and the head's bias elsewhere."""
+    """A Splatter Image whose groups have the given raw values, and elsewhere what the head starts with."""
     parts = [
-        torch.as_tensor(raw.get(name, group.bias), dtype=torch.float32).expand(1, layers, group.channels, SIZE, SIZE)
+        torch.as_tensor(raw.get(name, FIRST.get(name, group.bias)), dtype=torch.float32).expand(
+            1, layers, group.channels, SIZE, SIZE
+        )
         for name, group in GROUPS.items()
     ]
     return SplatterImage(torch.cat(parts, dim=2), Parameterization(layers, depths))
@@ -111,8 +114,16 @@ def test_raw_values_start_as_far_apart_as_splatter_images(network):
             raw = NETWORKS[network]().eval()(torch.rand(2, 3, 64, 64)).splatter_image.split()
         for name, values in raw.items():
             deviations[name] += values.double().std().item() / seeds
-            assert values.mean().item() == pytest.approx(GROUPS[name].bias, abs=0.7 * GROUPS[name].gain)
+            assert values.mean().item() == pytest.approx(
+                FIRST.get(name, GROUPS[name].bias), abs=0.7 * GROUPS[name].gain
+            )
         colors = 0.5 + SH_C0 * raw["color"]
         outside += ((colors < 0) | (colors > 1)).float().mean().item() / seeds
     assert deviations == pytest.approx(UPSTREAM, rel=0.2)
     assert outside < 0.15  # 0.08 there, 0.7 with its gains on one convolution
+
+
+def test_gaussians_start_as_large_as_the_parameterization_says():
+    reconstructor = Reconstructor(Parameterization(2, first_scale=0.06), (16, 32), 1, 4, 8)
+    scales = reconstructor(torch.randn(2, 4, 4, 4), [torch.zeros(2, 16, 8, 8)]).split()["scale"].exp()
+    torch.testing.assert_close(scales, torch.full_like(scales, 0.06), rtol=0.02, atol=0)

@@ -46,6 +46,8 @@ class Encoder(nn.Module):
         latent_channels: channels of the latent.
         norm_groups: groups of the group normalisation.
         in_channels: of what is encoded; 3 for images.
+        first_log_variance: about what the posterior's is at the start, where nothing pretrained is loaded. At 0 the
+            latents are noise at first, of which the reconstructor learns nothing.
     """
 
     def __init__(
@@ -55,10 +57,13 @@ class Encoder(nn.Module):
         latent_channels: int = 4,
         norm_groups: int = 32,
         in_channels: int = 3,
+        first_log_variance: float = 0.0,
     ) -> None:
         super().__init__()
         self.network = vae_encoder(in_channels, 2 * latent_channels, channels, layers_per_block, norm_groups)
         self.quant_conv = nn.Conv2d(2 * latent_channels, 2 * latent_channels, 1)
+        with torch.no_grad():
+            self.quant_conv.bias[latent_channels:] += first_log_variance  # type: ignore[index]
         self.gradient_checkpointing = False
 
     def forward(

@@ -71,3 +71,9 @@ def test_evaluation_draws_nothing_and_training_samples_the_posterior(images):
     assert torch.equal(model(images).splatter_image.raw, model(images).splatter_image.raw)
     model = build().train()
     assert (model(images).splatter_image.raw - model(images).splatter_image.raw).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("start", [0.0, -6.0])
+def test_latents_start_as_noisy_as_is_said(images, start):
+    posterior, _ = Encoder((16, 32), 1, 4, 8, first_log_variance=start)(images)
+    assert posterior.log_variance.mean().item() == pytest.approx(start, abs=1)
