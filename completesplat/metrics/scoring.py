@@ -101,8 +101,10 @@ class Evaluation:
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
-        curve = expected_best_curve(by, higher)
-        self.drawn[name] = {"curve": curve, "diversity": diversity(images[:, 1:]), "ranks": ranks}
+        noisy = noisy_mean(images, self.scene_seed(name))
+        by_noise = [self.score(sample, truth)["full", "novel", self.criterion] for sample in noisy]
+        curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
+        self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
         """One prediction of one scene, values in [0, 1]: means over the novel views."""
@@ -166,8 +168,9 @@ class Evaluation:
             results[predictor] = entry
         if self.drawn:
             names = sorted(self.drawn)
-            curves = zip(*(self.drawn[name]["curve"] for name in names), strict=True)
-            results[BEST]["curve"] = [sum(values) / len(values) for values in curves]
+            for kind in ("curve", "curve_noisy_mean"):
+                curves = zip(*(self.drawn[name][kind] for name in names), strict=True)
+                results[BEST][kind] = [sum(values) / len(values) for values in curves]
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
             for region in PROPER_REGIONS:
                 known = [shares[region] for name in names if region in (shares := self.drawn[name]["ranks"])]
@@ -175,6 +178,17 @@ class Evaluation:
                     mean = [sum(values) / len(known) for values in zip(*known, strict=True)]
                     results[MEAN][f"ranks_{region}"] = mean
         return results
+
+
+def noisy_mean(
+    images: Float[Tensor, "sample view 3 height width"], seed: int
+) -> Float[Tensor, "sample view 3 height width"]:
+    """As many pictures that differ as much from each other, but by white noise: the samples' mean with noise on it.
+
+    What the best of k gains by this is no merit of what was drawn.
+    """
+    noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed)).to(images)
+    return (images.mean(0) + images.var(0).mean().sqrt() * noise).clamp(0, 1)
 
 
 def proper_scores(

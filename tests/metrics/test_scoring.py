@@ -88,6 +88,18 @@ def test_of_several_samples_the_first_the_best_and_the_mean_are_told():
     assert results["mean_of_k"]["diversity"] == pytest.approx((0.09 + 0.099 + 0.009) / 3, abs=1e-5)
 
 
+def test_noise_gains_in_the_best_of_k_what_a_noisy_mean_does_and_samples_that_differ_gain_more():
+    truth, noise = scenes(1, 2).all_views()[0], 0.1 * torch.randn(8, 3, 3, 16, 16)
+    for name, samples in {"noise": 0.5 + noise, "samples": 0.5 + noise.mean((1, 2, 3, 4), keepdim=True) * 8}.items():
+        evaluation = Evaluation(samples=8)
+        evaluation.update_samples(name, samples, truth)
+        row = evaluation.results()["best_of_k"]
+        gain, noisy = row["curve"][-1] - row["curve"][0], row["curve_noisy_mean"][-1] - row["curve_noisy_mean"][0]
+        assert len(row["curve_noisy_mean"]) == 8
+        assert 0 <= noisy < 0.5
+        assert gain < 0.5 if name == "noise" else gain > 3
+
+
 def test_the_best_is_chosen_by_the_criterion():
     truth = scenes(1, 1).all_views()[0]
     texture = 0.2 * torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
