@@ -130,7 +130,7 @@ def run_hidden_modes(
     logger: Mapping[str, Any] | None,
     out: Path,
 ) -> None:
-    """Write `hidden_modes.json`, `calibration.json`, `protocol.json` and `hidden_modes.png`, and print the table.
+    """Write the JSON files of hidden_modes, shares, calibration and protocol, `hidden_modes.png`, and print the table.
 
     Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
     `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
@@ -159,6 +159,7 @@ def run_hidden_modes(
     results, calibration = measured.results(samples), measured.calibration()
     write_json(out / "hidden_modes.json", results)
     write_json(out / "calibration.json", calibration)
+    write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
     write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used))
     draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")

@@ -127,19 +127,23 @@ class Shown:
 class Measured:
     """The measurements so far: scores by method and scene, sums of the calibration by method and region.
 
-    `energies` are the energy scores of the views that show the modes, of what the reference hides and of the rest.
+    `energies` are the energy scores of the views that show the modes, of what the reference hides and of the rest;
+    `classes` those of all samples, by method and the modes' probabilities.
     """
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
     energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    classes: dict[str, dict[tuple[float, ...], list[Tensor]]] = field(default_factory=dict)
     shown: list[Shown] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
         """Score the renders of the views that show the modes."""
-        found = scores(in_region(images, scene.region), in_region(scene.truths, scene.region), scene.probabilities)
-        self.scores.setdefault(method, []).append(found)
+        pixels, modes = in_region(images, scene.region), in_region(scene.truths, scene.region)
+        self.scores.setdefault(method, []).append(scores(pixels, modes, scene.probabilities))
+        alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
+        alike.append(classify(pixels, modes, scene.probabilities))
         unseen, truth = scene.unseen[list(scene.views)], scene.truths[scene.true_mode]
         energies = self.energies.setdefault(method, {name: [] for name in REGIONS})
         for name, region in zip(REGIONS, (unseen, ~unseen), strict=True):
@@ -169,6 +173,25 @@ class Measured:
             | counts
             for method, found in self.scores.items()
         }
+
+    def shares(self) -> dict[str, list[dict[str, Any]]]:
+        """By method, of all scenes whose modes are equally probable together: how many samples are of which mode.
+
+        `total_variation` is between these shares, of what is not rejected, and the probabilities; by chance alone it is
+        small for so many samples. Where two kinds of scenes have different probabilities, a model that has learned how
+        often modes occur, and not when, is found out.
+        """
+        found: dict[str, list[dict[str, Any]]] = {}
+        for method, kinds in self.classes.items():
+            for probabilities, each in kinds.items():
+                classes, p = torch.cat(each), torch.tensor(probabilities)
+                counts = torch.stack([(classes == mode).sum() for mode in range(len(p))])
+                shares = counts / counts.sum().clamp(min=1)
+                row = {"probabilities": p.tolist(), "scenes": len(each), "shares": shares.tolist()}
+                row["rejected"] = (classes == REJECTED).float().mean().item()
+                row["total_variation"] = (0.5 * (shares - p).abs().sum()).item() if counts.any() else 1.0
+                found.setdefault(method, []).append(row)
+        return found
 
     def calibration(self) -> dict[str, dict[str, Any]]:
         """Curves by method and region."""

@@ -28,6 +28,7 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage):
     assert true["coverage"] <= 0.75  # three draws of four modes
     calibration = strict_json(tmp_path / "out/calibration.json")
     assert set(calibration) == METHODS
+    assert set(strict_json(tmp_path / "out/shares.json")) == set(results)
     for found in calibration.values():
         # Two spread views, one of which may be the one from behind.
         assert found["hidden"]["pixels"] + found["visible"]["pixels"] in (2 * 32**2, 3 * 32**2)

@@ -1,5 +1,7 @@
 """The benchmark on constructed predictors, and samples of real models as renders."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from support import tiny_generator
@@ -69,6 +71,18 @@ def test_constructed_predictors_have_their_scores():
     assert mean["sharpness"] == pytest.approx(1)
     assert (true["sharpness"], true["rejected"]) == (0, 0)
     assert 0 < true["total_variation"] < 0.6
+
+
+def test_shares_are_of_all_scenes_with_the_same_probabilities():
+    often = replace(hidden_scene(1), probabilities=torch.tensor([0.5, 0.25, 0.25, 0.0]))
+    modes = [0, 1, 2, 0]  # right for the second scene, and not for the first, whose modes are equally probable
+    even, uneven = measured([*modes], [SCENES[0], often]).shares()["model"]
+    assert (even["shares"], even["scenes"], even["total_variation"]) == ([0.5, 0.25, 0.25, 0], 1, 0.25)
+    assert (uneven["probabilities"], uneven["total_variation"]) == ([0.5, 0.25, 0.25, 0], 0)
+    (pooled,) = measured([2]).shares()["model"]
+    assert (pooled["shares"], pooled["scenes"], pooled["rejected"]) == ([0, 0, 1, 0], 2, 0)
+    (blurred,) = measured([2]).shares()["mean_predictor"]
+    assert (blurred["rejected"], blurred["total_variation"]) == (1, 1)
 
 
 def test_the_error_of_wrong_modes_is_in_the_hidden_region():
