@@ -46,8 +46,8 @@ class Encoder(nn.Module):
         latent_channels: channels of the latent.
         norm_groups: groups of the group normalisation.
         in_channels: of what is encoded; 3 for images.
-        first_log_variance: about what the posterior's is at the start, where nothing pretrained is loaded. At 0 the
-            latents are noise at first, of which the reconstructor learns nothing.
+        first_log_variance: about what the posterior's is at the start, where nothing pretrained is loaded. At 0 noise
+            of deviation 1 covers what the latents say at first.
     """
 
     def __init__(

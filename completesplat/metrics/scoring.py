@@ -101,8 +101,9 @@ class Evaluation:
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
-        noisy = noisy_mean(images, self.scene_seed(name))
-        by_noise = [self.score(sample, truth)["full", "novel", self.criterion] for sample in noisy]
+        with torch.autocast(images.device.type, enabled=False):
+            noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
+            by_noise = [self.metrics[self.criterion](one, truth.images[1:]).mean().item() for one in noisy]
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 

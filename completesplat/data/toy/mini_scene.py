@@ -28,7 +28,7 @@ FROM_THE_FRONT = 0.35
 """The first camera sees the nose from an azimuth that differs by at most this (radians): it never sees the patch."""
 
 PATCH_EDGE, PATCH_TILT = 0.5, 0.2
-"""The patch is where the normal lies within 60 degrees of away from the nose and 0.2 radians down."""
+"""The patch is where the normal lies within 60 degrees of the nose's opposite, tilted down by 0.2 radians."""
 
 
 def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
