@@ -19,9 +19,9 @@ from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.pictures.photograph import Photograph, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.scene import Views
 from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
@@ -185,6 +185,44 @@ class CompleteSplat(nn.Module):
             **settings,
         )
         return [scenes[i] for i in range(len(scenes.means))]
+
+    @torch.no_grad()
+    def reconstruct(self, views: Views) -> Gaussians:
+        """The scene that several views show, at the posterior's mean: nothing is drawn.
+
+        Args:
+            views: [view ...], the first the reference and its frame the world, in the model's units (`in_own_units`).
+
+        Returns:
+            Gaussians in the frame of the first camera.
+
+        Raises:
+            WeightsError: the posterior of these weights sees one picture.
+        """
+        if not self.autoreconstructor.sees_views:
+            raise WeightsError("these weights reconstruct from one picture: they were trained with posterior=image")
+        batch, depth_range = views.to(self.latent_std.device)[None], self.depth_range[None]
+        posterior, features = self.eval().autoreconstructor.posterior(batch.images[:, 0], batch, depth_range)
+        splatter_image = self.autoreconstructor.reconstructor(posterior.mode(), features)
+        scene: Gaussians = splatter_image.gaussians(batch.cameras[:, 0], depth_range)[0]
+        return scene
+
+    def in_own_units(self, cameras: Cameras) -> Cameras:
+        """Cameras of any units, in a world that is scaled to what the model knows.
+
+        The point nearest to all optical axes comes to the depth at which untrained Gaussians start
+        (`Parameterization.first_depth`), which a data set's objects are meant to lie at.
+
+        Raises:
+            CompleteSplatError: axes that are parallel, or meet behind the first camera.
+        """
+        center = nearest_to_axes(cameras)
+        depth = 0.0 if center is None else transform_points(cameras[0].world_to_camera, center[None])[0, 2].item()
+        if depth <= 0:
+            raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
+        near, far = self.depth_range.tolist()
+        share = self.autoreconstructor.reconstructor.parameterization.first_depth
+        return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Draw with another sampler from now on; noise schedule and prediction type stay those of training."""

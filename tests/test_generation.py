@@ -14,6 +14,7 @@ from support import compose_config, tiny_generator
 
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import CompleteSplat
+from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 
@@ -181,3 +182,22 @@ def test_a_configuration_cannot_name_foreign_code(model, folder, target):
     (folder / CONFIG_FILE).write_text(json.dumps(config))
     with pytest.raises(WeightsError, match="no part of a model"):
         CompleteSplat.from_pretrained(folder)
+
+
+def test_cameras_of_any_units_come_to_where_gaussians_start(model):
+    eyes = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]])
+    poses = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1, 0]))
+    cameras = Cameras(poses, pinhole(50.0, 32).expand(3, 3, 3), (32, 32))
+    cameras = cameras.relative_to(cameras[0])
+    near, far = model.depth_range.tolist()
+    start = near + model.autoreconstructor.reconstructor.parameterization.first_depth * (far - near)
+    for units in (1.0, 0.01, 30.0):
+        placed = model.in_own_units(cameras.scale_world(torch.tensor(units)))
+        assert placed.centers.norm(dim=1).tolist() == pytest.approx(
+            [0, math.sqrt(2) * start, placed.centers[2].norm().item()], rel=1e-4
+        )
+    with pytest.raises(CompleteSplatError, match="do not look at one place"):
+        model.in_own_units(cameras[[0, 0]])
+    turned = look_at(eyes, 2 * eyes, torch.tensor([0.0, -1, 0]))
+    with pytest.raises(CompleteSplatError, match="do not look at one place"):
+        model.in_own_units(replace(cameras, world_to_camera=turned))

@@ -1,10 +1,11 @@
-"""`completesplat predict`: complete scenes from photographs."""
+"""`completesplat predict`: complete scenes from photographs, each from one, or one from several."""
 
 import logging
 import math
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.commands.schema import Positive, Range, Share, check_settings
 from completesplat.commands.trained import open_generator
+from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS
@@ -52,7 +54,10 @@ def run(config: Any, out: Path) -> None:
     if config.mask is not None and len(pictures) > 1:
         raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
     wanted = wanted_files(config)  # before the model runs: is the converter there?
-    predict_pictures(config, open_generator(config), pictures, wanted, out)
+    if config.cameras is not None:
+        predict_from_views(config, pictures, wanted, out)
+    else:
+        predict_pictures(config, open_generator(config), pictures, wanted, out)
 
 
 def find_pictures(image: Any) -> list[Path]:
@@ -132,6 +137,34 @@ def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path]
     if failed:
         share = f"{len(failed)} of {len(pictures)} pictures failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
+
+
+def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+    """Write the files of one scene that all pictures show, into the folder of the first's name.
+
+    Raises:
+        CompleteSplatError: one picture alone, something hidden, or a field of view beside that of the cameras.
+        DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
+    """
+    if len(pictures) < 2:
+        raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")
+    if beside := [name for name in ("mask", "box", "fov") if config[name] is not None]:
+        raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
+    model = open_generator(config)
+    views = read_photographs(pictures, Path(config.cameras), model.image_size)
+    views = replace(views, cameras=model.in_own_units(views.cameras))
+    scene = model.reconstruct(views)
+    recorded = {
+        "seed": config.seed,
+        "image": pictures[0].name,
+        "images": [picture.name for picture in pictures],
+        "cameras": Path(config.cameras).name,
+        "screen_space_dilation": config.screen_space_dilation,
+        "depth_range": model.depth_range.tolist(),
+    }
+    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / pictures[0].stem
+    write_prediction(folder, views.images[0], [scene], views.cameras[0], rasterizer, model.up, wanted, recorded)
+    print(f"one scene of {len(pictures)} pictures, at the posterior's mean: {folder}")
 
 
 def folder_names(pictures: Sequence[Path]) -> list[str]:

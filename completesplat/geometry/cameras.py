@@ -13,6 +13,9 @@ from torch import Tensor
 
 from completesplat.tensors import TensorDataclass
 
+PARALLEL = 1e-5
+"""Mean squared sine between axes and their mean direction, below which they count as parallel (0.2 degrees)."""
+
 
 @dataclass(frozen=True)
 class Cameras(TensorDataclass):
@@ -108,6 +111,17 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
     """Intrinsics of a square image with the given horizontal field of view and a central principal point."""
     focal = 0.5 * size / torch.tensor(fov_degrees).deg2rad().div(2).tan().item()
     return torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+
+
+def nearest_to_axes(cameras: Cameras) -> Float[Tensor, "3"] | None:
+    """The world point with the least sum of squared distances to all optical axes; None where they are parallel."""
+    axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
+    across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
+    total = across.sum(0)
+    if torch.linalg.eigvalsh(total)[0] < PARALLEL * len(axes):
+        return None
+    point: Tensor = torch.linalg.solve(total, (across @ centers[..., None]).sum(0))[:, 0]
+    return point.float()
 
 
 def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: int) -> Cameras:

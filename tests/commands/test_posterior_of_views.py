@@ -2,9 +2,11 @@
 
 import csv
 
+import numpy as np
 import pytest
 from conftest import made
-from support import SMALL, refused, strict_json
+from plyfile import PlyData
+from support import SMALL, refused, strict_json, write_capture
 
 LADDER = {"model", "posterior_mean", "posterior_samples", "other_scene", "mean_predictor", "true_sampler"}
 SCORES = {"coverage", "total_variation", "sharpness", "rejected", "energy_hidden", "energy_visible"}
@@ -76,6 +78,33 @@ def test_one_picture_is_completed(runs, command, tmp_path):
     given = [f"image={picture}", f"weights={runs / 'diffusion/weights'}", "samples=2", "video=false"]
     assert command("predict", *given, f"out={tmp_path / 'out'}").status == 0
     assert len(list((tmp_path / "out").rglob("*.ply"))) == 2
+
+
+def test_several_pictures_with_their_cameras_give_one_scene(runs, command, tmp_path):
+    write_capture(tmp_path, 6)
+    weights = [f"weights={runs / 'diffusion/weights'}", f"cameras={tmp_path / 'transforms.json'}", "video=false"]
+
+    def predict(*numbers: int) -> np.ndarray:
+        pictures = ",".join(str(tmp_path / f"frame{number}.png") for number in numbers)
+        out = tmp_path / "".join(map(str, numbers))
+        assert command("predict", f"image=[{pictures}]", *weights, f"out={out}").status == 0
+        assert strict_json(out / f"frame{numbers[0]}/scene.json")["settings"]["images"][0] == f"frame{numbers[0]}.png"
+        (splats,) = out.rglob("*.ply")
+        return np.stack([PlyData.read(splats)["vertex"][name] for name in ("z", "f_dc_0", "opacity")])
+
+    first = predict(1, 2, 4)
+    np.testing.assert_allclose(predict(1, 4, 2), first, atol=1e-4)
+    assert np.abs(predict(1, 2, 3) - first).max() > 1e-3
+
+
+def test_pictures_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tmp_path):
+    write_capture(tmp_path, 6)
+    pictures = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"
+    cameras = f"cameras={tmp_path / 'transforms.json'}"
+    weights = f"weights={runs / 'diffusion/weights'}"
+    assert "two pictures or more" in refused("predict", f"image={tmp_path / 'frame0.png'}", cameras, weights)
+    assert "box does not go with cameras" in refused("predict", pictures, cameras, weights, "box=[0,0,1,0.5]")
+    assert "trained with posterior=image" in refused("predict", pictures, cameras, f"weights={tiny_weights}")
 
 
 @pytest.mark.parametrize(

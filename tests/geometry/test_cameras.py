@@ -1,6 +1,7 @@
 """The camera conventions, each as a fact about points and pixels."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from completesplat.geometry.cameras import (
     invert_rigid,
     look_at,
     mirror,
+    nearest_to_axes,
     pinhole,
     pixel_rays,
     project,
@@ -129,6 +131,19 @@ def test_scaling_the_world_scales_depths_and_leaves_pixels() -> None:
     assert_close(scaled_pixels, pixels, atol=1e-6, rtol=1e-9)
     assert_close(scaled_depth, depth * factor[:, None])
     assert_close(scaled.centers, cameras.centers * factor[:, None])
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_the_place_that_cameras_look_at_is_nearest_to_their_axes(count: int) -> None:
+    target = rand(3, low=-2, high=2)
+    poses = look_at(target + rand(count, 3, low=-4, high=-1, seed=1), target, f64(0.0, -1, 0))
+    cameras = Cameras(poses, random_cameras(count).intrinsics, (48, 64))
+    found = nearest_to_axes(cameras)
+    assert found is not None
+    assert_close(found, target.float())
+    parallel = replace(cameras, world_to_camera=poses[:1].repeat(count, 1, 1))
+    parallel.world_to_camera[:, 0, 3] += torch.arange(count)
+    assert nearest_to_axes(parallel) is None
 
 
 @pytest.mark.parametrize(("left", "top", "side", "size"), [(0, 0, 48, 48), (3.5, 7.25, 30.5, 128), (-4, -2, 60, 16)])

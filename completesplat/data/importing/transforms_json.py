@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from completesplat.data.importing.capture import (
@@ -19,8 +20,10 @@ from completesplat.data.importing.capture import (
     check_lens,
     in_order,
     make_cloud,
+    read_picture,
 )
 from completesplat.data.pictures.files import picture_size
+from completesplat.data.pictures.photograph import read_photograph
 from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
     BadAnnotation,
@@ -35,6 +38,10 @@ from completesplat.data.validation import (
     require_file,
     require_rotation,
 )
+from completesplat.errors import CompleteSplatError
+from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.scene import Views
+from completesplat.tensors import stack
 
 logger = logging.getLogger(__name__)
 
@@ -63,18 +70,62 @@ def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
     Raises:
         DataError: whatever is missing, malformed or impossible, with the file and the number of the frame in it.
     """
+    frames, content = _read_frames(path, most_missing)
+    with at(path):
+        ordered = in_order(frames)
+        cloud = None if content.get("ply_file_path") is None else field(content, "ply_file_path", str)
+        points = None if cloud is None else _read_cloud(inside(path.parent, cloud))
+    return Capture(path.resolve().parent.name, path, ordered, points)
+
+
+def read_photographs(pictures: Sequence[Path], path: Path, size: int) -> Views:
+    """Photographs with their cameras in `transforms.json`, as `read_photograph` cuts and resizes them.
+
+    Returns:
+        Views [view ...] in the order of the pictures, in the world of the first camera and the file's units.
+
+    Raises:
+        DataError: as `read_transforms`, but for the number of frames; a picture of another size, or to be turned.
+        CompleteSplatError: a picture that the file does not have, or one that is distorted.
+    """
+    frames = {frame.image.resolve(): frame for frame in _read_frames(path, most_missing=1)[0]}
+    images, cameras = [], []
+    for picture in pictures:
+        frame = frames.get(picture.resolve())
+        if frame is None:
+            raise CompleteSplatError(f"{picture}: {path} has no frame with this picture")
+        if any(frame.lens.distortion):
+            said = "import the capture (completesplat data import), which undistorts it, and use the pictures it writes"
+            raise CompleteSplatError(f"{picture}: its lens distorts; {said}")
+        read_picture(frame.image, frame.lens.image_size)  # refuses what `read_photograph` would turn
+        images.append(read_photograph(frame.image, size).image)
+        cameras.append(_of_square(frame, size))
+    placed = stack(cameras)
+    return Views(torch.stack(images), placed.relative_to(placed[0]), torch.ones(len(images), 1, size, size))
+
+
+def _of_square(frame: CapturedFrame, size: int) -> Cameras:
+    """The camera of the central square, resized."""
+    (height, width), (fx, fy), (x, y) = frame.lens.image_size, frame.lens.focal, frame.lens.center
+    whole = Cameras(
+        torch.tensor(frame.world_to_camera, dtype=torch.float32),
+        torch.tensor([[fx, 0, x], [0, fy, y], [0, 0, 1]], dtype=torch.float32),
+        (height, width),
+    )
+    side = min(height, width)
+    return crop_resize(whole, (width - side) // 2, (height - side) // 2, side, size)
+
+
+def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], dict[str, Any]]:
+    """All frames that have pictures, and the file's content."""
     content = read_json(path, allow_nan=True)  # NaN is refused where it stands, by frame.
-    root = path.parent
     with at(path):
         entries = field(content, "frames", list)
         frames = []
         for number, image in _find_pictures(path, entries, most_missing).items():
             with at(frame=number):
-                frames.append(_read_frame(root, number, content, entries[number], image))
-        ordered = in_order(frames)
-        cloud = None if content.get("ply_file_path") is None else field(content, "ply_file_path", str)
-        points = None if cloud is None else _read_cloud(inside(root, cloud))
-    return Capture(path.resolve().parent.name, path, ordered, points)
+                frames.append(_read_frame(path.parent, number, content, entries[number], image))
+    return frames, content
 
 
 def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> dict[int, Path]:

@@ -3,11 +3,15 @@ import logging
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from plyfile import PlyData
 
 from completesplat.data.importing import import_capture
-from completesplat.data.validation import MissingFile
+from completesplat.data.importing.transforms_json import read_photographs
+from completesplat.data.validation import BadPicture, MissingFile
+from completesplat.errors import CompleteSplatError
+from completesplat.geometry.cameras import project
 
 LENSES = {
     "a pinhole off the centre": {},
@@ -159,3 +163,35 @@ def test_the_command_writes_it_and_says_what_comes_next(captures, tmp_path, comm
     assert "8 copied as they are" in text
     lists = json.loads((tmp_path / "out/desk/set_lists/set_lists_imported.json").read_text())
     assert [entry[1] for entry in lists["test"]] == [0, 4]
+
+
+def test_photographs_have_the_cameras_of_their_squares(captures, tmp_path):
+    shot = captures.Shot()
+    path = captures.write_transforms(tmp_path / "in", shot)
+    names = [2, 0, 5]
+    views = read_photographs([tmp_path / f"in/images/r_{n}.png" for n in names], path, 75)
+    poses = captures.opengl_poses()[names]
+    assert views.cameras.world_to_camera[0].allclose(torch.eye(4), atol=1e-5)
+    # In the first camera's frame, with OpenCV's axes.
+    local = (shot.points - poses[0][:3, 3]) @ poses[0][:3, :3] * [1, -1, -1]
+    found = project(views.cameras, torch.from_numpy(local).float())[0].numpy()
+    for pixels, pose in zip(found, poses, strict=True):
+        expected = (shot.pixels(pose) - [(210 - 150) / 2, 0]) * 75 / 150
+        np.testing.assert_allclose(pixels, expected, atol=1e-3)
+    # And the pictures show the blobs there.
+    for image, pixels in zip(views.images, found, strict=True):
+        inside = pixels[((pixels > 3) & (pixels < 72)).all(1)].astype(int)
+        assert (image[0, inside[:, 1], inside[:, 0]] > 0.5).all()
+
+
+def test_photographs_without_a_plain_camera_are_refused(captures, tmp_path):
+    path = captures.write_transforms(tmp_path / "in", captures.Shot(k1=0.1))
+    first = tmp_path / "in/images/r_0.png"
+    with pytest.raises(CompleteSplatError, match=r"r_0.png: its lens distorts; import the capture"):
+        read_photographs([first], path, 32)
+    captures.edit(path, lambda content: content.update(k1=0, w=200))
+    with pytest.raises(BadPicture, match="200"):
+        read_photographs([first], path, 32)
+    captures.edit(path, lambda content: content["frames"].pop(0))
+    with pytest.raises(CompleteSplatError, match=r"r_0.png: .*transforms.json has no frame with this picture"):
+        read_photographs([first], path, 32)
