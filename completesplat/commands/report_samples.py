@@ -20,6 +20,7 @@ from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import masked as masked_study
 from completesplat.studies import samplers as samplers_study
+from completesplat.studies import views as views_study
 from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
@@ -133,6 +134,23 @@ def depth(
     Console(width=120).print(table("Deviation of depth over samples, scene units", DEPTH, rows))
 
 
+def views(
+    ckpt: str, overrides: Sequence[str], scenes: Positive, counts: Annotated[Sequence[Positive], Filled()], out: Path
+) -> None:
+    """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings.
+
+    Refused as by `Trained.open`, `first_scenes` and `views.rows`.
+    """
+    quieten()
+    module, data = Trained(ckpt, overrides).open()
+    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    with _status() as tick:
+        rows = views_study.rows(module, counts, [scene.to(module.device) for scene in first_scenes(data, scenes)], tick)
+    write_json(out / "views.json", {"settings": {"scenes": scenes}, "rows": rows})
+    views_study.plot_views(rows, out / "views.png", f"{scenes} scenes, posterior's mean")
+    Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
+
+
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
     """What draws a run's samples, the first test scenes, and the settings that are written beside what is found.
 
@@ -171,6 +189,7 @@ CONTROLS: list[Column] = [
     ("near object", "near_object_psnr", ".2f"),
     ("diversity", "diversity", ".4f"),
 ]
+VIEWS: list[Column] = [("views", "views", "d"), ("all pixels", "psnr", ".2f"), ("object", "object_psnr", ".2f")]
 DEPTH = [*WEIGHTS]
 for _view in ("reference", "far"):
     DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]

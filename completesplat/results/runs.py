@@ -18,7 +18,7 @@ from completesplat.errors import CompleteSplatError
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
-ROWS = ("samplers.json", "controls.json", "depth.json")
+ROWS = ("samplers.json", "controls.json", "depth.json", "views.json")
 """What `completesplat report NAME` leaves beside its figure: settings and rows."""
 PROTOCOL = "protocol"  # where results say how they were measured, beside the entries of the predictors
 NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}

@@ -31,6 +31,7 @@ from completesplat.metrics.mode_coverage import (
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
+from completesplat.studies.samples import autoreconstructor_of
 
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
@@ -55,8 +56,8 @@ def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
         return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
 
-    own = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
-    if not isinstance(own, VariationalAutoReconstructor):
+    own = autoreconstructor_of(module)
+    if own is None:
         return {"model": model}
     ladder = _Ladder(module, own, samples, batch)
     found: dict[str, Predictor] = {

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.errors import DataError
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras
@@ -46,6 +47,12 @@ class SampleRenderer:
         gaussians = self.model.generate(*given, samples=self.samples, seed=self.seed, **settings)
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
+
+
+def autoreconstructor_of(module: Any) -> VariationalAutoReconstructor | None:
+    """The variational autoreconstructor of either stage; None for another model."""
+    own = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
+    return own if isinstance(own, VariationalAutoReconstructor) else None
 
 
 def first_scenes(data: Any, count: int) -> list[SceneBatch]:
