@@ -12,7 +12,7 @@ from rich.progress import track
 from completesplat.data.processes import map_in_processes
 from completesplat.errors import DataError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 Result = TypeVar("Result")
 
