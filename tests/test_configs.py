@@ -45,7 +45,7 @@ def needed(group: str, option: str) -> list[str]:
     given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
-    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_small", "_diffusion_cached"))
+    stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_cached"))
     given += ["evaluation.scene_list=x"] if option == "realestate10k_100" else []
     given += ["evaluation.evaluation_index=x"] if option in ("realestate10k_128", "realestate10k_256") else []
     return given + (["model.autoreconstructor_checkpoint=null"] if stage2 or option == "latent_diffusion" else [])
@@ -170,8 +170,6 @@ def test_every_toy_experiment_trains_on_one_batch(experiment, pipeline: Path, mo
     settings += {
         "toy_diffusion": [f"model.autoreconstructor_checkpoint={var}", "sampler.steps=2"],
         "toy_diffusion_masked": [f"model.checkpoint={diffusion}", "sampler.steps=2"],
-        # Of the pipeline's stage 1, which has four levels.
-        "toy_diffusion_small": [f"model.autoreconstructor_checkpoint={var}", "conditioning.channels=[8,8,16,16]"],
         "toy_var_stage2": [f"model.checkpoint={var}", "ablation=no_lpips"],
         "toy_var_masked": [f"model.checkpoint={var}"],
     }.get(experiment, [])

@@ -30,7 +30,6 @@ def test_an_experiment_lists_what_comes_before_it(experiment):
     commands = written.experiment_commands(experiment)
     assert f"fit experiment={experiment} " in commands[-1]
     made = {"ROOT"} if experiment.startswith(("co3d_", "re10k_")) else set()
-    made |= {"RUN1", "DATA"} if experiment == "toy_diffusion_small" else set()  # of toy_var_small
     for command in commands:
         given = dict(argument.split("=", 1) for argument in written.arguments_of(command) if "=" in argument)
         folder = given.pop("out")
