@@ -87,7 +87,7 @@ def test_other_data_are_refused(toy_root, tmp_path):
 
 
 SIZE, FRAMES = 48, 8
-SCENE = draw_scene(np.random.default_rng([5, 1]), FRAMES)
+SCENE = draw_scene(np.random.default_rng([5, 4]), FRAMES)
 
 
 @pytest.mark.parametrize("frame", [1, 2])
