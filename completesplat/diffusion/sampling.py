@@ -1,6 +1,7 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else."""
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,11 +34,19 @@ class Sampler:
     Args:
         scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
         steps: denoising steps unless a call says otherwise (50 in the paper).
+        ancestral: of flow matching: renew as much of the noise in each step as the reverse of the forward process does
+            (`renewed`), instead of none. Errors of earlier steps are forgotten so.
+
+    Raises:
+        CompleteSplatError: `ancestral` for diffusion.
     """
 
-    def __init__(self, scheduler: Any, steps: int = 50) -> None:
+    def __init__(self, scheduler: Any, steps: int = 50, ancestral: bool = False) -> None:
+        if ancestral and not is_flow(scheduler):
+            raise CompleteSplatError("sampler.ancestral: for flow matching (sampler=flow25, flow50_ancestral) only")
         self.scheduler = scheduler
         self.steps = steps
+        self.ancestral = ancestral
 
     @torch.no_grad()
     def __call__(
@@ -58,7 +67,7 @@ class Sampler:
         """
         scheduler = self.scheduler
         self._set_steps(self.steps if steps is None else steps, noise.device)
-        flow = is_flow(scheduler)
+        flow, fresh = is_flow(scheduler), fresh_noise(noise)
         latent: Tensor = noise if flow else noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
             level = timestep.round().long()
@@ -66,7 +75,11 @@ class Sampler:
             predicted = guided_noise(denoise, inputs, level.expand(len(noise)), conditioning, guidance_weight)
             if on_step is not None:
                 on_step(index, int(level), clean_estimate(scheduler, inputs, predicted, level))
-            latent = scheduler.step(predicted, timestep, latent).prev_sample
+            if self.ancestral:
+                time, following = scheduler.sigmas[index : index + 2].tolist()
+                latent = renewed(latent, predicted, next(fresh), time, following)
+            else:
+                latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
 
     def _set_steps(self, steps: int, device: torch.device) -> None:
@@ -103,6 +116,28 @@ class Sampler:
         """T, the number of noise levels of the forward process."""
         steps: int = self.scheduler.config.num_train_timesteps
         return steps
+
+
+def renewed(latent: Latents, velocity: Latents, fresh: Latents, time: float, following: float) -> Latents:
+    """A step from time t to s of flow matching that renews the share 1 - r^2 of the noise's variance.
+
+    With h_t = (1 - t) h + t eps, n(t) = t / (1 - t) and r = n(s) / n(t), the forward process has made h_t of h_s by
+    noise that is independent of h_s. Given h, its reverse is h_s = (1 - s) h + s (r eps + sqrt(1 - r^2) z) with z new:
+    the ancestral step of diffusion (Ho et al. 2020, Eq. 7; k-diffusion's `sample_euler_ancestral_RF`), in which the
+    denoiser's estimates stand for h and eps.
+    """
+    clean, noise = latent - time * velocity, latent + (1 - time) * velocity
+    ratio = following * (1 - time) / (time * (1 - following))
+    return (1 - following) * clean + following * (ratio * noise + math.sqrt(1 - ratio**2) * fresh)
+
+
+def fresh_noise(noise: Latents) -> Iterator[Latents]:
+    """New noise, again and again: for each latent it depends on that latent's first noise alone."""
+    seeds = noise.float().contiguous().view(torch.int32).flatten(1).sum(1).tolist()
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    while True:
+        drawn = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
+        yield torch.stack(drawn).to(noise)
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
