@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.schema import Positive
 
 logger = logging.getLogger(__name__)
 MOST_SHOWN = 8

@@ -20,8 +20,8 @@ from omegaconf import OmegaConf
 from completesplat import __version__
 from completesplat.atomic import atomic_path
 from completesplat.commands.protocol import git_commit, write_json
-from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import check_settings
 
 LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"

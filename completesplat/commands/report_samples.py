@@ -10,12 +10,12 @@ from rich.console import Console
 
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
-from completesplat.commands.schema import Filled, Positive, Range
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, Column, table
 from completesplat.scene import SceneBatch
+from completesplat.schema import Filled, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import masked as masked_study
