@@ -21,7 +21,7 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 # method.
 LAYERS = """
     errors atomic schema weights tensors geometry gaussians splatter_image scene rasterizers data autoreconstructor
-    diffusion losses metrics baselines generation export training viewer results studies commands cli
+    diffusion losses metrics baselines parts generation export training viewer results studies commands cli
     benchmarks
 """
 FLOORS = LAYERS.split()

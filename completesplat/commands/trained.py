@@ -1,6 +1,5 @@
 """Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,8 @@ from omegaconf import OmegaConf
 
 from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
+from completesplat.parts import read_architecture
+from completesplat.weights import WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -98,7 +98,7 @@ class Trained:
             "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
-        found.data.image_size = json.loads((folder / CONFIG_FILE).read_text())["image_size"]
+        found.data.image_size = read_architecture(folder)["image_size"]
         return found
 
 

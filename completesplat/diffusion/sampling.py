@@ -1,7 +1,7 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import Range
 
 OnStep = Callable[[int, int, Tensor], None]
 """(number of the denoiser call, timestep, estimate of the clean latent)."""
@@ -35,7 +36,7 @@ class Sampler:
         steps: denoising steps unless a call says otherwise (50 in the paper).
     """
 
-    def __init__(self, scheduler: Any, steps: int = 50) -> None:
+    def __init__(self, scheduler: Any, steps: Annotated[int, Range(1, 10_000)] = 50) -> None:
         self.scheduler = scheduler
         self.steps = steps
 
