@@ -30,7 +30,7 @@ from completesplat.diffusion.conditioning import LearnedConditioning, StableDiff
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.schema import AtMost, Range, Share, hints_of, refused
+from completesplat.schema import AtMost, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, read_small
 
@@ -151,11 +151,11 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
     for name, value in settings.items():
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
-            raise WeightsError(f"{_short(key)}: there is no such setting, but {', '.join(hints)}")
+            raise WeightsError(f"{shown(key)}: there is no such setting, but {', '.join(hints)}")
         if name in PARTS and (value is not None or name != "view_encoder"):
             _check_part(key, value, PARTS[name])
         elif name not in PARTS and (found := refused(hints[name], value)):
-            raise WeightsError(f"{key}={_short(value)}: {found[0].reason}")
+            raise WeightsError(f"{key}={shown(value)}: {found[0].reason}")
 
 
 def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
@@ -163,14 +163,9 @@ def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
     kinds = [kind for kind in allowed if name_of(kind) == target]
     if not kinds or not isinstance(part, Mapping):
         names = ", ".join(map(name_of, allowed))
-        raise WeightsError(f"{place} names {_short(target)}, which is no part of a model; allowed are {names}")
+        raise WeightsError(f"{place} names {shown(target)}, which is no part of a model; allowed are {names}")
     settings = {name: value for name, value in part.items() if name != "_target_"}
     _check_settings(place, settings_of(kinds[0]), settings)
-
-
-def _short(value: Any) -> str:
-    """A value as it is shown: without what would move a terminal's cursor, and not for pages."""
-    return str(value).encode("unicode_escape").decode()[:80]
 
 
 def build(part: Part) -> Any:

@@ -135,3 +135,8 @@ def _is_a(kind: type, value: Any) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)
+
+
+def shown(value: Any) -> str:
+    """A stranger's value for a message: not for pages, and without what would move a terminal's cursor."""
+    return str(value).encode("unicode_escape").decode()[:80]
