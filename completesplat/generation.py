@@ -260,7 +260,7 @@ class CompleteSplat(nn.Module):
             path: a folder, a name of the weights in the package, or an id of the Hugging Face hub (`weights_folder`).
 
         Raises:
-            WeightsError: files are missing, unreadable, changed, or do not belong together.
+            WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not.
         """
         folder = weights_folder(path)
         try:

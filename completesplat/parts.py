@@ -169,7 +169,7 @@ def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
 
 
 def build(part: Part) -> Any:
-    """A part of a configuration that was checked, with all that is in it."""
+    """A part of a configuration that `check_architecture` has let through, with the parts in it."""
     settings = {name: build(value) if isinstance(value, Mapping) else value for name, value in part.items()}
     return CLASSES[settings.pop("_target_")](**settings)
 

@@ -196,7 +196,7 @@ def settings(part: dict, place: str = "") -> Iterator[str]:
 ODD = (None, True, -1, 0, 10**400, 1e308, math.nan, "", "x", "${x}", [], [None], {}, {"_target_": "x"}, [[]])
 
 
-@pytest.mark.parametrize("odd", ODD, ids=str)
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: str(odd)[:20])
 def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_kind(odd):
     accepted = []
     for place in settings(IN_THE_BOX):
