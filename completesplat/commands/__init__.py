@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from completesplat.commands import jobs
+from completesplat.commands.jobs import conf_folder
 from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
 
@@ -68,12 +69,6 @@ def launch(verb: str, arguments: list[str]) -> None:
     hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
     if failures:
         raise failures[0]
-
-
-def conf_folder() -> Path:
-    """The configuration tree: inside an installed package, or beside it in the repository."""
-    package = Path(__file__).parents[1]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def best_precision() -> str:

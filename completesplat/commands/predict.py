@@ -16,7 +16,6 @@ from rich.progress import Progress
 from torch import Tensor
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.commands.schema import Positive, Range, Share, check_settings
 from completesplat.commands.trained import open_generator
 from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
@@ -27,6 +26,7 @@ from completesplat.export.splat_transform import find_splat_transform
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
+from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5

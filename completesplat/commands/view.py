@@ -6,8 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
-from completesplat.commands.schema import Range, Share, check_settings
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.schema import Range, Share, check_settings
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
 EXPORT = "--export"

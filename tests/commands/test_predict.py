@@ -10,8 +10,8 @@ from plyfile import PlyData
 from support import compose_config, strict_json
 
 from completesplat.commands.predict import PredictNumbers, visible_part
-from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import check_settings
 
 FEW = ["samples=2", "frames=4", "steps=2"]
 
