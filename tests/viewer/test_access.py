@@ -62,15 +62,14 @@ def statuses(server, query: str, **headers: str) -> tuple[int, int]:
 
 
 def open_socket(server, path: str = "", cookie: str = ""):
-    version = [f"viser-v{viser.__version__}"]
-    address = f"127.0.0.1:{server.get_port()}"
-    cookies = {"Cookie": cookie}
+    address = ("127.0.0.1", server.get_port())
+    host = "{}:{}".format(*address)
     return connect(
-        f"ws://{address}{path}",
-        origin=f"http://{address}",
-        additional_headers=cookies,
-        subprotocols=version,
-        proxy=None,
+        f"ws://{host}{path}",
+        sock=socket.create_connection(address, timeout=SECONDS),  # past a proxy that may be set
+        origin=f"http://{host}",
+        additional_headers={"Cookie": cookie},
+        subprotocols=[f"viser-v{viser.__version__}"],
     )
 
 
@@ -256,6 +255,18 @@ def test_files_that_are_received_at_once_share_the_room(uploader):
     uploader.part("first", 1, bytes(MIB // 2))
     assert uploader.arrived.wait(SECONDS)
     assert [len(content) for content in uploader.received] == [7, MIB]
+
+
+def test_who_leaves_before_looking_takes_its_files_with_it(server):
+    """viser knows a browser from its first camera on."""
+    button = server.gui.add_upload_button("file")
+    uploads = server.gui._current_file_upload_states
+    with own_socket(server) as opened:
+        start = messages.FileTransferStartUpload(button._impl.uuid, "early", "a.png", "", 2, MIB)
+        opened.send(_infra.msgspec.msgpack.encode(start.as_serializable_dict()))
+        until(lambda: uploads)
+    until(lambda: not uploads)
+    button.remove()
 
 
 def test_names_of_files_are_shown_as_one_short_line():
