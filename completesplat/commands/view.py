@@ -58,7 +58,7 @@ def run(config: Any, out: Path) -> None:
     try:
         if config.export is not None:
             return export(page, Path(config.export))
-        print(f"http://{page.server.get_host()}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
+        print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
