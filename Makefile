@@ -73,5 +73,5 @@ notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb
 
 clean: ## Remove everything that can be made again, the environment included
-	rm -rf .venv outputs multirun build dist .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf .venv outputs multirun build dist .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
