@@ -10,9 +10,9 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
-from plyfile import PlyData, PlyElement
 
-from completesplat.errors import DataError
+from completesplat.errors import DataError, PlyError
+from completesplat.ply_files import read_vertices
 
 MOST_BYTES = 2**32
 # Beyond this size a gzipped file may be smaller than its content by no more than this factor. Deflate gets up to 1032,
@@ -138,14 +138,14 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
         raise UnreadableFile(f"not a text file ({type(error).__name__})", str(path)) from None
 
 
-def read_vertices(path: Path) -> tuple[PlyElement, np.ndarray]:
-    """The vertices of a PLY file, and their places [n 3] in float64; errors as of `read_text`."""
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of a PLY file as `read_vertices`, and their places [n 3] in float64; errors as of `read_text`."""
     require_file(path)
     try:
-        vertices = PlyData.read(str(path))["vertex"]
-        return vertices, np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=-1)
-    except Exception as error:  # The parser raises nearly anything on a damaged file.
-        raise UnreadableFile(f"not a point cloud ({type(error).__name__}: {error})", str(path)) from None
+        vertices = read_vertices(path, "xyz")
+    except PlyError as error:
+        raise UnreadableFile(f"not a point cloud ({error})", str(path)) from None
+    return vertices, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
