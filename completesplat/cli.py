@@ -1,5 +1,6 @@
 """The `completesplat` command: picks the verb, reports refusals in one line."""
 
+import io
 import os
 import sys
 
@@ -20,6 +21,9 @@ USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --hel
 
 def main() -> None:
     """Entry point. Exit status 0 only when all of it worked, 2 for a refused input."""
+    # Paths may hold bytes that are no UTF-8. Standard error escapes them by itself.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)

@@ -35,7 +35,7 @@ class ImageError(CompleteSplatError):
 
 
 class PlyError(CompleteSplatError):
-    """A `.ply` file that is not a complete and finite set of Gaussians."""
+    """A `.ply` file that is damaged, or not a finite set of Gaussians."""
 
 
 class WeightsError(CompleteSplatError):

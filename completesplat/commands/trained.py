@@ -117,12 +117,20 @@ class Trained:
 
 
 def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given; errors are `from_pretrained`'s."""
+    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given.
+
+    `WeightsError`: as `from_pretrained`, or weights that are not finite.
+    """
     from completesplat.generation import CompleteSplat
 
     if config.weights in in_the_box():
         print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
     model = CompleteSplat.from_pretrained(config.weights)
+    broken = [name for name, values in model.state_dict().items() if not values.isfinite().all()]
+    if broken:
+        raise WeightsError(
+            f"{config.weights}: weights that are not finite in {len(broken)} tensors, such as {broken[0]}"
+        )
     if config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)
         model.replace_sampler(sampler)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.names import printable
 from completesplat.schema import Range, Share, check_settings
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
@@ -115,7 +116,7 @@ def make_page(config: Any, out: Path) -> Any:
         steps = model.sampler.steps if config.steps is None else config.steps
         completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
         if photograph is not None:
-            completion.load(Path(config.image).name, photograph)
+            completion.load(printable(Path(config.image).name), photograph)
         return page
     except BaseException:
         stop_server(server)

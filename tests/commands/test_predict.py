@@ -109,7 +109,7 @@ def test_a_mask_hides_what_a_box_hides(predict, tmp_path):
 
 def test_settings_have_ranges():
     for setting, least in (
-        ("samples=0", "at least 1"),
+        ("samples=0", "1 and 1000"),
         ("steps=1001", "1 and 1000"),
         ("guidance_weight=-1", "0 and 1"),
     ):
