@@ -82,7 +82,7 @@ def run(config: Any, out: Path) -> None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-        write_json(out / METRICS, results, allow_nan=True)  # the last file, because it means that the job is done
+        write_json(out / METRICS, results)  # the last file, because it means that the job is done
         if scores is not None:
             log_test(scores, shown, trainer, out)
 

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from time import monotonic
@@ -11,10 +12,10 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import nn
+from torch import Tensor, nn
 
 from completesplat.atomic import atomic_path
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
 
 LAST = "last.ckpt"
 
@@ -69,11 +70,11 @@ class Checkpoints(Checkpoint):
         # Several batches share an optimizer step where gradients are accumulated; these are not in a checkpoint.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped and (self._is_milestone() or self._is_due(trainer)):
-            self._save(trainer)
+            self._save(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step != self.saved_step:
-            self._save(trainer)
+            self._save(trainer, pl_module)
 
     def _is_milestone(self) -> bool:
         return self.keep_every is not None and self.step % self.keep_every == 0
@@ -86,7 +87,10 @@ class Checkpoints(Checkpoint):
         # All processes save together, and their clocks differ.
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
-    def _save(self, trainer: Trainer) -> None:
+    def _save(self, trainer: Trainer, module: LightningModule) -> None:
+        if (name := not_finite(module.state_dict())) is not None:
+            said = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
+            raise DivergenceError(f"step {trainer.global_step}: {said}")
         self.step = self.saved_step = trainer.global_step
         self.saved_at = monotonic()
         last = self.folder / LAST
@@ -115,14 +119,25 @@ def _replaced(path: Path) -> AbstractContextManager[Path]:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents; `WeightsError` if the file is missing or not a checkpoint of plain tensors."""
+    """A checkpoint's contents.
+
+    `WeightsError`: the file is missing, no checkpoint of plain tensors, or its weights are not finite.
+    """
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
     try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
-        return {"state_dict": contents["state_dict"], **contents}
+        contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        name = not_finite(contents["state_dict"])
     except Exception as error:
         raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
+    if name is not None:
+        raise WeightsError(f"{path}: {name} is not finite")
+    return contents
+
+
+def not_finite(weights: Mapping[str, Any]) -> str | None:
+    """The name of the first tensor that holds NaN or infinities, if there is one."""
+    return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
