@@ -18,7 +18,7 @@ from completesplat.commands.protocol import checkpoint_facts, protocol, write_js
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.results.tables import Table, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_test
+from completesplat.results.wandb import begin, log_scores, log_shown
 from completesplat.training.loggers import finished
 
 logger = logging.getLogger(__name__)
@@ -82,9 +82,10 @@ def run(config: Any, out: Path) -> None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
+            log_scores(scores, trainer)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
         if scores is not None:
-            log_test(scores, shown, trainer, out)
+            log_shown(scores, shown, trainer, out)
 
 
 def _parts(config: Any) -> list[Any]:

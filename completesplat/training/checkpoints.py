@@ -4,6 +4,7 @@ import os
 import shutil
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from copy import deepcopy
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -18,6 +19,7 @@ from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
 
 LAST = "last.ckpt"
+FIGURES = "figures"
 
 
 class CheckpointFiles(TorchCheckpointIO):
@@ -40,6 +42,10 @@ class Checkpoints(Checkpoint):
     Every time one file is written: at a milestone `step=N.ckpt`, and `last.ckpt` becomes a second name (hard link) of
     it. A run that is killed at any moment leaves a whole `last.ckpt`.
 
+    Loggers get a step's rows, and those of its validation, after the last callback of the step. So the file is written
+    before the next batch, with the loops' state as it was at the end of the step: where a run goes on, nothing that the
+    step had to log is missing. It holds the figures that were logged so far, too, which the end of a run reports.
+
     Args:
         every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
         keep_every: optimizer steps between milestones (at least 1); None: none are kept.
@@ -59,6 +65,11 @@ class Checkpoints(Checkpoint):
         self.every_n_train_steps = every_n_train_steps
         self.every_minutes = every_minutes
         self.keep_every = keep_every
+        self.due: dict[str, Any] | None = None
+        self.figures: dict[str, Tensor] = {}
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.callback_metrics.update(self.figures)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = self.saved_step = trainer.global_step
@@ -70,11 +81,26 @@ class Checkpoints(Checkpoint):
         # Several batches share an optimizer step where gradients are accumulated; these are not in a checkpoint.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped and (self._is_milestone() or self._is_due(trainer)):
+            self.due = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        if self.due is not None:
             self._save(trainer, pl_module)
+            self.due = None
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.due = None  # the loops are at the end of the run now
         if trainer.global_step != self.saved_step:
             self._save(trainer, pl_module)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        if self.due is not None:
+            checkpoint["epoch"] = self.due["epoch"]
+            checkpoint["loops"]["fit_loop"] = self.due["fit_loop"]
+        checkpoint[FIGURES] = {name: value.cpu() for name, value in trainer.callback_metrics.items()}
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.figures = checkpoint.get(FIGURES, {})
 
     def _is_milestone(self) -> bool:
         return self.keep_every is not None and self.step % self.keep_every == 0
