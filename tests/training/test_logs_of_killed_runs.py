@@ -42,13 +42,13 @@ class Logging(BoringModel):
         self.log("val/loss", self.layer(batch).square().mean())
 
 
-def fit(folder: Path) -> None:
+def fit(folder: Path, steps: int = STEPS) -> None:
     """Go on in a folder, as `completesplat fit ckpt_path=last` does, and write the final row."""
     torch.manual_seed(0)
     module, logger = Logging(), ContinuedCSVLogger(str(folder))
     checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=1, keep_every=5)
     trainer = Trainer(
-        max_steps=STEPS, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
+        max_steps=steps, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
         log_every_n_steps=2, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0,
         enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
@@ -56,7 +56,7 @@ def fit(folder: Path) -> None:
     validation = torch.utils.data.DataLoader(torch.ones(1, 32))
     trainer.fit(module, Batches(), validation, ckpt_path=last if last.is_file() else None, weights_only=True)
     figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
-    logger.log_metrics(figures | {"epochs": trainer.current_epoch}, step=trainer.global_step)
+    logger.log_metrics(figures, step=trainer.global_step)
 
 
 def rows(folder: Path) -> list[dict[str, str]]:
@@ -92,6 +92,14 @@ def test_a_run_killed_before_every_change_of_a_file_leaves_all_rows(tmp_path, mo
         fit(folder)
         assert rows(folder) == expected, survived
     assert survived > 3 * STEPS
+
+
+@pytest.mark.parametrize("steps", [6, 7, 12])
+def test_a_run_that_ended_and_is_made_longer_is_one_that_was_as_long(tmp_path, steps):
+    fit(tmp_path / "long")
+    fit(tmp_path / "short", steps)
+    fit(tmp_path / "short")
+    assert rows(tmp_path / "short") == rows(tmp_path / "long")
 
 
 def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
