@@ -1,8 +1,10 @@
-"""The refusals that a person sees as one line, `error: ...`, with exit status 2."""
+"""The refusals that a person sees as one line, `error: ...`, with exit status 2, or 1 after work that failed."""
 
 
 class CompleteSplatError(Exception):
     """Something that the caller can put right: a bad input, a missing file, a wrong setting."""
+
+    exit_status = 2
 
 
 class DataError(CompleteSplatError):
@@ -39,4 +41,10 @@ class PlyError(CompleteSplatError):
 
 
 class WeightsError(CompleteSplatError):
-    """Weights that are missing, damaged or made for another model."""
+    """Weights that are missing, damaged, not finite or made for another model."""
+
+
+class DivergenceError(CompleteSplatError):
+    """A training whose losses, gradients or weights are not finite any more."""
+
+    exit_status = 1
