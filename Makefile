@@ -1,10 +1,11 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser check bench notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser check lock bench notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
-READY := .venv/installed
+# LOCKED=1 installs the versions of requirements.lock, whose files must have the hashes in it.
+READY := .venv/installed$(if $(LOCKED),-locked)
 DEMO := outputs/demo
 DEMO_SCENES := 80
 DEMO_LAST := 00079
@@ -13,9 +14,10 @@ TRAINED := outputs/demo_train
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
-$(READY): pyproject.toml
+$(READY): pyproject.toml $(if $(LOCKED),requirements.lock)
 	@echo "Installing into .venv: a few minutes, once"
 	@$(PYTHON) -m venv .venv
+	$(if $(LOCKED),@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $(READY)
 
@@ -64,6 +66,12 @@ check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# Without torch, of which a machine with a GPU takes another build than one without: that is installed by pyproject.toml.
+lock: $(READY) ## Write requirements.lock: the newest versions that pyproject.toml allows, for all systems, with hashes
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/python -m uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --upgrade --generate-hashes \
+	  --no-annotate --no-emit-package torch --custom-compile-command "make lock" --quiet --output-file requirements.lock
+
 bench: $(READY) ## Time the rasterizer backends, data loading, and stage 2, side by side
 	$(BIN)/completesplat bench rasterizers
 	$(BIN)/completesplat bench data
@@ -73,5 +81,5 @@ notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb
 
 clean: ## Remove everything that can be made again, the environment included
-	rm -rf .venv outputs multirun build dist .pytest_cache .mypy_cache .ruff_cache *.egg-info
+	rm -rf .venv outputs multirun build dist .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,6 @@
 """The `completesplat` command: picks the verb, reports refusals in one line."""
 
+import io
 import os
 import sys
 
@@ -19,7 +20,10 @@ USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --hel
 
 
 def main() -> None:
-    """Entry point. Exit status 0 only when all of it worked, 2 for a refused input."""
+    """Entry point. Exit status 0 only when all of it worked, 2 for a refused input, 1 for other failures."""
+    # Paths may hold bytes that are no UTF-8. Standard error escapes them by itself.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(USAGE)
@@ -35,7 +39,7 @@ def main() -> None:
     # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work at full speed, for
     # milliseconds, in which they keep the rasterizer's threads and other processes off the cores.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
-    from completesplat.commands import launch, refusal
+    from completesplat.commands import exit_status, launch, refusal
 
     try:
         launch(arguments[0], arguments[1:])
@@ -48,9 +52,9 @@ def main() -> None:
         message = refusal(error)
         if message is None:
             raise
-        sys.exit(_refuse(message))
+        sys.exit(_refuse(message, exit_status(error)))
 
 
-def _refuse(message: str) -> int:
+def _refuse(message: str, status: int = 2) -> int:
     print(f"error: {message}", file=sys.stderr)
-    return 2
+    return status

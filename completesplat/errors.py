@@ -1,8 +1,10 @@
-"""The refusals that a person sees as one line, `error: ...`, with exit status 2."""
+"""The refusals that a person sees as one line, `error: ...`, with exit status 2, or 1 after work that failed."""
 
 
 class CompleteSplatError(Exception):
     """Something that the caller can put right: a bad input, a missing file, a wrong setting."""
+
+    exit_status = 2
 
 
 class DataError(CompleteSplatError):
@@ -35,8 +37,14 @@ class ImageError(CompleteSplatError):
 
 
 class PlyError(CompleteSplatError):
-    """A `.ply` file that is not a complete and finite set of Gaussians."""
+    """A `.ply` file that is damaged, or not a finite set of Gaussians."""
 
 
 class WeightsError(CompleteSplatError):
-    """Weights that are missing, damaged or made for another model."""
+    """Weights that are missing, damaged, not finite or made for another model."""
+
+
+class DivergenceError(CompleteSplatError):
+    """A training whose losses, gradients or weights are not finite any more."""
+
+    exit_status = 1

@@ -22,11 +22,10 @@ from completesplat.diffusion.splitting import in_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
+from completesplat.parts import build, check_architecture, check_sizes, read_architecture
 from completesplat.scene import Views
 from completesplat.tensors import concatenate
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
-
-TRUSTED_PACKAGES = ("completesplat.", "diffusers.")
 
 
 class CompleteSplat(nn.Module):
@@ -38,6 +37,9 @@ class CompleteSplat(nn.Module):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
         image_size: side of the square images, in pixels.
+
+    Raises:
+        WeightsError: a part or a setting that weights may not name (`parts`).
     """
 
     latent_mean: Tensor
@@ -62,12 +64,13 @@ class CompleteSplat(nn.Module):
             for name, part in parts.items()
         }
         self.architecture: dict[str, Any] = {**saved, "sampler": dict(sampler), "image_size": image_size}
+        check_architecture(self.architecture)
         self.image_size = image_size
         # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
-        self.autoreconstructor = _build(saved["autoreconstructor"]).requires_grad_(False)
-        self.conditioning = _build(conditioning)
-        self.denoiser = _build(denoiser)
-        self.sampler = _build(sampler)
+        self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
+        self.conditioning = build(conditioning)
+        self.denoiser = build(denoiser)
+        self.sampler = build(sampler)
         # Measured on the training set by the training stage; the last three serve photographs of unknown cameras.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
@@ -227,7 +230,8 @@ class CompleteSplat(nn.Module):
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Draw with another sampler from now on; noise schedule and prediction type stay those of training."""
         config = with_forward_process(sampler, self.architecture["sampler"])
-        self.sampler = _build(config)
+        check_architecture({**self.architecture, "sampler": config})
+        self.sampler = build(config)
         self.architecture["sampler"] = config
 
     def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
@@ -256,11 +260,13 @@ class CompleteSplat(nn.Module):
             path: a folder, a name of the weights in the package, or an id of the Hugging Face hub (`weights_folder`).
 
         Raises:
-            WeightsError: files are missing, unreadable, changed, or do not belong together.
+            WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not.
         """
         folder = weights_folder(path)
         try:
-            model = cls(**json.loads((folder / CONFIG_FILE).read_text()))
+            architecture = read_architecture(folder)
+            check_sizes(architecture, folder / WEIGHTS_FILE)
+            model = cls(**architecture)
             model.load_state_dict(load_file(folder / WEIGHTS_FILE))
         except WeightsError:
             raise
@@ -270,27 +276,3 @@ class CompleteSplat(nn.Module):
                 f"{folder}: cannot be loaded: {reason[0] if reason else type(error).__name__}"
             ) from error
         return model.eval()
-
-
-def _build(config: Mapping[str, Any]) -> Any:
-    """Instantiate a part, from this package and diffusers only: a config that comes with weights is not trusted."""
-    from hydra.utils import instantiate
-
-    _check_targets(config)
-    return instantiate(dict(config), _convert_="all")
-
-
-def _check_targets(config: Any) -> None:
-    from hydra.utils import get_object
-
-    if isinstance(config, Mapping):
-        for key, value in config.items():
-            if key == "_target_":
-                # The path is checked before it is imported, and the object after: a path can lead out of a package.
-                trusted = str(value).startswith(TRUSTED_PACKAGES)
-                if not trusted or not f"{get_object(value).__module__}.".startswith(TRUSTED_PACKAGES):
-                    raise WeightsError(f"the configuration names {value}, which is no part of a model")
-            _check_targets(value)
-    elif isinstance(config, list | tuple):
-        for value in config:
-            _check_targets(value)

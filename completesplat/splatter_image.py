@@ -8,7 +8,7 @@ scale 3, rotation 4, colour 3. Gaussians are in the reference camera's frame, or
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from einops import rearrange
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.schema import Few, Range, Share
 from completesplat.tensors import TensorDataclass
 
 SH_C0 = 0.28209479177387814
@@ -71,6 +72,9 @@ LAYER_DEPTHS: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {
 }
 
 
+Length = Annotated[float, Range(1e-9, 1e9)]
+
+
 @dataclass(frozen=True)
 class Parameterization:
     """How raw values are read.
@@ -87,13 +91,13 @@ class Parameterization:
             (the paper does not state one; the clamp has no gradient outside, full gradient inside).
     """
 
-    layers: int = 2
-    layer_depths: str = "independent"
-    first_depth: float = 0.5
-    first_scale: float = 0.02
-    layer_step: float = 1.0
-    smallest_scale: float = 1e-4
-    largest_scale: float = 2.0
+    layers: Few = 2
+    layer_depths: Literal["independent", "incremental"] = "independent"
+    first_depth: Share = 0.5
+    first_scale: Length = 0.02
+    layer_step: Length = 1.0
+    smallest_scale: Length = 1e-4
+    largest_scale: Length = 2.0
 
     @property
     def channels(self) -> int:

@@ -1,11 +1,13 @@
-"""What pyproject.toml declares is what is imported, and nothing else."""
+"""What pyproject.toml declares is what is imported, and nothing else; licences of all of it, and its lock file."""
 
 import ast
 import re
 import sys
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from importlib.metadata import packages_distributions
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
 from pathlib import Path
 
 from packaging.requirements import Requirement
@@ -68,3 +70,93 @@ def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_import
     used |= set().union(*tests.values())
     assert developers <= used | NEVER_IMPORTED.keys()
     assert NEVER_IMPORTED.keys() <= (needed | optional | developers) - used
+
+
+# What an Apache-2.0 package may need to be installed.
+ALLOWED = {"0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0"}
+ALLOWED |= {"CNRI-Python", "ISC", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Zlib"}
+# Metadata that is older than SPDX's names.
+OLD_NAMES = {
+    "3-Clause BSD License": "BSD-3-Clause",
+    "Apache 2.0": "Apache-2.0",
+    "Apache 2.0 License": "Apache-2.0",
+    "Apache License, Version 2.0": "Apache-2.0",
+    "Apache Software License": "Apache-2.0",
+    "BSD": "BSD-3-Clause",
+    "BSD License": "BSD-3-Clause",
+    "MIT License": "MIT",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+}
+# Their metadata does not say. What it says is of the code: the program in imageio-ffmpeg's wheel, which is only run, is
+# ffmpeg under the GPL.
+READ_IN_THEIR_FILES = {"gsplat": "Apache-2.0"}
+# With its CUDA build, torch brings libraries of NVIDIA's, under NVIDIA's own terms; the CPU build has none.
+OF_ANOTHER_BUILD = ("nvidia-", "cuda-")
+
+
+def licences(name: str) -> set[str]:
+    """Those of an installed distribution, all of which must be allowed; by SPDX's names where they are known."""
+    metadata = distribution(name).metadata
+    given = metadata.get("License-Expression") or metadata.get("License") or "UNKNOWN"
+    if given == "UNKNOWN" or "\n" in given.strip() or len(given) > 100:  # the text of the licence
+        classifiers = metadata.get_all("Classifier") or []
+        given = " AND ".join(line.split(" :: ")[-1] for line in classifiers if line.startswith("License ::"))
+    given = given or READ_IN_THEIR_FILES.get(name, "UNKNOWN")
+    parts = (
+        re.split(r"\s+(?:AND|OR)\s+", given.replace("(", "").replace(")", "")) if given not in OLD_NAMES else [given]
+    )
+    return {OLD_NAMES.get(part.strip(), part.strip()) for part in parts}
+
+
+def tree(lines: Iterable[str]) -> set[str]:
+    """The distributions that are installed with these requirements, theirs included."""
+    found: set[tuple[str, str]] = set()
+    waiting = [Requirement(line) for line in lines]
+    while waiting:
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        for extra in {"", *requirement.extras} - {extra for known, extra in found if known == name}:
+            found.add((name, extra))
+            try:
+                needed = [Requirement(line) for line in distribution(name).requires or ()]
+            except PackageNotFoundError:  # of an extra that is not installed here
+                continue
+            waiting += [one for one in needed if one.marker is None or one.marker.evaluate({"extra": extra})]
+    return {name for name, _ in found}
+
+
+def refused_licences(names: Iterable[str]) -> dict[str, set[str]]:
+    found = {}
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found[name] = licences(name) - ALLOWED
+    return {name: others for name, others in found.items() if others}
+
+
+def test_everything_that_the_wheel_brings_has_a_licence_that_goes_with_its_own() -> None:
+    lines = [line for name, extra in EXTRAS.items() if name != "dev" for line in extra]
+    needed = tree([*PROJECT["dependencies"], *lines])
+    assert len(needed) > 50
+    assert {"torch", "numpy", "urllib3"} <= needed  # the last one by others only
+    assert refused_licences(name for name in needed if not name.startswith(OF_ANOTHER_BUILD)) == {}
+    # The rule notices.
+    assert "plyfile" not in needed
+    assert refused_licences(["plyfile"]).keys() == {"plyfile"}
+
+
+def test_the_lock_file_pins_what_is_declared_with_hashes_and_names_no_place() -> None:
+    text = (ROOT / "requirements.lock").read_text()
+    pinned = re.findall(r"^([a-z0-9-]+)==([^ ;\\]+)(?: ;.*)? \\\n    --hash=sha256:[0-9a-f]{64}", text, re.MULTILINE)
+    others = {line for line in text.splitlines() if line.startswith("-") or "==" in line.partition(";")[0]}
+    assert len(others) == len(pinned)
+    assert not re.search(r"index|find-links|://|/", text)
+    versions: dict[str, set[str]] = defaultdict(set)
+    for name, version in pinned:
+        versions[name].add(version)
+    assert "torch" not in versions
+    for requirement in map(Requirement, [*PROJECT["dependencies"], *EXTRAS["dev"]]):
+        if requirement.name != "torch":
+            found = versions[canonicalize_name(requirement.name)]
+            assert found, requirement.name
+            assert all(requirement.specifier.contains(version) for version in found), requirement.name

@@ -1,7 +1,7 @@
 """Stable Diffusion's VAE encoder, unchanged, which also hands out its features before each downsampling."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from diffusers.models.autoencoders import vae
@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from completesplat.autoreconstructor.posterior import Posterior, from_moments
+from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Posterior, from_moments
+from completesplat.schema import Few, Range, Width, Widths
 
 
 def recompute(block: nn.Module, *inputs: Any) -> Any:
@@ -52,12 +53,12 @@ class Encoder(nn.Module):
 
     def __init__(
         self,
-        channels: Sequence[int] = (128, 256, 512, 512),
-        layers_per_block: int = 2,
-        latent_channels: int = 4,
-        norm_groups: int = 32,
-        in_channels: int = 3,
-        first_log_variance: float = 0.0,
+        channels: Widths = (128, 256, 512, 512),
+        layers_per_block: Few = 2,
+        latent_channels: Width = 4,
+        norm_groups: Width = 32,
+        in_channels: Width = 3,
+        first_log_variance: Annotated[float, Range(*LOG_VARIANCE_RANGE)] = 0.0,
     ) -> None:
         super().__init__()
         self.network = vae_encoder(in_channels, 2 * latent_channels, channels, layers_per_block, norm_groups)

@@ -11,6 +11,7 @@ from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.scene import Views
+from completesplat.schema import Share
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import TensorDataclass
 
@@ -47,7 +48,7 @@ class VariationalAutoReconstructor(nn.Module):
         self,
         encoder: Encoder,
         reconstructor: Reconstructor,
-        skip_dropout: float = 0.5,
+        skip_dropout: Share = 0.5,
         variational: bool = True,
         pretrained: str | None = None,
         gradient_checkpointing: bool = False,

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
+from completesplat.schema import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
 
 
@@ -31,11 +32,11 @@ class Reconstructor(nn.Module):
     def __init__(
         self,
         parameterization: Parameterization,
-        channels: Sequence[int] = (128, 256, 512, 512),
-        layers_per_block: int = 2,
-        latent_channels: int = 4,
-        norm_groups: int = 32,
-        skip_levels: Sequence[int] = (0,),
+        channels: Widths = (128, 256, 512, 512),
+        layers_per_block: Few = 2,
+        latent_channels: Width = 4,
+        norm_groups: Width = 32,
+        skip_levels: Levels = (0,),
     ) -> None:
         super().__init__()
         self.parameterization = parameterization

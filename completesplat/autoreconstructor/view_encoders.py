@@ -6,7 +6,7 @@ paper's posterior. Skips always come from the reference picture. Other works tha
 from: LN3Diff and GaussianAnything (6 and 8 views with Pluecker rays), TRELLIS (features of many renders).
 """
 
-from collections.abc import Sequence
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import vae_encoder
 from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, rays_through
 from completesplat.scene import Views
+from completesplat.schema import Few, Range, Width, Widths
 
 
 class PlaneSweep(nn.Module):
@@ -32,11 +33,11 @@ class PlaneSweep(nn.Module):
 
     def __init__(
         self,
-        planes: int = 12,
-        channels: Sequence[int] = (128, 256, 512, 512),
-        layers_per_block: int = 2,
-        latent_channels: int = 4,
-        norm_groups: int = 32,
+        planes: Annotated[int, Range(1, 256)] = 12,
+        channels: Widths = (128, 256, 512, 512),
+        layers_per_block: Few = 2,
+        latent_channels: Width = 4,
+        norm_groups: Width = 32,
     ) -> None:
         super().__init__()
         self.planes = planes
@@ -101,13 +102,13 @@ class CrossAttention(nn.Module):
 
     def __init__(
         self,
-        width: int = 256,
-        blocks: int = 4,
-        heads: int = 8,
-        channels: Sequence[int] = (128, 256, 512, 512),
-        layers_per_block: int = 2,
-        latent_channels: int = 4,
-        norm_groups: int = 32,
+        width: Width = 256,
+        blocks: Annotated[int, Range(1, 64)] = 4,
+        heads: Width = 8,
+        channels: Widths = (128, 256, 512, 512),
+        layers_per_block: Few = 2,
+        latent_channels: Width = 4,
+        norm_groups: Width = 32,
     ) -> None:
         super().__init__()
         self.network = vae_encoder(9, width, channels, layers_per_block, norm_groups)

@@ -15,13 +15,13 @@ from rich.console import Console
 
 from completesplat.benchmarks.printing import print_results
 from completesplat.benchmarks.reading import MakeData, chunks, decoding_share, opening_figures, rows
-from completesplat.commands.schema import Filled, Natural, OneOf, Positive, Range
 from completesplat.data.packed.rows import CODECS
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.errors import DataError
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, Table, table
+from completesplat.schema import Filled, Natural, OneOf, Positive, Range
 
 
 class Opening(TypedDict):

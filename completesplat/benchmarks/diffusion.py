@@ -21,7 +21,6 @@ from torch.optim import Optimizer
 
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands import quieten
-from completesplat.commands.schema import Positive, Range
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
@@ -31,6 +30,7 @@ from completesplat.generation import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
+from completesplat.schema import Positive, Range
 from completesplat.training.encoding import encode_training_set
 from completesplat.training.scene_module import SceneModule
 

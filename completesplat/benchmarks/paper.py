@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from completesplat.benchmarks.diffusion import WARM_UP, Training, autocast, milliseconds
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands import quieten
-from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -27,6 +26,7 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.scene import SceneBatch
+from completesplat.schema import Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.scene_module import SceneModule

@@ -27,13 +27,13 @@ from completesplat.benchmarks.workloads import (
     splatter_scene,
 )
 from completesplat.commands import quieten
-from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
+from completesplat.schema import Positive
 
 logger = logging.getLogger(__name__)
 

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from completesplat.commands import jobs
+from completesplat.commands.jobs import conf_folder
 from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
 
@@ -70,12 +71,6 @@ def launch(verb: str, arguments: list[str]) -> None:
         raise failures[0]
 
 
-def conf_folder() -> Path:
-    """The configuration tree: inside an installed package, or beside it in the repository."""
-    package = Path(__file__).parents[1]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
-
-
 def best_precision() -> str:
     """Lightning's precision for networks: bfloat16 where the processor computes in it, else float32."""
     import torch
@@ -98,11 +93,8 @@ def quieten() -> None:
 
 def refusal(error: BaseException) -> str | None:
     """One line for an error that the user can put right; None for a fault of the program."""
-    chain: BaseException | None = error
-    while chain is not None:
-        if isinstance(chain, CompleteSplatError):
-            return " ".join(str(chain).split())
-        chain = chain.__cause__
+    if (own := _own_error(error)) is not None:
+        return " ".join(str(own).split())
     if isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
         named = str(error).partition("Missing mandatory value: ")[2].split()  # omegaconf keeps it nowhere else
         key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
@@ -110,6 +102,19 @@ def refusal(error: BaseException) -> str | None:
     if isinstance(error, HydraException | OmegaConfBaseException) and not isinstance(error, InstantiationException):
         return " ".join(str(error).split())
     return None
+
+
+def exit_status(error: BaseException) -> int:
+    """Of an error that `refusal` has a line for."""
+    own = _own_error(error)
+    return 2 if own is None else own.exit_status
+
+
+def _own_error(error: BaseException) -> CompleteSplatError | None:
+    chain: BaseException | None = error
+    while chain is not None and not isinstance(chain, CompleteSplatError):
+        chain = chain.__cause__
+    return chain
 
 
 # What `conf/` interpolates besides hydra's own; here, because jobs that a cluster starts elsewhere import this alone.

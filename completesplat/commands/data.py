@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from completesplat.commands.schema import Positive
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
+from completesplat.schema import Positive
 
 logger = logging.getLogger(__name__)
 MOST_SHOWN = 8
@@ -82,6 +82,7 @@ def prepare(
 def latents(
     ckpt: str | Path,
     overrides: Sequence[str],
+    trust: bool,
     conditioning: Any,
     out: Path,
     frames: Positive | None,
@@ -98,7 +99,7 @@ def latents(
     from completesplat.training.checkpoints import load_part
     from completesplat.training.encoding import encode_training_set
 
-    run_config = config_of_run(Path(ckpt), list(overrides))
+    run_config = config_of_run(Path(ckpt), list(overrides), trust)
     autoreconstructor = instantiate(run_config.model.get("model"), _convert_="all")
     if not isinstance(autoreconstructor, VariationalAutoReconstructor):
         raise WeightsError(f"{ckpt}: not of stage 1, which trains an autoreconstructor (model=var)")

@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat import __version__
-from completesplat.commands import conf_folder
+from completesplat.commands.jobs import conf_folder
 from completesplat.commands.protocol import write_json
 
 ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")

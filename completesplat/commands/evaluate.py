@@ -15,13 +15,13 @@ from rich.progress import track
 from completesplat.commands import quieten
 from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.protocol import drawing, protocol, provenance, write_json
-from completesplat.commands.schema import Natural, Positive, Range
 from completesplat.commands.trained import Trained
 from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.packed.manifest import is_packed
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_modes, log_test
+from completesplat.results.wandb import begin, log_modes, log_scores, log_shown
+from completesplat.schema import Natural, Positive, Range
 from completesplat.training.loggers import finished
 
 
@@ -96,8 +96,9 @@ def run(
         if not testing.is_global_zero:
             return
         described = protocol(evaluation, module, data, results) | tested.facts()
+        log_scores(results, testing)
         write_json(out / METRICS, {"protocol": described} | results)
-        log_test(results, shown, testing, out)
+        log_shown(results, shown, testing, out)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from completesplat.commands.protocol import checkpoint_facts, protocol, write_js
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.results.tables import Table, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_test
+from completesplat.results.wandb import begin, log_scores, log_shown
+from completesplat.training.checkpoints import check_whole, newest_whole
 from completesplat.training.loggers import finished
 
 logger = logging.getLogger(__name__)
@@ -76,15 +78,16 @@ def run(config: Any, out: Path) -> None:
         scores = module.test_results() if tested is not None else None
         if not trainer.is_global_zero:
             return
-        results = {"steps": trainer.global_step, "epochs": trainer.current_epoch, "data.batch_per_process": share}
+        results = {"steps": trainer.global_step, "epochs": _epochs(trainer), "data.batch_per_process": share}
         results |= metrics
         if scores is not None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-        write_json(out / METRICS, results, allow_nan=True)  # the last file, because it means that the job is done
+            log_scores(scores, trainer)
+        write_json(out / METRICS, results)  # the last file, because it means that the job is done
         if scores is not None:
-            log_test(scores, shown, trainer, out)
+            log_shown(scores, shown, trainer, out)
 
 
 def _parts(config: Any) -> list[Any]:
@@ -93,19 +96,22 @@ def _parts(config: Any) -> list[Any]:
 
 
 def checkpoint_to_continue(config: Any, out: Path) -> str | None:
-    """The checkpoint that the run starts from, if any; `WeightsError` if one that is named does not exist.
+    """The checkpoint that the run starts from, if any; `WeightsError` if one that is named is missing or damaged.
 
     The other weights that the configuration names are not needed then.
     """
-    path: str | None = str(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
-    if path is None or not Path(path).is_file():
-        if config.ckpt_path in (None, "last"):
-            return None
+    last = config.ckpt_path == "last"
+    path = newest_whole(out / LAST) if last else None if config.ckpt_path is None else Path(config.ckpt_path)
+    if path is None:
+        return None
+    if not path.is_file():
         raise WeightsError(f"{path}: no such checkpoint")
+    if not last:
+        check_whole(path)
     for part in (config.autoreconstructor, config.conditioning, config.model):
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None
-    return path
+    return str(path)
 
 
 def refuse_missing(config: Any) -> None:
@@ -125,6 +131,14 @@ def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict
     except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
         raise KeyboardInterrupt from stop
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
+
+
+def _epochs(trainer: Any) -> int:
+    """How many were begun. (`current_epoch` counts the last one in the process alone that came to its end.)"""
+    if not trainer.global_step:
+        return 0
+    steps_of_one = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+    return int(-(-trainer.global_step // steps_of_one))
 
 
 def _test(config: Any, module: Any, data: Any) -> dict[str, float]:

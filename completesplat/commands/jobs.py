@@ -20,14 +20,20 @@ from omegaconf import OmegaConf
 from completesplat import __version__
 from completesplat.atomic import atomic_path
 from completesplat.commands.protocol import git_commit, write_json
-from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import check_settings
 
 LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 PROCESS_OF_JOB = "--process-of"
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
+
+
+def conf_folder() -> Path:
+    """The configuration tree: inside an installed package, or beside it in the repository."""
+    package = Path(__file__).parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def one_of_several() -> bool:

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,11 +13,11 @@ from typing import Annotated, Any, TypedDict
 from hydra.utils import instantiate
 from jaxtyping import Float
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from torch import Tensor
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.commands.schema import Positive, Range, Share, check_settings
 from completesplat.commands.trained import open_generator
 from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
@@ -26,7 +27,9 @@ from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
+from completesplat.names import folder_names, printable, safe_name
 from completesplat.rasterizers import Rasterizer
+from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
@@ -36,14 +39,16 @@ log = logging.getLogger(__name__)
 
 
 class PredictNumbers(TypedDict):
-    """The settings that are numbers."""
+    """The settings that are numbers. All samples of a picture, and all frames of a video, are in memory at once."""
 
-    samples: Positive
+    samples: Annotated[int, Range(1, 1000)]
     skip_weight: Share | None
     guidance_weight: Share
     steps: Annotated[int, Range(1, 1000)] | None
+    seed: Annotated[int, Range(0, 2**63 - 1)]
     batch: Positive | None
-    frames: Positive
+    fov: float | None
+    frames: Annotated[int, Range(1, 1000)]
     background: Share
 
 
@@ -66,19 +71,30 @@ def find_pictures(image: Any) -> list[Path]:
     Files that are named themselves are taken as they are, missing ones too: reading them says what is wrong.
 
     Raises:
-        CompleteSplatError: a folder without a picture, or an empty list.
+        CompleteSplatError: a folder without a picture or one that cannot be read, an empty list, or no name.
     """
-    found: list[Path] = []
-    for path in map(Path, [image] if isinstance(image, str) else map(str, image)):
-        pictures = [path]
-        if path.is_dir():
-            pictures = sorted(one for one in path.iterdir() if one.is_file() and one.suffix.lower() in SUFFIXES)
-        if not pictures:
-            raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
-        found += pictures
-    if not found:
+    given = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
+    if not given:
         raise CompleteSplatError("image=[]: name at least one picture")
+    found: list[Path] = []
+    for one in given:
+        if one == "" or isinstance(one, bool) or not isinstance(one, str | int):
+            raise CompleteSplatError(f"image={image}: give a picture, a folder, or a list of them")
+        found += _pictures_of(Path(str(one)))
     return found
+
+
+def _pictures_of(path: Path) -> list[Path]:
+    # The methods of `Path` raise where a name is too long.
+    if not os.path.isdir(path):
+        return [path]
+    try:
+        pictures = sorted(one for one in path.iterdir() if os.path.isfile(one) and one.suffix.lower() in SUFFIXES)
+    except OSError as error:
+        raise CompleteSplatError(f"{path}: {error.strerror}") from error
+    if not pictures:
+        raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
+    return pictures
 
 
 def wanted_files(config: Any) -> Wanted:
@@ -112,31 +128,42 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
 def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
-    `CompleteSplatError`: the only picture failed, or some of several, which it names.
+    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others.
     """
     console, failed = Console(), []
     rasterizer = instantiate(config.rasterizer, _convert_="all")
+    folders = folder_names(picture.stem for picture in pictures)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=len(pictures) * config.samples)
-        for index, (picture, name) in enumerate(zip(pictures, folder_names(pictures), strict=True)):
-            bar.update(task, description=picture.name, completed=index * config.samples)
+        for index, (picture, folder) in enumerate(zip(pictures, folders, strict=True)):
+            name = printable(picture.name)
+            bar.update(task, description=escape(name), completed=index * config.samples)
             start = time.perf_counter()
             try:
-                _predict(config, model, rasterizer, wanted, picture, out / name, lambda: bar.advance(task))
-            except (CompleteSplatError, OSError) as error:
-                message = " ".join(str(error).split())
-                message = message if picture.name in message else f"{picture}: {message}"
-                if len(pictures) == 1:
+                _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
+            except Exception as error:
+                message, expected = _told(error, picture), isinstance(error, CompleteSplatError | OSError)
+                if len(pictures) == 1 and expected:
                     raise CompleteSplatError(message) from error
-                failed.append(picture.name)
+                if len(pictures) == 1:
+                    raise
+                if not expected:
+                    log.error("a fault of the program, not of the picture", exc_info=error)
+                failed.append(name)
                 print(f"error: {message}", file=sys.stderr, flush=True)
                 continue
             if not console.is_terminal:
                 took = f"{time.perf_counter() - start:.0f} s"
-                print(f"{index + 1}/{len(pictures)} {picture.name}: {out / name} ({took})", flush=True)
+                print(f"{index + 1}/{len(pictures)} {name}: {out / folder} ({took})", flush=True)
     if failed:
         share = f"{len(failed)} of {len(pictures)} pictures failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
+
+
+def _told(error: Exception, picture: Path) -> str:
+    """What went wrong with a picture, in one line that names it."""
+    message = " ".join(str(error).split()) or type(error).__name__
+    return printable(message if picture.name in message else f"{picture}: {message}")
 
 
 def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
@@ -156,31 +183,15 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
     scene = model.reconstruct(views)
     recorded = {
         "seed": config.seed,
-        "image": pictures[0].name,
-        "images": [picture.name for picture in pictures],
-        "cameras": Path(config.cameras).name,
+        "image": printable(pictures[0].name),
+        "images": [printable(picture.name) for picture in pictures],
+        "cameras": printable(Path(config.cameras).name),
         "screen_space_dilation": config.screen_space_dilation,
         "depth_range": model.depth_range.tolist(),
     }
-    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / pictures[0].stem
+    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(pictures[0].stem)
     write_prediction(folder, views.images[0], [scene], views.cameras[0], rasterizer, model.up, wanted, recorded)
     print(f"one scene of {len(pictures)} pictures, at the posterior's mean: {folder}")
-
-
-def folder_names(pictures: Sequence[Path]) -> list[str]:
-    """A name for each picture's folder: its stem, and for a stem that is taken `_2`, `_3` and so on behind it.
-
-    Capitals do not tell names apart, because they do not on every file system.
-    """
-    names: list[str] = []
-    taken: set[str] = set()
-    for picture in pictures:
-        name, number = picture.stem, 2
-        while name.casefold() in taken:
-            name, number = f"{picture.stem}_{number}", number + 1
-        taken.add(name.casefold())
-        names.append(name)
-    return names
 
 
 def _predict(
@@ -194,7 +205,7 @@ def _predict(
 ) -> None:
     photograph = model.read(image, config.fov)
     if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
-        log.warning("%s: %s", image.name, warning)
+        log.warning("%s: %s", printable(image.name), warning)
     visible = visible_part(config, image, model.image_size)
     settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
     settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
@@ -203,9 +214,9 @@ def _predict(
     recorded = {
         **settings,
         "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
-        "image": image.name,
+        "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
-        "mask": None if config.mask is None else Path(config.mask).name,
+        "mask": None if config.mask is None else printable(Path(config.mask).name),
         "box": None if config.box is None else list(config.box),
         "fov_degrees": photograph.fov_degrees,
         "fov_source": photograph.fov_source,

@@ -1,6 +1,7 @@
 """The statement of what was measured and how, which stands beside all figures of a test."""
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -13,9 +14,26 @@ from completesplat.results.machine import machine
 from completesplat.weights import sha256_of
 
 
-def write_json(path: Path, content: Mapping[str, Any], allow_nan: bool = False) -> None:
-    """Write results in one step, so that a file that is there is whole."""
-    write_text(path, json.dumps(content, indent=2, allow_nan=allow_nan) + "\n")
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write results in one step, so that a file that is there is whole.
+
+    JSON has no NaN and no infinities: they become null, and an entry `not_finite` lists what they were.
+    """
+    found: list[str] = []
+    kept = {key: _finite(value, key, found) for key, value in content.items()}
+    kept |= {"not_finite": found} if found else {}
+    write_text(path, json.dumps(kept, indent=2, allow_nan=False) + "\n")
+
+
+def _finite(value: Any, place: str, found: list[str]) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(part, f"{place}.{key}", found) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part, f"{place}.{index}", found) for index, part in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        found.append(f"{place}: {value}")
+        return None
+    return value
 
 
 def git_commit() -> str | None:

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, TypedDict
 
 from completesplat.atomic import atomic_path
-from completesplat.commands.schema import Positive, Range
 from completesplat.results.html_page import page
 from completesplat.results.published import tables as published_tables
 from completesplat.results.runs import find, origin
 from completesplat.results.tables import show, write_tables
+from completesplat.schema import Positive, Range
 
 logger = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
-from completesplat.commands.schema import Filled, Positive, Range
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, Column, table
 from completesplat.scene import SceneBatch
+from completesplat.schema import Filled, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import masked as masked_study
@@ -35,6 +35,7 @@ class Run(TypedDict):
 
     ckpt: str
     overrides: Sequence[str]
+    trust: bool
     seed: int
     scenes: Positive
     samples: Annotated[int, Range(2)]
@@ -135,14 +136,19 @@ def depth(
 
 
 def views(
-    ckpt: str, overrides: Sequence[str], scenes: Positive, counts: Annotated[Sequence[Positive], Filled()], out: Path
+    ckpt: str,
+    overrides: Sequence[str],
+    trust: bool,
+    scenes: Positive,
+    counts: Annotated[Sequence[Positive], Filled()],
+    out: Path,
 ) -> None:
     """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings.
 
     Refused as by `Trained.open`, `first_scenes` and `views.rows`.
     """
     quieten()
-    module, data = Trained(ckpt, overrides).open()
+    module, data = Trained(ckpt, overrides, trust).open()
     module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
     with _status() as tick:
         rows = views_study.rows(module, counts, [scene.to(module.device) for scene in first_scenes(data, scenes)], tick)
@@ -157,7 +163,7 @@ def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
     Refused as by `Trained.open`, `diffusion_of` and `first_scenes`.
     """
     quieten()
-    module, data = Trained(run["ckpt"], run["overrides"]).open()
+    module, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
     model = diffusion_of(module)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     scenes = [scene.to(device) for scene in first_scenes(data, run["scenes"])]

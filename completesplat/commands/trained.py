@@ -1,17 +1,23 @@
 """Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
 
-import json
-from collections.abc import Mapping, Sequence
+import os
+import re
+import sysconfig
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
+from completesplat.commands.jobs import conf_folder
 from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
+from completesplat.parts import read_architecture
+from completesplat.schema import shown
+from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -22,17 +28,25 @@ ONLY_FOR_TRAINING = (
     "model.completesplat.conditioning.pretrained",
     "model.loss.terms.lpips",
 )
+# What a run is read for, and the groups of `conf/` that these are composed of.
+OF_A_RUN = ["model", "data"]
+GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
+GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
+TARGET = re.compile(r"_target_: *([\w.]+)")
+OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 
 
 @dataclass(frozen=True)
 class Trained:
     """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`.
+    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`. What the run
+    may name, and when it has to be trusted: `config_of_run`.
     """
 
     ckpt: str | None
     overrides: Sequence[str] = ()
+    trust: bool = False
     weights: str | None = None
     data: Mapping[str, Any] | None = None
     rasterizer: Mapping[str, Any] | None = None
@@ -43,7 +57,7 @@ class Trained:
         """The configuration of model and data.
 
         Raises:
-            WeightsError: the checkpoint, its run's configuration or the weights are missing.
+            WeightsError: the checkpoint, its run's configuration or the weights are missing or not trusted.
             CompleteSplatError: neither is given, or both, or weights without data.
         """
         if (self.ckpt is None) == (self.weights is None):
@@ -51,7 +65,7 @@ class Trained:
         if self.ckpt is not None and self.data is not None:
             raise CompleteSplatError("a checkpoint's data are its run's: change them by overrides=['data.root=DIR']")
         if self.ckpt is not None:
-            return config_of_run(Path(self.ckpt), list(self.overrides))
+            return config_of_run(Path(self.ckpt), list(self.overrides), self.trust)
         if self.data is None:
             raise CompleteSplatError("weights know no data: give data=NAME data.root=DIR")
         return self._config_of_weights(str(self.weights))
@@ -98,17 +112,25 @@ class Trained:
             "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
-        found.data.image_size = json.loads((folder / CONFIG_FILE).read_text())["image_size"]
+        found.data.image_size = read_architecture(folder)["image_size"]
         return found
 
 
 def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given; errors are `from_pretrained`'s."""
+    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given.
+
+    `WeightsError`: as `from_pretrained`, or weights that are not finite.
+    """
     from completesplat.generation import CompleteSplat
 
     if config.weights in in_the_box():
         print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
     model = CompleteSplat.from_pretrained(config.weights)
+    broken = [name for name, values in model.state_dict().items() if not values.isfinite().all()]
+    if broken:
+        raise WeightsError(
+            f"{config.weights}: weights that are not finite in {len(broken)} tensors, such as {broken[0]}"
+        )
     if config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)
         model.replace_sampler(sampler)
@@ -124,14 +146,22 @@ def diffusion_of(module: Any) -> Any:
     return module.completesplat
 
 
-def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
-    """The configuration saved beside a checkpoint's folder, with changes; `WeightsError` if one of both is missing."""
+def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
+    """Model and data in the configuration saved beside a checkpoint's folder, with changes.
+
+    The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
+    run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
+    user's own, too; the changes may name anything.
+
+    Raises:
+        WeightsError: one of both is missing or not readable, or the configuration names something else.
+    """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    config = OmegaConf.merge(OmegaConf.load(path), OmegaConf.from_dotlist(overrides))
+    config = OmegaConf.merge(_read_config(path, trust), OmegaConf.from_dotlist(overrides))
     # The weights come from this checkpoint.
     for key in ONLY_FOR_TRAINING:
         parent, _, name = key.rpartition(".")
@@ -141,3 +171,71 @@ def config_of_run(checkpoint: Path, overrides: list[str]) -> Any:
     if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
         config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
     return config
+
+
+def _read_config(path: Path, trust: bool) -> Any:
+    try:
+        written: Any = OmegaConf.create(read_small(path))
+        config = OmegaConf.masked_copy(written, OF_A_RUN)
+    except Exception as error:  # of YAML and of OmegaConf
+        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
+    if any(config.get(part) is None for part in OF_A_RUN):
+        raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(OF_A_RUN)}")
+    files = [file for group in GROUPS for file in (conf_folder() / group).glob("*.yaml")]
+    known = {name for file in files for name in TARGET.findall(file.read_text())}
+    for name, value in _strings(OmegaConf.to_container(config, resolve=False)):
+        # `fit` writes what it has resolved; a resolver can read the environment and more.
+        if "${" in value:
+            raise WeightsError(f"{path}: {shown(value)} refers to something else, which a run's configuration does not")
+        if name != "_target_" or value in known or OPTIMIZER.fullmatch(value):
+            continue
+        said = f"{path} names {shown(value)}, which is no part of models or data in this package"
+        if not trust and not _belongs_to_user(path):
+            raise WeightsError(f"{said}; if it is a module of your own, and you trust who made the run: trust=true")
+        if not _is_own(value):
+            raise WeightsError(f"{said}, and not defined in a module of your own (SECURITY.md)")
+    return config
+
+
+def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
+    """All keys and values, as text, with the name of the setting that they are of."""
+    if isinstance(config, Mapping):
+        for key, value in config.items():
+            yield name, str(key)
+            yield from _strings(value, key)
+    elif isinstance(config, list):
+        for value in config:
+            yield from _strings(value, name)
+    else:
+        yield name, str(config)
+
+
+def _belongs_to_user(config: Path) -> bool:
+    """Whether a run lies below the working folder and is the user's, who has then made or brought it there."""
+    run = config.resolve().parent
+    return run.is_relative_to(Path.cwd()) and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
+
+
+def _is_own(target: str) -> bool:
+    """Whether something is defined in a module that is neither this package's nor of Python's installation."""
+    top = target.partition(".")[0]
+    try:
+        spec = find_spec(top)  # of a name without a dot: nothing is imported
+    except (ImportError, ValueError):
+        return False
+    if spec is None or top == "completesplat":
+        return False
+    places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
+    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
+        return False
+    try:
+        found = get_object(target)
+    except (ImportError, ValueError) as error:
+        raise WeightsError(f"{target}: cannot be imported ({error})") from error
+    # A module of the user's own leads to others, by the names that it imports.
+    return str(getattr(found, "__module__", None)).partition(".")[0] == top
+
+
+def _is_installed(path: Path) -> bool:
+    libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)

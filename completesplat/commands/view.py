@@ -6,8 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypedDict
 
-from completesplat.commands.schema import Range, Share, check_settings
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.names import printable
+from completesplat.schema import Range, Share, check_settings
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
 EXPORT = "--export"
@@ -58,7 +59,7 @@ def run(config: Any, out: Path) -> None:
     try:
         if config.export is not None:
             return export(page, Path(config.export))
-        print(f"http://{page.server.get_host()}:{page.server.get_port()} (Ctrl-C ends it)", flush=True)
+        print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(3600)
     except KeyboardInterrupt:
@@ -115,7 +116,7 @@ def make_page(config: Any, out: Path) -> Any:
         steps = model.sampler.steps if config.steps is None else config.steps
         completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
         if photograph is not None:
-            completion.load(Path(config.image).name, photograph)
+            completion.load(printable(Path(config.image).name), photograph)
         return page
     except BaseException:
         stop_server(server)

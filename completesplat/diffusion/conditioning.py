@@ -3,8 +3,6 @@
 `frozen` says whether an encoder stays as it is in training, so that its features may be computed once and kept.
 """
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -12,6 +10,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
 from completesplat.autoreconstructor.pretrained import load_pretrained_encoder
 from completesplat.errors import WeightsError
+from completesplat.schema import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
 """Of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
@@ -38,10 +37,10 @@ class LearnedConditioning(nn.Module):
 
     def __init__(
         self,
-        out_channels: int = 16,
-        channels: Sequence[int] = (8, 16, 32, 64),
-        layers_per_block: int = 1,
-        norm_groups: int = 8,
+        out_channels: Width = 16,
+        channels: Widths = (8, 16, 32, 64),
+        layers_per_block: Few = 1,
+        norm_groups: Width = 8,
     ) -> None:
         super().__init__()
         self.out_channels = out_channels
@@ -72,10 +71,10 @@ class StableDiffusionConditioning(nn.Module):
     def __init__(
         self,
         pretrained: str | None = None,
-        out_channels: int = 4,
-        channels: Sequence[int] = (128, 256, 512, 512),
-        layers_per_block: int = 2,
-        norm_groups: int = 32,
+        out_channels: Width = 4,
+        channels: Widths = (128, 256, 512, 512),
+        layers_per_block: Few = 2,
+        norm_groups: Width = 32,
     ) -> None:
         super().__init__()
         self.pretrained = pretrained

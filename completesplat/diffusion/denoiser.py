@@ -1,7 +1,6 @@
 """Denoisers eps_theta(h_t, phi_ref, t): Stable Diffusion's UNet on [conditioning, noisy latent]."""
 
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import torch
 from diffusers import UNet2DConditionModel, UNet2DModel
@@ -9,6 +8,19 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from completesplat.diffusion.guidance import Features, Latents
+from completesplat.schema import Few, Levels, Width, Widths
+
+
+class Sizes(TypedDict, total=False):
+    """Sizes that both denoisers have, and whether they save memory; `TextlessStableDiffusion` explains each."""
+
+    latent_channels: Width
+    conditioning_channels: Width
+    channels: Widths
+    attention_levels: Levels
+    layers_per_block: Few
+    norm_groups: Width
+    gradient_checkpointing: bool
 
 
 class _UNet(nn.Module):
@@ -26,8 +38,8 @@ class _UNet(nn.Module):
         attention_settings: dict[str, Any],
         latent_channels: int = 4,
         conditioning_channels: int = 4,
-        channels: Sequence[int] = (320, 640, 1280, 1280),
-        attention_levels: Sequence[int] = (0, 1, 2),
+        channels: Widths = (320, 640, 1280, 1280),
+        attention_levels: Levels = (0, 1, 2),
         layers_per_block: int = 2,
         norm_groups: int = 32,
         gradient_checkpointing: bool = False,
@@ -80,7 +92,7 @@ class TextlessStableDiffusion(_UNet):
 
     context: Tensor
 
-    def __init__(self, heads: int = 8, context_channels: int = 768, **sizes: Any) -> None:
+    def __init__(self, heads: Width = 8, context_channels: Width = 768, **sizes: Unpack[Sizes]) -> None:
         attention = {"attention_head_dim": heads, "cross_attention_dim": context_channels}
         super().__init__(UNet2DConditionModel, "CrossAttn", attention, **sizes)
         self.register_buffer("context", torch.zeros(1, 1, context_channels), persistent=False)
@@ -101,5 +113,5 @@ class Denoiser(_UNet):
         **sizes: the others of `TextlessStableDiffusion`.
     """
 
-    def __init__(self, head_channels: int = 40, **sizes: Any) -> None:
+    def __init__(self, head_channels: Width = 40, **sizes: Unpack[Sizes]) -> None:
         super().__init__(UNet2DModel, "Attn", {"attention_head_dim": head_channels}, **sizes)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import Range
 
 OnStep = Callable[[int, int, Tensor], None]
 """(number of the denoiser call, timestep, estimate of the clean latent)."""
@@ -41,7 +42,7 @@ class Sampler:
         CompleteSplatError: `ancestral` for diffusion.
     """
 
-    def __init__(self, scheduler: Any, steps: int = 50, ancestral: bool = False) -> None:
+    def __init__(self, scheduler: Any, steps: Annotated[int, Range(1, 10_000)] = 50, ancestral: bool = False) -> None:
         if ancestral and not is_flow(scheduler):
             raise CompleteSplatError("sampler.ancestral: for flow matching (sampler=flow25, flow50_ancestral) only")
         self.scheduler = scheduler

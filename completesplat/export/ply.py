@@ -1,10 +1,7 @@
 """Gaussians as a `.ply` file in the layout of the original 3D Gaussian Splatting code."""
 
-import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -16,15 +13,9 @@ from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.ply_files import header, read_vertices
 from completesplat.splatter_image import SH_C0
 
-LONGEST_HEADER, LONGEST_COUNT = 1 << 16, 15  # bytes, digits
-HEADER = re.compile(rb"ply\s*\n(.*?)(?<=\n)end_header[ \t\r]*\n", re.DOTALL)
-TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
-    "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 SMALLEST_ALPHA = 1e-6
 AXES_COMMENT = "coordinates as given, none turned; camera frames have +x right, +y down, +z forward (OpenCV)"
 MEANS, NORMALS, COLORS = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -48,7 +39,7 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
     """
     table = _table(cleaned(gaussians, path))
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(table), comments))
+        file.write(header(len(table), [(name, "float") for name in WRITTEN], (AXES_COMMENT, *comments)))
         file.write(table.numpy().astype("<f4").tobytes())
     return len(table)
 
@@ -64,79 +55,20 @@ def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
     return torch.cat(rows, dim=-1).float()
 
 
-def _header(count: int, comments: Sequence[str]) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0"]
-    # A line break inside a comment would start a header line of its own.
-    lines += [f"comment {' '.join(comment.split())}" for comment in (AXES_COMMENT, *comments)]
-    lines += [f"element vertex {count}", *(f"property float {name}" for name in WRITTEN), "end_header", ""]
-    return "\n".join(lines).encode("ascii", "backslashreplace")
-
-
 def read_ply(path: str | Path) -> Gaussians:
-    """Read a binary little-endian 3DGS `.ply`, of this project or another.
+    """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
     Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
-    become 0, as in the renderers of such files. `PlyError`: no such file, another format or size than the header
-    declares, or values that are not finite.
+    become 0, as in the renderers of such files. `PlyError`: as `read_vertices`, or values that are not finite.
     """
     try:
-        if not Path(path).is_file():
-            raise PlyError("no such file")
-        with Path(path).open("rb") as file:
-            gaussians = _gaussians(_vertices(file))
-    except OSError as error:
-        raise PlyError(f"{path}: {error.strerror or error}") from error
+        gaussians = _gaussians(read_vertices(path, REQUIRED))
     except PlyError as error:
-        raise PlyError(f"{path}: {error}") from None
+        raise PlyError(f"{path}: {error}") from error.__cause__
     damaged = int((~gaussians.finite()).sum())
     if damaged:
         raise PlyError(f"{path}: {damaged} of {gaussians.count} Gaussians are not finite")
     return gaussians
-
-
-def _vertices(file: BinaryIO) -> np.ndarray:
-    start = file.read(LONGEST_HEADER)
-    if not start.startswith(b"ply"):
-        raise PlyError("not a .ply file")
-    header = HEADER.match(start)
-    if header is None:
-        raise PlyError("no end of the header found")
-    places: dict[str, tuple[np.dtype[np.void], int, int]] = {}
-    end = header.end()
-    for name, count, fields in _elements(header[1].decode("ascii", "replace").splitlines()):
-        if len(dict(fields)) < len(fields):
-            raise PlyError(f"element {name[:60]!r} names a property twice")
-        places[name] = np.dtype(fields), count, end
-        end += count * places[name][0].itemsize
-    actual = file.seek(0, os.SEEK_END)
-    if actual != end:
-        raise PlyError(f"the header declares {end} bytes, the file has {actual}")
-    if "vertex" not in places:
-        raise PlyError("no element vertex")
-    dtype, count, position = places["vertex"]
-    missing = [name for name in REQUIRED if name not in (dtype.names or ())]
-    if missing:
-        raise PlyError(f"no property {', '.join(missing)}: not a 3D Gaussian Splatting file")
-    file.seek(position)
-    return np.fromfile(file, dtype, count)
-
-
-def _elements(lines: Sequence[str]) -> list[tuple[str, int, list[tuple[str, str]]]]:
-    """Name, number of records, and names and types of their properties, in the order of the file."""
-    if not lines or lines[0].strip() != "format binary_little_endian 1.0":
-        raise PlyError("not a binary little-endian .ply file")
-    declared: list[tuple[str, int, list[tuple[str, str]]]] = []
-    for line in lines[1:]:
-        match line.split():
-            case ["comment" | "obj_info", *_]:
-                pass
-            case ["element", name, count] if count.isdecimal() and len(count) <= LONGEST_COUNT:
-                declared.append((name, int(count), []))
-            case ["property", kind, name] if kind in TYPES and declared:
-                declared[-1][2].append((name, TYPES[kind]))
-            case _:
-                raise PlyError(f"header line not understood: {line[:60]!r}")
-    return declared
 
 
 def _gaussians(vertices: np.ndarray) -> Gaussians:

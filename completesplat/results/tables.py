@@ -164,12 +164,12 @@ def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any
 
 
 def by_name(entry: dict[str, Any]) -> dict[str, float]:
-    """The scores of a predictor's entry in `Evaluation.results`, by `REGION_VIEW_METRIC`."""
+    """The scores of a predictor's entry in `Evaluation.results`, by `REGION_VIEW_METRIC`; nulls are left out."""
     parts = [(region, part) for region, part in entry.items() if isinstance(part, dict)]
     views = [(f"{region}_{view}", found) for region, part in parts for view, found in part.items()]
     # The seconds of a sequence hold figures, not metrics by view.
     named = [(name, found) for name, found in views if isinstance(found, dict)]
-    return {f"{name}_{metric}": value for name, found in named for metric, value in found.items()}
+    return {f"{name}_{metric}": x for name, found in named for metric, x in found.items() if x is not None}
 
 
 def evaluation_table(results: dict[str, Any]) -> Table:

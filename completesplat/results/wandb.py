@@ -111,21 +111,25 @@ def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> Scen
     return table
 
 
-def log_test(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
-    """Log `test/PREDICTOR/REGION_VIEW_METRIC` of `SceneModule.test_results`; for W&B also tables, pictures and videos.
-
-    `scenes` is what `begin` returned, `out` the run directory with the results in its `metrics.json`.
-    """
+def log_scores(results: dict[str, Any], trainer: Trainer) -> None:
+    """Log `test/PREDICTOR/REGION_VIEW_METRIC` of `SceneModule.test_results`."""
     flat = {predictor: by_name(scores) for predictor, scores in results.items()}
     numbers = {f"test/{predictor}/{name}": x for predictor, scores in flat.items() for name, x in scores.items()}
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=trainer.global_step)
         logger.save()
+
+
+def log_shown(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
+    """For W&B, tables, pictures and videos of a test.
+
+    `scenes` is what `begin` returned, `out` the run directory with the results in its `metrics.json`.
+    """
     runs = wandb_runs(trainer.loggers)
     if not runs:
         return
     media = {} if scenes is None else scenes.media()
-    media |= {"test/predictors": predictor_table(flat)}
+    media |= {"test/predictors": predictor_table({predictor: by_name(scores) for predictor, scores in results.items()})}
     ours = [table for table in tables(find(out)) if any(row.source == "ours" for row in table.rows)]
     media |= {f"report/{table.name}": as_wandb(table) for table in ours}
     for run in runs:

@@ -1,4 +1,4 @@
-"""Callbacks of training: seeds of each step, averaged weights, the progress bar, and the weights that are exported."""
+"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar, exported weights."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -11,9 +11,15 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
 from rich import get_console
+from torch import Tensor
+from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from completesplat.data.loading.distributed import gathered
+from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.training.latent_diffusion import LatentDiffusion
+
+BAD_STEPS = "train/bad_steps"
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +43,66 @@ def step_seed(*place: int) -> int:
     return int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
 
 
+class BadSteps(Callback):
+    """Leaves out the optimizer steps whose loss, or norm of all gradients, is not finite.
+
+    Such a step leaves weights, their averages and the optimizer's state as they are. It is counted as a step of the
+    run, so the schedule and the order of the data go on. All processes leave out the same steps. The bar and the
+    loggers get their number so far, `train/bad_steps`. With `trainer.precision=16-mixed` they include the first steps,
+    which look for the loss's scale.
+
+    Args:
+        most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`.
+    """
+
+    def __init__(self, most_bad_steps: int = 10) -> None:
+        if most_bad_steps < 1:
+            raise CompleteSplatError(f"callbacks.bad_steps.most_bad_steps={most_bad_steps}: must be at least 1")
+        self.most_bad_steps = most_bad_steps
+        self.total = self.in_a_row = 0
+        self.losses: list[Tensor] = []
+
+    def state_dict(self) -> dict[str, int]:
+        return {"total": self.total, "in_a_row": self.in_a_row}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        self.total, self.in_a_row = state_dict["total"], state_dict["in_a_row"]
+
+    def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
+        self.losses.append(loss.detach())  # several where gradients are accumulated
+
+    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+        gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients).to(pl_module.device)
+        finite = torch.stack([*self.losses, norm]).isfinite().all()
+        self.losses = []
+        # Processes have losses of their own, and the same gradients.
+        if trainer.strategy.reduce((~finite).float(), reduce_op="sum") == 0:
+            self.in_a_row = 0
+        else:
+            self.total, self.in_a_row = self.total + 1, self.in_a_row + 1
+            if self.in_a_row == self.most_bad_steps:
+                raise DivergenceError(_divergence(trainer, pl_module, self.in_a_row))
+            for parameter in pl_module.parameters():
+                parameter.grad = None  # which optimizers pass over
+        pl_module.log(BAD_STEPS, float(self.total), prog_bar=True, batch_size=1)
+
+
+def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
+    """Where it came to in the run, the loss term and the first layer with gradients that are not finite."""
+    logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
+    terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
+    terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
+    layers = [n for n, p in module.named_parameters() if p.grad is not None and not p.grad.isfinite().all()]
+    found = gathered((terms, layers))
+    term = next((f"loss term {terms[0]}" for terms, _ in found if terms), "the last losses are finite")
+    layer = next((f"that of {layers[0]} is the first" for _, layers in found if layers), "their norm is too large")
+    return (
+        f"step {trainer.global_step}: {steps} steps in a row had a loss or gradients that are not finite: {term}; "
+        f"of the gradients {layer}; lower optimizer.lr, or start again from an earlier checkpoint with another seed"
+    )
+
+
 class ExponentialMovingAverage(WeightAveraging):
     """Average of the weights over the steps; checkpoints, validation and the end of training use the average.
 
@@ -57,6 +123,14 @@ class ExponentialMovingAverage(WeightAveraging):
         finally:
             self._swap_models(module)
 
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Not after a step that was left out."""
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        if not any(isinstance(callback, BadSteps) and callback.in_a_row for callback in callbacks):
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Not yet: the checkpoint that is written now must hold the weights too, for a run that goes on."""
 
@@ -71,6 +145,8 @@ class Progress(RichProgressBar):
         """The figures behind the bar."""
         metrics = super().get_metrics(trainer, pl_module)
         metrics.pop("v_num", None)
+        if not metrics.get(BAD_STEPS):
+            metrics.pop(BAD_STEPS, None)
         return {"step": _steps(trainer), **metrics}
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

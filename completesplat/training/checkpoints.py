@@ -1,8 +1,12 @@
-"""Checkpoints: when they are written, how a file is replaced whole, and how weights are read from them."""
+"""Checkpoints: when they are written, how a file is replaced whole, and how damaged ones are told from whole ones."""
 
+import hashlib
+import logging
 import os
 import shutil
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
+from copy import deepcopy
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -11,18 +15,26 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import nn
+from torch import Tensor, nn
 
 from completesplat.atomic import atomic_path
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.training.loggers import ContinuedCSVLogger
 
-LAST = "last.ckpt"
+LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
+FIGURES = "figures"
+END, END_BYTES = b"PK\5\6", 22
+"""How the last record of a zip archive begins, and its length without the comment behind it."""
+CHECKSUM, DIGEST_BYTES = b"sha256:", 64
+
+logger = logging.getLogger(__name__)
 
 
 class CheckpointFiles(TorchCheckpointIO):
     """Writes straight into a file beside the final place and renames it: there is a whole checkpoint or none.
 
     Lightning's own first makes the whole file in memory, for 860 million parameters with optimizer and average 15 GB.
+    A checkpoint is a zip archive: its checksum is the archive's comment.
     """
 
     def save_checkpoint(
@@ -31,13 +43,24 @@ class CheckpointFiles(TorchCheckpointIO):
         """Replace what is at this path."""
         with _replaced(Path(path)) as unfinished:
             torch.save(checkpoint, unfinished)
+            _add_checksum(unfinished)
+
+    def load_checkpoint(self, path: str | os.PathLike[str], *options: Any, **more: Any) -> dict[str, Any]:
+        """As `read_checkpoint`, on the CPU."""
+        return read_checkpoint(Path(path))
 
 
 class Checkpoints(Checkpoint):
     """Writes `last.ckpt` anew at intervals and at the end of training, and milestones that are kept.
 
     Every time one file is written: at a milestone `step=N.ckpt`, and `last.ckpt` becomes a second name (hard link) of
-    it. A run that is killed at any moment leaves a whole `last.ckpt`.
+    it. A run that is killed at any moment leaves a whole `last.ckpt`. The one before it stays as `previous.ckpt` until
+    the end of training.
+
+    Loggers get a step's rows, and those of its validation, after the last callback of the step. So the file is written
+    before the next batch, with the loops' state as it was at the end of the step (also at the end of training, which
+    Lightning takes for the end of an epoch): where a run goes on, nothing that the step had to log is missing. It holds
+    the figures that were logged so far, too, which the end of a run reports.
 
     Args:
         every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
@@ -58,22 +81,51 @@ class Checkpoints(Checkpoint):
         self.every_n_train_steps = every_n_train_steps
         self.every_minutes = every_minutes
         self.keep_every = keep_every
+        self.due = False
+        self.end_of_step: dict[str, Any] | None = None
+        self.figures: dict[str, Tensor] = {}
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        trainer.callback_metrics.update(self.figures)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = self.saved_step = trainer.global_step
         self.saved_at = monotonic()
+        for one in trainer.loggers:
+            if isinstance(one, ContinuedCSVLogger):
+                one.experiment.goes_on_from = trainer.global_step
+        begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
+        last = self.folder / LAST
+        if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
+            link(begun, last)  # in the place of a damaged one, which is not to become the one before
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         # Several batches share an optimizer step where gradients are accumulated; these are not in a checkpoint.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
-        if stepped and (self._is_milestone() or self._is_due(trainer)):
-            self._save(trainer)
+        if stepped:
+            self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
+            self.due = self._is_milestone() or self._is_due(trainer)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        if self.due:
+            self._save(trainer, pl_module)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step != self.saved_step:
-            self._save(trainer)
+            self._save(trainer, pl_module)
+        if trainer.is_global_zero:
+            (self.folder / PREVIOUS).unlink(missing_ok=True)
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        if self.end_of_step is not None:
+            checkpoint["epoch"] = self.end_of_step["epoch"]
+            checkpoint["loops"]["fit_loop"] = self.end_of_step["fit_loop"]
+        checkpoint[FIGURES] = {name: value.cpu() for name, value in trainer.callback_metrics.items()}
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.figures = checkpoint.get(FIGURES, {})
 
     def _is_milestone(self) -> bool:
         return self.keep_every is not None and self.step % self.keep_every == 0
@@ -86,10 +138,16 @@ class Checkpoints(Checkpoint):
         # All processes save together, and their clocks differ.
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
-    def _save(self, trainer: Trainer) -> None:
+    def _save(self, trainer: Trainer, module: LightningModule) -> None:
+        if (name := not_finite(module.state_dict())) is not None:
+            said = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
+            raise DivergenceError(f"step {trainer.global_step}: {said}")
+        self.due = False
         self.step = self.saved_step = trainer.global_step
         self.saved_at = monotonic()
         last = self.folder / LAST
+        if trainer.is_global_zero and last.is_file():
+            link(last, self.folder / PREVIOUS)  # before the new one is there, so that there are never three
         if not self._is_milestone():
             return trainer.save_checkpoint(last)
         milestone = self.folder / f"step={self.step}.ckpt"
@@ -114,15 +172,86 @@ def _replaced(path: Path) -> AbstractContextManager[Path]:
     return atomic_path(path, f".{path.name}.unfinished")
 
 
+def _add_checksum(path: Path) -> None:
+    """Make the SHA-256 of all that stands before it the last 64 bytes of a zip archive without a comment."""
+    with path.open("rb+") as file:
+        file.seek(-2, os.SEEK_END)
+        file.write((len(CHECKSUM) + DIGEST_BYTES).to_bytes(2, "little") + CHECKSUM)
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        file.seek(0, os.SEEK_END)
+        file.write(digest.encode())
+
+
+def check_whole(path: Path) -> None:
+    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end."""
+    bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - bytes_of_end))
+        end = file.read()
+        if not end.startswith(END):
+            if end[-END_BYTES:].startswith(END) and end.endswith(b"\0\0"):
+                return
+            raise WeightsError(f"{path}: not a readable checkpoint (damaged at its end, or cut off)")
+        digest, left = hashlib.sha256(), size - DIGEST_BYTES
+        file.seek(0)
+        while left and (part := file.read(min(left, 2**20))):
+            digest.update(part)
+            left -= len(part)
+    if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
+        raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
+
+
+def newest_whole(last: Path) -> Path | None:
+    """`last.ckpt`, or with a warning the one before it or the latest milestone beside it; None if there is no last one.
+
+    `WeightsError`: none of them is whole.
+    """
+    if not last.is_file():
+        return None
+    refusals: list[WeightsError] = []
+    for path in _newest_first(last):
+        try:
+            check_whole(path)
+        except WeightsError as error:
+            refusals.append(error)
+            continue
+        if refusals:
+            logger.warning("%s; going on from %s", refusals[0], path)
+        return path
+    raise refusals[0]
+
+
+def _newest_first(last: Path) -> Iterator[Path]:
+    yield last
+    if (previous := last.with_name(PREVIOUS)).is_file():
+        yield previous
+    steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
+    yield from sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
+
+
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents; `WeightsError` if the file is missing or not a checkpoint of plain tensors."""
+    """A checkpoint's contents.
+
+    `WeightsError`: the file is missing, damaged, no checkpoint of plain tensors, or its weights are not finite.
+    """
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
+    check_whole(Path(path))
     try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
-        return {"state_dict": contents["state_dict"], **contents}
+        contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        name = not_finite(contents["state_dict"])
     except Exception as error:
         raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
+    if name is not None:
+        raise WeightsError(f"{path}: {name} is not finite")
+    return contents
+
+
+def not_finite(weights: Mapping[str, Any]) -> str | None:
+    """The name of the first tensor that holds NaN or infinities, if there is one."""
+    return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:

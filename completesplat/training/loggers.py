@@ -32,8 +32,8 @@ log = logging.getLogger(__name__)
 class ContinuedCSVLogger(CSVLogger):
     """Writes `metrics.csv`, each row at once, so that a run that is killed keeps what it logged.
 
-    Of what the file holds already, the rows before the first step that is logged now stay: what an interrupted run did
-    after its last checkpoint is done again.
+    Of what the file holds already, the rows before the step that the run goes on from, and before the first that is
+    logged now, stay: what an interrupted run did after its last checkpoint is done again.
     """
 
     def __init__(self, save_dir: str) -> None:
@@ -55,6 +55,7 @@ class MetricsFile(ExperimentWriter):
         super().__init__(log_dir)
         self.path = Path(self.metrics_file_path)
         self.begun = False
+        self.goes_on_from: int | None = None
 
     def _check_log_dir_exists(self) -> None:
         """Keep the old file until there is something to put in its place; Lightning would delete it here."""
@@ -83,6 +84,7 @@ class MetricsFile(ExperimentWriter):
             # The last line of a process that was killed may have no end.
             rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
         first = min(row["step"] for row in self.metrics)
+        first = first if self.goes_on_from is None else min(first, self.goes_on_from)
         return [row for row in rows if self.begun or int(row["step"]) < first]
 
 

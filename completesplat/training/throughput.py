@@ -11,6 +11,7 @@ from lightning.pytorch.profilers import Profiler
 from completesplat.training.scene_module import now
 
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
+SAVING = "save_checkpoint"
 STATUS = Path("/proc/self/status")
 
 
@@ -18,9 +19,9 @@ class Throughput(Callback):
     """Logs speed and memory with the trainer's interval.
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
-    for data, are of the steps since the last row; for memory see `memory`. The clock stands still during validation
-    and from a row to the next batch: while pictures are drawn and checkpoints written, if their intervals are multiples
-    of the trainer's, and this callback stands before those.
+    for data, are of the steps since the last row; for memory see `memory`. The clock stands still during validation,
+    while checkpoints are written, and from a row to the next batch: while pictures are drawn, if their interval is a
+    multiple of the trainer's, and this callback stands before those.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -32,7 +33,7 @@ class Throughput(Callback):
         trainer.profiler = self.clock.profiler  # type: ignore[attr-defined]
 
     def _forget(self) -> None:
-        self.clock.waited, self.clock.begin = 0.0, None
+        self.clock.waited, self.clock.saved, self.clock.begin = 0.0, 0.0, None
         self.scenes, self.paused = 0, 0.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -53,7 +54,7 @@ class Throughput(Callback):
         interval = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not stepped or not interval or trainer.global_step % interval or self.clock.begin is None:
             return
-        seconds = now() - self.clock.begin - self.paused
+        seconds = now() - self.clock.begin - self.paused - self.clock.saved
         values = {
             "speed/scenes_per_second": self.scenes * trainer.world_size / seconds,
             "speed/data_wait": self.clock.waited / seconds,
@@ -64,21 +65,22 @@ class Throughput(Callback):
 
 
 class DataClock(Profiler):
-    """A profiler that measures the time of fetching batches, and passes every call on to another profiler."""
+    """A profiler that times fetching batches and saving checkpoints, and passes every call on to another profiler."""
 
     def __init__(self, profiler: Profiler) -> None:
         super().__init__()
         self.profiler = profiler
         self.begin: float | None = None
-        self.waited = 0.0
+        self.waited = self.saved = 0.0
         for name in ("setup", "describe", "teardown"):
             setattr(self, name, getattr(profiler, name))
 
     def start(self, action_name: str) -> None:
         """Called by Lightning before an action."""
-        if action_name == FETCHING:
+        if action_name in (FETCHING, SAVING):
             self.since = time.perf_counter()
-            self.begin = self.since if self.begin is None else self.begin
+        if action_name == FETCHING and self.begin is None:
+            self.begin = self.since
         self.profiler.start(action_name)
 
     def stop(self, action_name: str) -> None:
@@ -86,6 +88,8 @@ class DataClock(Profiler):
         self.profiler.stop(action_name)
         if action_name == FETCHING:
             self.waited += time.perf_counter() - self.since
+        elif action_name == SAVING and self.begin is not None:
+            self.saved += time.perf_counter() - self.since
 
 
 def memory(device: torch.device) -> dict[str, float]:

@@ -14,11 +14,11 @@ from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
+from completesplat.viewer.access import told
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
 from completesplat.viewer.sample import Sample
 
-MOST_BYTES = 32 * 2**20
 PAUSE = 0.2  # seconds between two pictures of a scene that forms
 
 
@@ -100,14 +100,11 @@ class Completion:
 
 
 def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
-    """The picture at the model's size; `ImageError` above 32 MiB. Its name is for refusals only, never a path."""
-    shown = "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
-    if len(content) > MOST_BYTES:
-        raise ImageError(f"{shown}: {len(content) / 2**20:.0f} MiB; at most {MOST_BYTES // 2**20} MiB are taken")
+    """The picture at the model's size; `ImageError` if it is none. Its name is for refusals only, never a path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "upload"
         file.write_bytes(content)
         try:
             return model.read(file)
         except ImageError as error:
-            raise ImageError(str(error).replace(str(file), shown)) from error
+            raise ImageError(str(error).replace(str(file), told(name))) from error

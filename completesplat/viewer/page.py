@@ -17,11 +17,10 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.export.video import orbit_views, write_video
 from completesplat.rasterizers import Rasterizer
+from completesplat.viewer.access import GuardedServer
 from completesplat.viewer.panel import SIDE_BY_SIDE, add_looking, add_saving
 from completesplat.viewer.sample import Sample
 from completesplat.viewer.stage import Stage
-
-HOST = "127.0.0.1"
 
 Job = Callable[[], None]
 
@@ -80,11 +79,11 @@ class Worker:
                     log.exception("the viewer could not say what failed")
 
 
-def start_server(port: int, background: float = 0.5) -> viser.ViserServer:
+def start_server(port: int, background: float = 0.5) -> GuardedServer:
     """Listen on the port or, if it is taken, on the next free one (0 takes any), before a grey background."""
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(HOST, port, verbose=False)
+        server = GuardedServer(port)
     server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
     server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would lead through the internet
     server.gui.set_panel_label("completesplat")
@@ -136,7 +135,7 @@ class Saver:
 class Page:
     """Controls and scene of one server, where `layers` can be switched. What takes time happens in the worker."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, saver: Saver, layers: int) -> None:
+    def __init__(self, server: GuardedServer, stage: Stage, saver: Saver, layers: int) -> None:
         self.server, self.stage, self.saver = server, stage, saver
         self.worker = Worker(self.tell)
         self.status = server.gui.add_markdown("", order=0)

@@ -15,6 +15,7 @@ from completesplat.errors import WeightsError
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
+LARGEST_TEXT = 1_000_000
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
@@ -36,7 +37,7 @@ def weights_folder(weights: Path | str) -> Path:
     sums = folder / SUMS_FILE
     if not sums.is_file():
         return folder
-    known = sums.read_text(errors="replace").splitlines()
+    known = read_small(sums).splitlines()
     for name in (CONFIG_FILE, WEIGHTS_FILE):
         if f"{sha256_of(folder / name)}  {name}" not in known:
             raise WeightsError(
@@ -44,6 +45,13 @@ def weights_folder(weights: Path | str) -> Path:
                 f"if the change is meant, remove {SUMS_FILE}"
             )
     return folder
+
+
+def read_small(path: Path) -> str:
+    """The text of a file that says something about weights; `WeightsError` for one of more than 1 MB."""
+    if path.stat().st_size > LARGEST_TEXT:
+        raise WeightsError(f"{path}: of {path.stat().st_size} bytes, and {LARGEST_TEXT} are plenty")
+    return path.read_text(errors="replace")
 
 
 def write_sums(folder: Path) -> None:

@@ -10,8 +10,8 @@ from plyfile import PlyData
 from support import compose_config, strict_json
 
 from completesplat.commands.predict import PredictNumbers, visible_part
-from completesplat.commands.schema import check_settings
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import check_settings
 
 FEW = ["samples=2", "frames=4", "steps=2"]
 
@@ -109,7 +109,7 @@ def test_a_mask_hides_what_a_box_hides(predict, tmp_path):
 
 def test_settings_have_ranges():
     for setting, least in (
-        ("samples=0", "at least 1"),
+        ("samples=0", "1 and 1000"),
         ("steps=1001", "1 and 1000"),
         ("guidance_weight=-1", "0 and 1"),
     ):

@@ -1,6 +1,9 @@
 """Several pictures at once, file formats, videos, and what is said about them."""
 
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +12,16 @@ import pytest
 import torch
 from fake_converter import calls, install
 from PIL import Image
-from support import compose_config, some_gaussians, strict_json
+from safetensors.torch import load_file, save_file
+from support import compose_config, refused, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_pictures, folder_names, run, unusual_field_of_view
+from completesplat.commands.predict import find_pictures, run, unusual_field_of_view
 from completesplat.data.pictures.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.generation import CompleteSplat
+from completesplat.names import folder_names
+from completesplat.weights import SUMS_FILE, WEIGHTS_FILE
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
@@ -61,7 +67,111 @@ def test_a_folder_is_its_pictures_sorted_and_not_those_of_its_folders(tmp_path):
 
 def test_pictures_of_one_name_get_folders_of_their_own():
     names = ["x/a.jpg", "y/a.jpg", "a_2.png", "A.png", "b.jpg", "c.tar.gz"]
-    assert folder_names([Path(name) for name in names]) == ["a", "a_2", "a_2_2", "A_3", "b", "c.tar"]
+    assert folder_names(Path(name).stem for name in names) == ["a", "a_2", "a_2_2", "A_3", "b", "c.tar"]
+
+
+ODD_NAMES = [
+    b"...png",
+    b"..png",
+    b"\xff.png",
+    b"[red].png",
+    b"new\nline.png",
+    b"a" * 250 + b".png",
+    "é".encode() * 120 + b".png",
+]
+ODD_NAMES += [b"\xfe.png", b"\x1b[31m.png", b"a\\b.png", b"z.png"]
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_pictures_of_any_name_are_written_below_out_and_stop_nothing(predict, tmp_path, monkeypatch, terminal):
+    if terminal:  # of which rich asks this
+        monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    content = picture(tmp_path / "x.png").read_bytes()
+    (tmp_path / "photos").mkdir()
+    for name in ODD_NAMES:
+        (tmp_path / "photos" / os.fsdecode(name)).write_bytes(content)
+    finished = predict(tmp_path / "photos", "fov=15")  # with a warning for each
+    assert (finished.status, finished.err) == (0, "")
+    assert {path.name for path in tmp_path.iterdir()} == {"x.png", "photos", "out"}
+    folders = [path for path in (tmp_path / "out").iterdir() if path.is_dir()]
+    assert len(folders) == len(ODD_NAMES)
+    assert {path.parent.parent for path in tmp_path.rglob("sheet.png")} == {tmp_path / "out"}
+    recorded = {strict_json(folder / "scene.json")["settings"]["image"] for folder in folders}
+    assert {"...png", "\\udcff.png", "new\\nline.png", "z.png"} < recorded
+    assert "\x1b[31m" not in finished.out
+
+
+def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_path, tiny_weights):
+    """What pytest puts in the place of the streams prints anything."""
+    name, out = os.fsdecode(b"\xff.png"), os.fsdecode(b"out\xff")
+    (tmp_path / name).write_bytes(picture(tmp_path / "x.png").read_bytes())
+    program = "from completesplat.cli import main; main()"
+    given = [f"image='{name}'", f"weights={tiny_weights}", f"out='{out}'", *QUICK]  # as hydra wants them
+    environment = os.environ | {"PYTHONUTF8": "0", "PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run(
+        [sys.executable, "-c", program, "predict", *given], cwd=tmp_path, env=environment, capture_output=True
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert done.stdout.endswith(b"/out\\udcff\n")
+    assert (tmp_path / out / "_" / "sheet.png").is_file()
+
+
+def test_a_fault_at_one_picture_does_not_stop_the_others(predict, tmp_path, monkeypatch):
+    def faulty(model, photograph, visible, **settings):
+        if photograph.image[0].mean() < 0.5:
+            raise ValueError("a fault\nof the program")
+        return draw(model, photograph, visible, **settings)
+
+    monkeypatch.setattr(CompleteSplat, "forward", faulty)
+    finished = predict(f"[{picture(tmp_path / 'a.png', 'blue')},{picture(tmp_path / 'b.png')}]")
+    assert finished.status == 2
+    first, summary = finished.err.splitlines()
+    assert first == f"error: {tmp_path / 'a.png'}: a fault of the program"
+    assert "1 of 2 pictures failed (a.png)" in summary
+    assert "Traceback" in finished.out
+    assert (tmp_path / "out/b/sheet.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("image=null", "image=None: give a picture, a folder, or a list of them"),
+        ("image=''", "image=: give a picture"),
+        ("image=[a.png,null]", "give a picture"),
+        ("image=[]", "name at least one picture"),
+        ("image={a:1}", "give a picture"),
+        ("samples=1000000000", "samples=1000000000: must lie between 1 and 1000"),
+        ("frames=1000000000", "frames=1000000000: must lie between 1 and 1000"),
+        ("seed=-1", "seed=-1: must lie between 0 and"),
+        ("seed=null", "seed=None: must be a whole number"),
+        ("fov=wide", "fov=wide: must be a number"),
+    ],
+)
+def test_odd_settings_are_refused_before_the_model_is_loaded(setting, said):
+    assert said in refused("predict", "image=a.png", "weights=nowhere", setting)
+
+
+def test_a_path_of_any_length_is_refused_in_a_short_line(predict):
+    for path in ("a" * 5000, "a/" * 2500, f"[{'a' * 5000}]"):
+        finished = predict(path)
+        assert finished.status == 2
+        assert finished.err.count("\n") == 1
+        assert len(finished.err) < 600
+        assert "File name too long" in finished.err
+
+
+def test_weights_that_are_not_finite_are_refused_as_such(predict, tiny_weights, tmp_path):
+    weights = load_file(tiny_weights / WEIGHTS_FILE)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    for file in tiny_weights.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    (folder / SUMS_FILE).unlink()
+    for value in (torch.nan, torch.inf):
+        save_file(weights | {"latent_std": torch.full_like(weights["latent_std"], value)}, folder / WEIGHTS_FILE)
+        finished = predict(picture(tmp_path / "a.png"), f"weights={folder}")
+        said = f"error: {folder}: weights that are not finite in 1 tensors, such as latent_std\n"
+        assert (finished.status, finished.err) == (2, said)
 
 
 def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):

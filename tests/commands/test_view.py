@@ -5,10 +5,10 @@ import pytest
 from support import compose_config
 from viewer_scenes import balls
 
-from completesplat.commands.schema import check_settings
 from completesplat.commands.view import ViewNumbers, data_cameras, overrides, settings_of
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
+from completesplat.schema import check_settings
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 import gzip
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +55,33 @@ def test_bad_files_are_refused_by_name(name, tmp_path):
         read_json(tmp_path / file)
     assert caught.value.file == str(tmp_path / file)
     assert part in caught.value.reason
+
+
+# Peak memory is that of a process: VmHWM, as `ru_maxrss` starts with that of the process that started it.
+READ = """
+import sys, time
+from pathlib import Path
+from completesplat.data.validation import UnreadableFile, read_json
+def peak():
+    return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) // 1024
+before, start = peak(), time.perf_counter()
+try:
+    read_json(Path(sys.argv[1]))
+except UnreadableFile as error:
+    print(peak() - before, time.perf_counter() - start, error)
+"""
+
+
+def test_a_gzip_of_4_megabytes_that_holds_4_gigabytes_is_refused_with_little_memory(tmp_path):
+    path = tmp_path / "a.jgz"
+    part = gzip.compress(b" " * 2**26)
+    path.write_bytes(gzip.compress(b"[") + 2**6 * part + gzip.compress(b"]"))  # several members are one content
+    assert 3.9e6 < path.stat().st_size < 4.3e6
+    finished = subprocess.run([sys.executable, "-c", READ, path], capture_output=True, text=True, check=True)
+    megabytes, seconds, said = finished.stdout.split(maxsplit=2)
+    assert int(megabytes) < 256
+    assert float(seconds) < 20
+    assert "hold more than" in said
 
 
 @pytest.mark.parametrize("file", ["a.json", "a.jgz"])

@@ -222,6 +222,16 @@ def bomb(path: Path) -> None:
             archive.writestr(name, data)
 
 
+def bytes_from_nothing(path: Path) -> None:
+    """A pickle of 30 bytes for 2 GiB."""
+    with zipfile.ZipFile(path) as archive:
+        records = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in records.items():
+            asks = b"\x80\x02cbuiltins\nbytearray\n\x8a\x05" + (2**31).to_bytes(5, "little") + b"\x85R."
+            archive.writestr(name, asks if name.endswith("data.pkl") else data)
+
+
 # name: (damage of the broken clip's chunk, kind)
 BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
     "empty": (lambda path: path.write_bytes(b""), UnreadableFile),
@@ -232,6 +242,7 @@ BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
     ),
     "legacy_form": (saved(lambda entry: [entry], _use_new_zipfile_serialization=False), UnreadableFile),
     "bomb": (bomb, UnreadableFile),
+    "bytes_from_nothing": (bytes_from_nothing, UnreadableFile),
     "list_of_tensors": (saved(lambda entry: list(entry["images"])), BadAnnotation),
     "key_twice": (saved(lambda entry: [entry, entry]), BadAnnotation),
     "another_clip": (saved(lambda entry: [entry | {"key": "other"}]), BadAnnotation),

@@ -5,9 +5,10 @@ from functools import cache
 import pandas
 import pytest
 import torch
-from support import SMALL, call
+from support import SMALL, call, strict_json
 from torch import Tensor
 
+from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -86,13 +87,43 @@ def test_a_run_that_is_continued_is_bit_equal(settings, whole, tmp_path, monkeyp
         assert call(monkeypatch, *arguments) != 0
     assert rows(tmp_path / "run")["step"].max() == saved  # So it did more than it saved.
     assert call(monkeypatch, *arguments, "ckpt_path=last") == 0
+    must_be_equal(whole(stage), tmp_path / "run")
+    assert any("current_model_state" in name for name in weights(tmp_path / "run")) == (stage != "var")
 
-    expected, found = weights(whole(stage)), weights(tmp_path / "run")
-    assert expected.keys() == found.keys()
-    assert any("current_model_state" in name for name in expected) == (stage != "var")
-    same = {name: value == found[name] for name, value in expected.items()}
+
+def must_be_equal(whole, found) -> None:
+    """Weights, the rows of `metrics.csv` and the figures in `metrics.json`."""
+    expected, continued = weights(whole), weights(found)
+    assert expected.keys() == continued.keys()
+    same = {name: value == continued[name] for name, value in expected.items()}
     assert [name for name, equal in same.items() if not (equal.all() if isinstance(equal, Tensor) else equal)] == []
-    pandas.testing.assert_frame_equal(rows(whole(stage)), rows(tmp_path / "run"), check_exact=True)
+    pandas.testing.assert_frame_equal(rows(whole), rows(found), check_exact=True)
+    assert results(whole) == results(found)
+
+
+def results(run) -> dict:
+    return {k: v for k, v in strict_json(run / "metrics.json").items() if not k.startswith(("speed/", "memory/"))}
+
+
+@pytest.mark.parametrize("written", [4, 6, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_run_killed_when_its_checkpoint_was_just_written_misses_nothing(
+    settings, whole, tmp_path, monkeypatch, written
+):
+    """With rows, validation and pictures due at the same step; 6 is the last."""
+    monkeypatch.chdir(tmp_path)
+    arguments = [*settings["var"], "callbacks.checkpoint.every_n_train_steps=2", f"out={tmp_path}/run"]
+    save = CheckpointFiles.save_checkpoint
+
+    def last_deed(self, checkpoint, *inputs, **options):
+        save(self, checkpoint, *inputs, **options)
+        if checkpoint["global_step"] == written:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(CheckpointFiles, "save_checkpoint", last_deed)
+        assert call(monkeypatch, *arguments) != 0
+    assert call(monkeypatch, *arguments, "ckpt_path=last") == 0
+    must_be_equal(whole("var"), tmp_path / "run")
 
 
 @pytest.mark.slow

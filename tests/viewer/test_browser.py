@@ -66,7 +66,7 @@ def open_tab(chromium, address: str):
 
 @pytest.fixture(scope="module")
 def tab(chromium, page):
-    return open_tab(chromium, f"http://127.0.0.1:{page.server.get_port()}")
+    return open_tab(chromium, page.server.address)
 
 
 def pixels(tab) -> np.ndarray:
@@ -156,6 +156,16 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     seed.press("Enter")
     until(lambda: page.stage.samples[0].settings.get("seed") == 9, "no new sample")
     changed(tab, first)
+
+
+def test_a_browser_needs_the_whole_address_once(chromium, page):
+    bare = page.server.address.partition("?")[0]
+    with chromium.new_context() as context:
+        for address, status in ((bare, 403), (page.server.address, 200), (bare, 200)):
+            tab = context.new_page()
+            assert tab.goto(address).status == status
+        # What the page shows comes through its websocket.
+        tab.get_by_role("button", name="Load a picture").wait_for(timeout=1000 * SECONDS)
 
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):

@@ -10,7 +10,6 @@ from support import tiny_generator
 
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, ImageError
-from completesplat.viewer import completion
 from completesplat.viewer.completion import read_upload
 from completesplat.viewer.panel import nearest_steps, possible_steps
 
@@ -38,11 +37,9 @@ def test_a_picture_is_read_at_the_models_size(model):
         ("notes.txt", png(50, 40)[:60], "^notes.txt: "),
         ("../../\n\x1betc/passwd", b"nothing", r"^\.\./\.\./\?\?etc/passwd: not an image"),  # no path, no markup
         ("bomb.png", png(8000, 8000, "1"), "64,000,000|8000 x 8000"),  # some kilobytes
-        ("big.png", png(50, 40) + bytes(2**21), r"^big\.png: 2 MiB; at most 1 MiB"),
     ],
 )
-def test_what_is_no_picture_or_too_large_is_refused_by_its_name(model, monkeypatch, name, content, said):
-    monkeypatch.setattr(completion, "MOST_BYTES", 2**20)
+def test_what_is_no_picture_or_has_too_many_pixels_is_refused_by_its_name(model, name, content, said):
     with pytest.raises(ImageError, match=said):
         read_upload(model, name, content)
 

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from plyfile import PlyData, PlyElement
 
 from completesplat.data.validation import (
     BadAnnotation,
@@ -29,6 +28,7 @@ from completesplat.data.validation import (
     require_rotation,
 )
 from completesplat.geometry.cameras import Cameras
+from completesplat.ply_files import TYPES, header
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])
@@ -189,9 +189,10 @@ def sequence_annotation(category: str, name: str, points: int) -> dict[str, Any]
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> None:
     """A point cloud as a binary PLY file."""
-    types = [(axis, "<f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
+    properties = [(axis, "float") for axis in "xyz"] + [(channel, "uchar") for channel in ("red", "green", "blue")]
+    types = [(name, f"<{TYPES[kind]}") for name, kind in properties]
     vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
-    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(path))
+    path.write_bytes(header(len(vertices), properties) + vertices.tobytes())
 
 
 def write_annotations(

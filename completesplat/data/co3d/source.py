@@ -17,7 +17,7 @@ from completesplat.data.co3d.splits import SplitMembers
 from completesplat.data.pictures.crop import Square, principal_square, read_square
 from completesplat.data.pictures.files import decode, read_depth
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
-from completesplat.data.validation import BadCamera, BadPlacement, at, read_vertices
+from completesplat.data.validation import BadCamera, BadPlacement, at, read_points
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import crop_resize, invert_rigid, pixel_centers, transform_points, unproject
 from completesplat.tensors import stack
@@ -100,7 +100,7 @@ def from_point_cloud(path: Path, axes: Axes) -> Placement:
     The centre is the points' mean, but upwards the middle between the lowest and the highest; half the size is the
     largest coordinate from there, along the upright axes.
     """
-    _, points = read_vertices(path)
+    _, points = read_points(path)
     with at(path):
         return _placement(points, axes, 1.0, "the point cloud")
 

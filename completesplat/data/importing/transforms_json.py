@@ -34,7 +34,7 @@ from completesplat.data.validation import (
     finite_array,
     inside,
     read_json,
-    read_vertices,
+    read_points,
     require_file,
     require_rotation,
 )
@@ -213,8 +213,8 @@ def _focal(angle: float, side: int) -> float:
 
 
 def _read_cloud(path: Path) -> PointCloud | None:
-    vertices, points = read_vertices(path)
-    names = [name for name in ("red", "green", "blue") if name in vertices.data.dtype.names]
-    colors = [np.asarray(vertices[name]) for name in names]
+    vertices, points = read_points(path)
+    names = [name for name in ("red", "green", "blue") if name in (vertices.dtype.names or ())]
+    colors = [vertices[name] for name in names]
     usable = len(colors) == 3 and all(color.dtype == np.uint8 for color in colors)
     return make_cloud(points, np.stack(colors, axis=-1) if usable else np.full(points.shape, 128), path)

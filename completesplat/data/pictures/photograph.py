@@ -63,10 +63,7 @@ def read_photograph(
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        if not Path(path).is_file():
-            raise ImageError("no such file")
-        if Path(path).stat().st_size == 0:
-            raise ImageError("the file is empty")
+        _check_file(Path(path))
         with opened(path, FORMATS) as picture:
             if min(picture.size) < SMALLEST_SIDE:
                 raise ImageError(f"{picture.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
@@ -84,6 +81,17 @@ def read_photograph(
     if (recorded := crop_fov(exif, picture.size)) is not None:
         return Photograph(image, recorded, "exif")
     return Photograph(image, float(default_fov_degrees), "default")
+
+
+def _check_file(path: Path) -> None:
+    try:
+        found = path.is_file()
+    except OSError as error:  # a name that is too long, say
+        raise ImageError(str(error.strerror)) from error
+    if not found:
+        raise ImageError("no such file")
+    if path.stat().st_size == 0:
+        raise ImageError("the file is empty")
 
 
 def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Tensor, "3 size size"]:

@@ -98,11 +98,14 @@ def read_chunk(path: Path) -> Chunk:
             # torch.save compresses nothing, so a chunk that says it is larger than its file is made to fill the memory.
             # PyTorch does not look at the checksums.
             whole = size <= path.stat().st_size and archive.testzip() is None
+            # What it reads safely may still be a byte array of any length, which a few bytes ask for.
+            names = [name for name in archive.namelist() if whole and name.lower().endswith(".pkl")]
+            whole = whole and not any(b"bytearray" in archive.read(name) for name in names)
         content = torch.load(path, map_location="cpu", weights_only=True) if whole else None
     except Exception as error:  # the unpickler's refusals have no common class
         raise UnreadableFile(f"not a chunk that can be read safely ({type(error).__name__})", str(path)) from None
     if not whole:
-        raise UnreadableFile("damaged, or larger than its file", str(path))
+        raise UnreadableFile("damaged, or asks for more memory than its file has bytes", str(path))
     if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
         raise BadAnnotation("not a list of clips with keys", str(path))
     chunk = {entry["key"]: entry for entry in content}

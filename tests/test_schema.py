@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal, TypedDict
 
 import pytest
 
-from completesplat.commands.schema import Filled, Natural, OneOf, Positive, Range, check_settings
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import Filled, Natural, OneOf, Positive, Range, check_settings
 
 
 class Part(TypedDict):

@@ -47,9 +47,26 @@ class Filled:
         return None if value else "must not be empty"
 
 
+@dataclass(frozen=True)
+class AtMost:
+    """A rule for `Annotated`: a list has no more entries."""
+
+    entries: int
+
+    def refusal(self, value: Any) -> str | None:
+        """Why the value is refused; None if it is not."""
+        return None if len(value) <= self.entries else f"must have at most {self.entries} entries"
+
+
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
 Share = Annotated[float, Range(0, 1)]
+
+# Sizes of networks. Their bounds lie beyond what anyone trains; they hold off configurations that strangers wrote.
+Width = Annotated[int, Range(1, 8192)]
+Widths = Annotated[Sequence[Width], Filled(), AtMost(8)]
+Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], AtMost(8)]
+Few = Annotated[int, Range(1, 16)]
 
 
 class Refused(NamedTuple):
@@ -63,20 +80,26 @@ class Refused(NamedTuple):
 def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
     """Hold settings against the annotations of the same names: of a function's arguments, or in a `TypedDict`.
 
-    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Filled`; any other
-    annotation accepts everything.
+    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf`, `Filled` and `AtMost`; any
+    other annotation accepts everything.
 
     Raises:
         CompleteSplatError: names the first setting that does not fit, and what it may be.
     """
-    hints = get_type_hints(function, include_extras=True)
-    for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
-        hints |= get_type_hints(shared, include_extras=True)
+    hints = hints_of(function)
     for name in [name for name in settings if name in hints]:
         for place, value, reason in refused(hints[name], settings[name]):
             key = name + place
             example = f", such as {key}=[{value}]" if reason == "must be a list" else ""
             raise CompleteSplatError(f"{key}={value}: {reason}{example}")
+
+
+def hints_of(function: Any) -> dict[str, Any]:
+    """Annotations by name, of a function's arguments or in a `TypedDict`; those of `**name: Unpack[...]` one by one."""
+    hints = get_type_hints(function, include_extras=True)
+    for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
+        hints |= get_type_hints(shared, include_extras=True)
+    return hints
 
 
 def refused(annotation: Any, value: Any) -> list[Refused]:
@@ -112,3 +135,8 @@ def _is_a(kind: type, value: Any) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)
+
+
+def shown(value: Any) -> str:
+    """A stranger's value for a message: not for pages, and without what would move a terminal's cursor."""
+    return str(value).encode("unicode_escape").decode()[:80]

@@ -1,0 +1,143 @@
+"""Who may use the page: browsers on this machine that know its token; and how much of theirs is taken in at once.
+
+viser answers everyone who reaches its port. A web page of any site, opened on the same machine, reaches it as well.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import parse_qs
+
+import viser
+from viser._messages import FileTransferPart, FileTransferPartAck, FileTransferStartUpload
+from viser.infra import ClientId
+from websockets.asyncio import server as websockets_server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from completesplat.errors import CompleteSplatError
+
+HOST = "127.0.0.1"
+NAMES = (HOST, "localhost", "[::1]")
+MOST_FRAME = 2**20  # bytes of one websocket message; the page sends files in parts of half of that
+MOST_BYTES = 32 * 2**20  # of all pictures that are being received
+MOST_PARTS = 2**10
+
+Answer = Callable[[ServerConnection, Request], Response | None]
+
+_starting = threading.Lock()
+
+
+class GuardedServer(viser.ViserServer):
+    """viser's server on this machine's port or, if it is taken, on the next free one, behind checks of our own.
+
+    Requests and websocket handshakes are answered (else 403) if their `Host` is a loopback name with the server's port,
+    their `Origin` is that host too (a request that is no handshake may have none), and they bring the token: in the
+    address, or in the cookie that the page comes with, since viser's page leaves out the query of its address when it
+    opens the websocket. Websocket messages and uploads are refused by what they announce, before they are received.
+
+    Raises:
+        CompleteSplatError: this viser starts its websocket server in a way that leaves the checks out.
+    """
+
+    def __init__(self, port: int) -> None:
+        self.token = secrets.token_urlsafe(32)
+        self._guarded = False
+        # viser takes no settings for its websocket server, which its constructor starts in a thread and waits for.
+        with _starting:
+            serve = websockets_server.serve
+            websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
+            try:
+                super().__init__(HOST, port, verbose=False)
+            finally:
+                websockets_server.serve = serve  # type: ignore[misc]
+        if not self._guarded:
+            self.stop()
+            raise CompleteSplatError(f"the viewer cannot guard viser {viser.__version__}: pip install viser==1.1.1")
+        self._limit_uploads()
+
+    @property
+    def address(self) -> str:
+        """What opens the page; it holds the token."""
+        return f"http://{self.get_host()}:{self.get_port()}/?token={self.token}"
+
+    def _serve(self, serve: Callable[..., Any], *args: Any, process_request: Answer, **settings: Any) -> Any:
+        """What viser calls in the place of `serve`."""
+        self._guarded = True
+        answer = partial(self._answer, process_request)
+        return serve(*args, process_request=answer, **settings | {"max_size": MOST_FRAME})
+
+    def _answer(self, answer: Answer, connection: ServerConnection, request: Request) -> Response | None:
+        port = connection.local_address[1]
+        refusal = self._refusal(request, port)
+        if refusal is not None:
+            return connection.respond(HTTPStatus.FORBIDDEN, refusal + "\n")
+        response = answer(connection, request)
+        if response is not None:
+            cookie = f"{cookie_name(port)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+            response.headers.update({"Set-Cookie": cookie, "Referrer-Policy": "no-referrer"})
+        return response
+
+    def _refusal(self, request: Request, port: int) -> str | None:
+        """Why the request is not answered; None if it is."""
+        hosts = [f"{name}:{port}" for name in NAMES] + list(NAMES if port == 80 else ())
+        host = request.headers.get_all("Host")
+        if len(host) != 1 or host[0].lower() not in hosts:
+            return f"The viewer is reached at {', '.join(hosts)} only. Through ssh: the same port on both sides."
+        origin = request.headers.get_all("Origin")
+        if origin != [f"http://{host[0].lower()}"] and (origin or "Upgrade" in request.headers):
+            return "The viewer answers its own page only."
+        expected = self.token.encode()
+        if not any(secrets.compare_digest(token, expected) for token in tokens(request, port)):
+            return "Open the address that completesplat view has printed: its token is missing here, or is another's."
+        return None
+
+    def _limit_uploads(self) -> None:
+        gui, connection = self.gui, self._websock_server
+        connection.unregister_handler(FileTransferStartUpload, gui._handle_file_transfer_start)
+        connection.register_handler(FileTransferStartUpload, self._upload_starts)
+        connection.unregister_handler(FileTransferPart, gui._handle_file_transfer_part)
+        connection.register_handler(FileTransferPart, self._upload_goes_on)
+        # viser itself does this only for browsers that have sent a camera.
+        connection.on_client_disconnect(lambda client: gui._drop_uploads_from_client(ClientId(client.client_id)))
+
+    def _upload_starts(self, client_id: ClientId, message: FileTransferStartUpload) -> None:
+        taken = sum(upload["total_bytes"] for upload in self.gui._current_file_upload_states.values())
+        if 0 <= message.size_bytes <= MOST_BYTES - taken and 0 <= message.part_count <= MOST_PARTS:
+            return self.gui._handle_file_transfer_start(client_id, message)
+        client = self.get_clients().get(client_id)
+        if client is not None:
+            # Its page would wait for this before it takes another file; what it sends meanwhile is dropped.
+            source, size = message.source_component_uuid, message.size_bytes
+            client.gui._websock_interface.queue_message(FileTransferPartAck(source, message.transfer_uuid, size, size))
+            most = f"at most {MOST_BYTES // 2**20} MiB are taken at a time"
+            text = f"{told(message.filename)}: {size / 2**20:.0f} MiB; {most}"
+            client.add_notification("Not possible", text, color="red")
+
+    def _upload_goes_on(self, client_id: ClientId, message: FileTransferPart) -> None:
+        uploads = self.gui._current_file_upload_states
+        upload = uploads.get(message.transfer_uuid)
+        if upload is not None and upload["transferred_bytes"] + len(message.content) > upload["total_bytes"]:
+            del uploads[message.transfer_uuid]  # more than it announced
+        self.gui._handle_file_transfer_part(client_id, message)
+
+
+def cookie_name(port: int) -> str:
+    """A name for each port, since browsers keep cookies of all ports of a host together."""
+    return f"completesplat-{port}"
+
+
+def tokens(request: Request, port: int) -> list[bytes]:
+    """What the request gives as the token, in its address and in its cookies."""
+    given = parse_qs(request.path.partition("?")[2]).get("token", [])
+    pairs = [pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";")]
+    given += [value for name, _, value in pairs if name == cookie_name(port)]
+    return [token.encode(errors="replace") for token in given]
+
+
+def told(name: str) -> str:
+    """The name of an uploaded file as it is shown: of one line, not too long."""
+    return "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"

@@ -1,0 +1,180 @@
+"""What the configuration of a run may name: it may come from a stranger."""
+
+import os
+import re
+import sys
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from support import compose_config
+
+from completesplat.commands import conf_folder
+from completesplat.commands.trained import GROUPS, config_of_run
+from completesplat.errors import WeightsError
+
+MINE = """
+import json
+from torch import load
+class Mine:
+    pass
+def make(**settings):
+    return Mine()
+"""
+
+
+class Payload:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return open, (str(self.path), "w")
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run's folder, with a checkpoint that is never read."""
+    folder = tmp_path / "runs/run"
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints/last.ckpt").touch()
+    config = compose_config("fit", "experiment=toy_var", "data.root=DATA", "out=OUT")
+    resolved = {name: OmegaConf.to_container(config[name], resolve=True) for name in ("model", "data")}
+    OmegaConf.save(resolved, folder / "config.yaml")
+    return folder
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """A folder of the user's own modules."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules/mine.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path / "modules")
+    yield
+    sys.modules.pop("mine", None)
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    return tmp_path / "elsewhere"
+
+
+def name(run, value, place="model.rasterizer"):
+    config = OmegaConf.load(run / "config.yaml")
+    OmegaConf.update(config, place, value, merge=False, force_add=True)
+    OmegaConf.save(config, run / "config.yaml")
+
+
+def configuration(run, *overrides, trust=False):
+    return config_of_run(run / "checkpoints/last.ckpt", list(overrides), trust)
+
+
+FOREIGN = [
+    {"_target_": "torch.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "numpy.load", "file": "PAYLOAD", "allow_pickle": True},
+    {"_target_": "os.system", "command": "touch SPRUNG"},
+    {"_target_": "posix.system", "_args_": ["touch SPRUNG"]},
+    {"_target_": "builtins.eval", "_args_": ["open('SPRUNG', 'w')"]},
+    {"_target_": "lightning.Trainer", "default_root_dir": "SPRUNG"},
+    {"_target_": "torch.optim.adam.torch.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "torch.optim.Adam.__init__.__globals__"},
+    {"_target_": "completesplat.commands.launch", "verb": "test", "arguments": []},
+    {"_target_": "completesplat.cli.main"},
+    {"_target_": "completesplat.data.toy.write", "out": "SPRUNG"},
+    {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "completesplat.training.callbacks.ExportWeights"},
+    {"_target_": "__main__.open", "file": "SPRUNG", "mode": "w"},
+    {"_target_": "missing_module.Thing"},
+    {"_target_": ""},
+    {"_target_": None},
+    {"_target_": ["os.system"]},
+    {"_target_": "torch.optim.Adam", "_args_": [[{"_target_": "os.system", "command": "touch SPRUNG"}]]},
+    {"_target_": "mine.load", "f": "PAYLOAD", "weights_only": False},
+    {"_target_": "mine.json.loads", "s": "{}"},
+    {"_target_": "mine.Mine.mro"},
+    {"_target_": "mine.make.__globals__.get"},
+]
+
+
+@pytest.mark.parametrize("foreign", FOREIGN, ids=lambda foreign: str(foreign["_target_"]))
+@pytest.mark.parametrize("place", ["model.rasterizer", "data.more"])
+def test_what_is_neither_the_packages_nor_the_users_own_is_refused_always(
+    run, mine, elsewhere, tmp_path, monkeypatch, foreign, place
+):
+    torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")
+    text = OmegaConf.to_yaml(foreign).replace("PAYLOAD", str(tmp_path / "payload"))
+    name(run, OmegaConf.create(text.replace("SPRUNG", str(tmp_path / "sprung"))), place)
+    for trust in (False, True):
+        with pytest.raises(WeightsError, match=r"config\.yaml names |cannot be imported"):
+            configuration(run, trust=trust)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(WeightsError, match=r"not defined in a module of your own|cannot be imported"):
+        configuration(run)
+    assert not (tmp_path / "sprung").exists()
+
+
+@pytest.mark.parametrize("target", ["mine.Mine", "mine.make"])
+def test_modules_of_the_users_own_are_named_where_the_run_is_the_users_or_trusted(
+    run, mine, elsewhere, tmp_path, monkeypatch, target
+):
+    name(run, {"_target_": target})
+    with pytest.raises(WeightsError, match=rf"config\.yaml names {target}, .* trust=true"):
+        configuration(run)
+    assert "mine" not in sys.modules
+    assert configuration(run, trust=True).model.rasterizer._target_ == target
+    monkeypatch.chdir(tmp_path)
+    assert configuration(run).model.rasterizer._target_ == target
+    monkeypatch.setattr(os, "getuid", lambda: os.stat(run).st_uid + 1)
+    with pytest.raises(WeightsError, match="trust=true"):
+        configuration(run)
+
+
+def test_a_module_of_a_foreign_folder_is_not_found(run, tmp_path, monkeypatch):
+    (run / "evil.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\n")
+    name(run, {"_target_": "evil.Evil"})
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(WeightsError, match=r"names evil\.Evil"):
+        configuration(run, trust=True)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):
+    found = configuration(run, "model.loss=null", "model.rasterizer._target_=anything.At", "data.root=${oc.env:HOME}")
+    assert found.model.rasterizer._target_ == "anything.At"
+    assert found.data.root == os.environ["HOME"]
+    name(run, {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}, "model.optimizer")
+    assert configuration(run).model.optimizer.lr == 0.1
+    with_targets = {path.parent.name for path in conf_folder().glob("*/*.yaml") if "_target_: " in path.read_text()}
+    others = {one for one in with_targets if one.endswith("_task")} | {"callbacks", "evaluation", "logger", "trainer"}
+    assert with_targets - others <= GROUPS
+
+
+@pytest.mark.parametrize("value", ["${oc.env:HOME}", "${hydra:runtime.cwd}", "${data.root}", "a ${x}"])
+def test_resolvers_and_references_are_refused(run, value):
+    name(run, value, "model.background")
+    with pytest.raises(WeightsError, match=re.escape(f"{value} refers to something else")):
+        configuration(run, trust=True)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "model: 3", "{", "model: {}", "!!python/object/apply:os.getcwd []"])
+def test_what_is_no_configuration_is_refused(run, text):
+    (run / "config.yaml").write_text(text)
+    with pytest.raises(WeightsError, match=r"config\.yaml: not "):
+        configuration(run)
+
+
+@pytest.mark.parametrize(
+    "verb", ["test", "test evaluation=hidden_modes", "report samplers", "report views", "data latents"]
+)
+def test_no_verb_runs_what_a_run_names(command, run, elsewhere, monkeypatch, tmp_path, verb):
+    monkeypatch.chdir(elsewhere)  # `command` works in the folder that holds the run
+    torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")
+    for place in ("model.rasterizer", "model.model.encoder"):
+        name(run, {"_target_": "torch.load", "f": str(tmp_path / "payload"), "weights_only": False}, place)
+    finished = command(*verb.split(), f"ckpt={run}/checkpoints/last.ckpt")
+    assert not (tmp_path / "sprung").exists()
+    assert finished.status == 2
+    assert finished.err.splitlines()[-1].startswith(f"error: {run}/config.yaml names torch.load, ")

@@ -1,0 +1,231 @@
+"""Weights of a stranger: their configuration starts nothing, and gets no memory that their file does not have."""
+
+import copy
+import json
+import math
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import reduce
+
+import pytest
+from support import compose_config
+
+from completesplat.errors import WeightsError
+from completesplat.generation import CompleteSplat
+from completesplat.parts import CLASSES, PARTS, check_architecture, settings_of
+from completesplat.schema import refused
+from completesplat.weights import BOX, CONFIG_FILE, LARGEST_TEXT, SUMS_FILE
+
+ENCODER = "autoreconstructor.encoder"
+SCHEDULER = "sampler.scheduler"
+IN_THE_BOX = json.loads((BOX / "toy_objects" / CONFIG_FILE).read_text())
+
+
+@pytest.fixture
+def folder(tiny_weights, tmp_path):
+    """Weights that anyone may have changed."""
+    shutil.copytree(tiny_weights, tmp_path / "weights")
+    (tmp_path / "weights" / SUMS_FILE).unlink()
+    return tmp_path / "weights"
+
+
+def changed(architecture: dict, place: str, value: object) -> dict:
+    """A copy with another value of a setting, which may be new."""
+    architecture = copy.deepcopy(architecture)
+    *parts, name = place.split(".")
+    reduce(dict.__getitem__, parts, architecture)[name] = value
+    return architecture
+
+
+def change(folder, place: str, value: object) -> None:
+    path = folder / CONFIG_FILE
+    path.write_text(json.dumps(changed(json.loads(path.read_text()), place, value)))
+
+
+def refusal(folder) -> str:
+    with pytest.raises(WeightsError) as caught:
+        CompleteSplat.from_pretrained(folder)
+    return str(caught.value)
+
+
+@pytest.fixture
+def trap(tmp_path, monkeypatch):
+    """A module that leaves a mark when it is imported, and a function that shows whether it was."""
+    (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\nclass Trap: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield (tmp_path / "sprung").exists
+    sys.modules.pop("trap", None)
+
+
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [
+        (SCHEDULER, {"_target_": "trap.Trap"}),
+        ("sampler", {"_target_": "trap.Trap"}),
+        ("denoiser.network", {"_target_": "trap.Trap"}),
+        (f"{ENCODER}.channels", [8, {"_target_": "trap.Trap"}]),
+        (f"{ENCODER}.channels", [[8, [{"_target_": "trap.Trap"}]]]),
+        (
+            SCHEDULER,
+            {
+                "_target_": "diffusers.utils.dynamic_modules_utils.get_class_from_dynamic_module",
+                **{"pretrained_model_name_or_path": "FOLDER", "module_file": "trap.py", "trust_remote_code": True},
+            },
+        ),
+        (
+            SCHEDULER,
+            {
+                "_target_": "completesplat.commands.launch",
+                **{"verb": "test", "arguments": ["task._target_=trap.Trap", "out=OUT"]},
+            },
+        ),
+        (SCHEDULER, {"_target_": "completesplat.cli.main"}),
+        (SCHEDULER, {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": "FOLDER"}),
+        (SCHEDULER, {"_target_": "completesplat.weights.json.loads", "_args_": ["{}"]}),
+        (SCHEDULER, {"_target_": "diffusers.DDIMScheduler.from_pretrained", "pretrained_model_name_or_path": "FOLDER"}),
+        (SCHEDULER, {"_target_": "diffusers.schedulers.scheduling_ddim.os.system", "command": "touch SPRUNG"}),
+        (SCHEDULER, {"_target_": "os.system", "command": "touch SPRUNG"}),
+        (SCHEDULER, {"_target_": "completesplat.diffusion.sampling.Sampler", "scheduler": {"_target_": "trap.Trap"}}),
+    ],
+)
+def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, tmp_path, place, named):
+    written = {"FOLDER": tmp_path, "OUT": tmp_path / "out", "SPRUNG": tmp_path / "sprung"}
+    text = reduce(lambda said, name: said.replace(name, str(written[name])), written, json.dumps(named))
+    change(folder, place, json.loads(text))
+    message = refusal(folder)
+    assert not trap()
+    assert "trap" not in sys.modules
+    assert message.startswith(f"{folder / CONFIG_FILE}: {place.split('.')[0]}")
+    assert "no part of a model" in message or "must be a whole number" in message or "no such setting" in message
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are comp"),
+        ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
+        ("denoiser", "completesplat.diffusion.denoiser.Denoiser", "is no part of a model"),
+        ("denoiser", None, "is no part of a model"),
+        ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
+        (f"{SCHEDULER}._args_", [10**9], "._args_: there is no such setting"),
+        (f"{SCHEDULER}._convert_", "all", "._convert_: there is no such setting"),
+        ("sampler.steps", "${oc.env:HOME}", "sampler.steps=${oc.env:HOME}: must be a whole number"),
+        (f"{SCHEDULER}.beta_schedule", "${oc.env:HOME}", "choose one of linear,"),
+        ("conditioning.pretrained", "some/hub-id", "there is no such setting"),
+        ("autoreconstructor.pretrained", "some/hub-id", "autoreconstructor.pretrained=some/hub-id: must be null"),
+        ("image_size", 1_000_000, "image_size=1000000: must lie between 8 and 1024"),
+        ("image_size", math.nan, "image_size=nan: must be a whole number"),
+        ("image_size", 10**300, "must lie between 8 and 1024"),
+        ("image_size", True, "must be a whole number"),
+        (f"{ENCODER}.channels", [10**9] * 4, "must lie between 1 and 8192"),
+        (f"{ENCODER}.channels", [8] * 100_000, "must have at most 8 entries"),
+        (f"{ENCODER}.channels", 8, "must be a list"),
+        (f"{ENCODER}.first_log_variance", math.inf, "must lie between -30 and 20"),
+        ("denoiser.layers_per_block", 10**6, "must lie between 1 and 16"),
+        ("autoreconstructor.skip_dropout", math.nan, "must lie between 0 and 1"),
+        ("autoreconstructor.reconstructor.parameterization.layers", 10**6, "must lie between 1 and 16"),
+        (f"{SCHEDULER}.num_train_timesteps", 10**9, "must lie between 1 and 10000"),
+        (f"{SCHEDULER}.trained_betas", [0.1] * 20_000, "must have at most 10000 entries"),
+        ("more", {}, "a model's settings are autoreconstructor, "),
+    ],
+)
+def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, said):
+    change(folder, place, value)
+    message = refusal(folder)
+    assert message.startswith(f"{folder / CONFIG_FILE}: ")
+    assert said in message
+    assert len(message) < 1000
+
+
+def test_what_is_no_configuration_at_all_is_refused(folder):
+    for text, said in (
+        ("", "not readable as JSON"),
+        ("[" * 100_000, "not readable as JSON"),
+        ('{"image_size": ' + "9" * 5000 + "}", "not readable as JSON"),
+        ("[]", "a model's settings are"),
+        ("{}", "a model's settings are"),
+        (" " * LARGEST_TEXT + "{}", f"and {LARGEST_TEXT} are plenty"),
+    ):
+        (folder / CONFIG_FILE).write_text(text)
+        assert said in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "tensor"),
+    [
+        ("denoiser.channels", [2048] * 4, "denoiser.network.conv_in.weight"),
+        ("denoiser.layers_per_block", 16, "denoiser.network.down_blocks"),
+        (f"{ENCODER}.latent_channels", 8192, f"{ENCODER}.network.conv_out.weight"),
+    ],
+)
+def test_a_network_is_not_larger_than_its_file(folder, place, value, tensor):
+    change(folder, place, value)
+    message = refusal(folder)
+    assert tensor in message
+    assert f"by {CONFIG_FILE}" in message
+
+
+@pytest.mark.slow
+def test_no_memory_is_asked_for_that_the_file_does_not_have(folder):
+    change(folder, "denoiser.channels", [1024] * 4)
+    program = f"""
+        import resource
+        from completesplat.generation import CompleteSplat
+        from completesplat.weights import BOX
+        CompleteSplat.from_pretrained(BOX / "toy_objects")
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        try:
+            CompleteSplat.from_pretrained({str(folder)!r})
+        except Exception:
+            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    """
+    program = "\n".join(line.removeprefix(" " * 8) for line in program.splitlines())
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(found) < 100_000  # kB; such a network takes a million
+
+
+def settings(part: dict, place: str = "") -> Iterator[str]:
+    for name, value in part.items():
+        yield f"{place}{name}"
+        if isinstance(value, dict):
+            yield from settings(value, f"{place}{name}.")
+
+
+ODD = (None, True, -1, 0, 10**400, 1e308, math.nan, "", "x", "${x}", [], [None], {}, {"_target_": "x"}, [[]])
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: str(odd)[:20])
+def test_any_value_in_any_place_is_refused_as_weights_are_or_is_of_the_settings_kind(odd):
+    accepted = []
+    for place in settings(IN_THE_BOX):
+        try:
+            check_architecture(changed(IN_THE_BOX, place, odd))
+            accepted.append(place)
+        except WeightsError as error:
+            assert len(str(error)) < 1000  # noqa: PT017
+    assert not any("_target_" in place for place in accepted)
+    if odd not in (None, True, 0, []) or odd is math.nan:
+        assert accepted == []
+
+
+def test_every_setting_of_every_class_is_checked():
+    for kind in CLASSES.values():
+        for name, hint in settings_of(kind).items():
+            assert name in PARTS or refused(hint, object()), (kind, name)
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ["autoreconstructor=stable_diffusion", "denoiser=stable_diffusion", "posterior=views_attention"],
+        ["autoreconstructor=minis", "conditioning=stable_diffusion", "posterior=views", "sampler=dpm20"],
+        ["denoiser=stable_diffusion_no_text", "posterior=image", "objective=flow"],
+        ["ablation=no_skips", "sampler=unipc5"],
+    ],
+)
+def test_what_the_configuration_tree_offers_may_be_saved_and_loaded(chosen):
+    config = compose_config("fit", "model=latent_diffusion", "autoreconstructor.pretrained=null", *chosen)
+    config = config.model.completesplat
+    check_architecture({name: config[name] for name in (*PARTS.keys() & config.keys(), "image_size")})

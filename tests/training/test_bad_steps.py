@@ -1,0 +1,213 @@
+"""Steps whose loss or gradients are not finite change nothing, and many in a row end the run."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from lightning import Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
+from small_runs import Batches
+from support import SMALL, strict_json
+
+from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
+from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
+from completesplat.training.reconstruction import ReconstructionModule
+
+NAN, INFINITE = float("nan"), float("inf")
+FAULTS = {
+    "a loss that is NaN": lambda loss, weight: loss * NAN,
+    "an infinite loss, whose gradients are finite": lambda loss, weight: loss + INFINITE,
+    "one element of a gradient that is NaN": lambda loss, weight: loss + spoilt(weight, NAN),
+    "one infinite element of a gradient": lambda loss, weight: loss + spoilt(weight, INFINITE),
+    "finite gradients whose norm is not": lambda loss, weight: loss + 1e30 * weight.sum(),
+}
+
+
+def spoilt(weight: torch.Tensor, value: float) -> torch.Tensor:
+    """Nothing, with a gradient that has one such element."""
+    copy = weight[0, 0] * 1.0
+    copy.register_hook(lambda gradient: gradient * value)
+    return copy - copy.detach()
+
+
+class Faulty(BoringModel):
+    """Has a fault in the batches that it is told, and keeps its weights after every batch."""
+
+    def __init__(self, fault=None, batches=()) -> None:
+        super().__init__()
+        self.fault, self.batches, self.seen = fault, batches, []
+
+    def configure_optimizers(self):
+        optimizer = torch.optim.AdamW(self.parameters(), lr=0.1)
+        return [optimizer], [{"scheduler": torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.9), "interval": "step"}]
+
+    def training_step(self, batch, index):
+        loss = self.layer(batch).square().mean()
+        self.log("train/mse", loss.detach())
+        return self.fault(loss, self.layer.weight) if index in self.batches else loss
+
+    def on_train_batch_end(self, *_):
+        state = self.optimizers().state.get(self.layer.weight, {})
+        average = next((c for c in self.trainer.callbacks if isinstance(c, ExponentialMovingAverage)), None)
+        averaged = [] if average is None else average._average_model.module.parameters()
+        self.seen.append([x.detach().clone() for x in (*self.parameters(), *state.values(), *averaged)])
+
+
+def train(module, *callbacks, steps=12, accumulated=1, most=3, ckpt_path=None, **settings) -> BadSteps:
+    torch.manual_seed(0)
+    module.layer.reset_parameters()
+    bad = BadSteps(most)
+    trainer = Trainer(
+        max_steps=steps, accelerator="cpu", logger=False, plugins=[CheckpointFiles()], callbacks=[bad, *callbacks],
+        accumulate_grad_batches=accumulated, enable_progress_bar=False, enable_model_summary=False,
+        enable_checkpointing=any(isinstance(c, Checkpoints) for c in callbacks), gradient_clip_val=1.0, **settings,
+    )  # fmt: skip
+    trainer.fit(module, Batches(), ckpt_path=ckpt_path, weights_only=True)
+    return bad
+
+
+def equal(one, other) -> bool:
+    return len(one) == len(other) and all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_step_changes_nothing_and_the_next_goes_on(fault):
+    module = Faulty(FAULTS[fault], batches=(4, 5, 8))
+    bad = train(module, ExponentialMovingAverage(0.9), steps=12)
+    assert (bad.total, bad.in_a_row) == (3, 0)
+    changed = [not equal(one, other) for one, other in zip(module.seen[:-1], module.seen[1:], strict=True)]
+    assert [batch for batch, different in enumerate(changed, start=1) if not different] == [4, 5, 8]
+    assert all(x.isfinite().all() for x in module.seen[-1])
+    assert module.trainer.global_step == 12
+    assert module.lr_schedulers().last_epoch == 12
+
+
+def test_a_run_without_bad_steps_is_as_it_would_be_without_the_callback(monkeypatch):
+    watched, free = Faulty(), Faulty()
+    train(watched, ExponentialMovingAverage(0.9))
+    monkeypatch.setattr(BadSteps, "on_before_optimizer_step", lambda *_: None)
+    train(free, ExponentialMovingAverage(0.9))
+    assert all(equal(one, other) for one, other in zip(watched.seen, free.seen, strict=True))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("batch", [3, 4, 5])
+def test_one_bad_batch_of_several_leaves_out_their_step(fault, batch):
+    module = Faulty(FAULTS[fault], batches=(batch,))
+    bad = train(module, ExponentialMovingAverage(0.9), steps=4, accumulated=3)
+    assert bad.total == 1
+    before, after = module.seen[2], module.seen[7]
+    assert equal(before, after)
+    assert not equal(after, module.seen[8])
+
+
+def test_so_many_in_a_row_end_the_run_and_name_step_term_and_layer():
+    module = Faulty(FAULTS["a loss that is NaN"], batches=(2, 3, 5, 6, 7, 8))
+    with pytest.raises(
+        DivergenceError, match=r"^step 7: 3 steps in a row .* gradients that of layer\.weight is the first"
+    ):
+        train(module)
+    assert all(x.isfinite().all() for x in module.parameters())
+    with pytest.raises(CompleteSplatError, match="most_bad_steps=0: must be at least 1"):
+        BadSteps(0)
+
+
+def test_the_count_goes_on_in_a_continued_run(tmp_path):
+    def module() -> Faulty:
+        return Faulty(FAULTS["a loss that is NaN"], batches=(3, 4))
+
+    whole, first, second = module(), module(), module()
+    assert train(whole, ExponentialMovingAverage(0.9), steps=4, accumulated=2).total == 2
+    train(first, ExponentialMovingAverage(0.9), Checkpoints(str(tmp_path)), steps=3, accumulated=2)
+    path = tmp_path / "last.ckpt"
+    bad = train(second, ExponentialMovingAverage(0.9), steps=4, accumulated=2, ckpt_path=path)
+    assert bad.total == 2
+    assert equal(whole.seen[-1], second.seen[-1])
+
+
+def test_no_checkpoint_of_weights_that_are_not_finite(tmp_path):
+    """The update itself is too large: neither loss nor gradient was."""
+
+    class TooFast(Faulty):
+        def optimizer_step(self, *arguments):
+            super().optimizer_step(*arguments)
+            if self.global_step == 4:  # the fifth, which is not counted yet
+                self.layer.bias.data[0] = INFINITE
+
+    with pytest.raises(DivergenceError, match=r"step 5: layer\.bias is not finite; no checkpoint is written of it"):
+        train(TooFast(), Checkpoints(str(tmp_path), every_n_train_steps=1), most=100)
+    assert torch.load(tmp_path / "last.ckpt", weights_only=True)["global_step"] == 4
+
+
+TWO_PROCESSES = """
+import sys
+
+sys.path += sys.argv[1:]
+
+import torch
+
+from test_bad_steps import FAULTS, Faulty, train
+
+
+class OnOne(Faulty):
+    def training_step(self, batch, index):
+        loss = self.layer(batch).square().mean()
+        return self.fault(loss, self.layer.weight) if index in self.batches and self.global_rank == 1 else loss
+
+
+for name, fault in FAULTS.items():
+    module = OnOne(fault, batches=(1, 2, 4))
+    assert train(module, steps=5, devices=2, strategy="ddp").total == 3, name
+    one, other = module.all_gather(module.layer.weight.detach())
+    assert torch.equal(one, other) and one.isfinite().all(), name
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_leave_out_the_same_steps(tmp_path, request):
+    program, folders = tmp_path / "program.py", request.path.parents[:2]
+    program.write_text(TWO_PROCESSES)
+    command = [sys.executable, str(program), *map(str, folders)]
+    finished = subprocess.run(command, timeout=300, capture_output=True, text=True)
+    assert finished.returncode == 0, finished.stderr
+
+
+def fit(command, root, run, *settings):
+    given = ["experiment=toy_var", f"data.root={root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    return command("fit", *given, "trainer.log_every_n_steps=1", *settings, f"out={run}")
+
+
+def test_a_run_that_diverges_ends_with_one_line_and_keeps_its_checkpoint(command, toy_root, tmp_path, monkeypatch):
+    step = ReconstructionModule.training_step
+
+    def failing(self, scenes, index):
+        loss = step(self, scenes, index)
+        return loss * NAN if self.global_step >= 3 else loss
+
+    monkeypatch.setattr(ReconstructionModule, "training_step", failing)
+    settings = ["trainer.max_steps=20", "callbacks.checkpoint.every_n_train_steps=2"]
+    finished = fit(command, toy_root, tmp_path / "run", *settings)
+    assert finished.status == 1
+    line = finished.err.splitlines()[-1]
+    assert line.startswith("error: step 12: 10 steps in a row")
+    assert "model." in line
+    weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
+    assert all(value.isfinite().all() for value in weights.values())
+    assert "Traceback" not in finished.err
+
+
+def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root, tmp_path, monkeypatch):
+    """The last step is bad, so that its loss is among the results."""
+    render = ReconstructionModule.render
+
+    def failing(self, gaussians, scenes):
+        return render(self, gaussians, scenes) * (NAN if self.training and self.global_step == 1 else 1.0)
+
+    monkeypatch.setattr(ReconstructionModule, "render", failing)
+    assert fit(command, toy_root, tmp_path / "run").status == 0
+    found = strict_json(tmp_path / "run/metrics.json")
+    assert found["train/bad_steps"] == 1
+    assert found["train/loss"] is None
+    assert "train/loss: nan" in found["not_finite"]

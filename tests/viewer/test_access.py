@@ -1,0 +1,296 @@
+"""The server's port as other pages, other programs and the page itself may use it, without a browser."""
+
+import http.client
+import logging
+import socket
+import struct
+import threading
+from contextlib import closing, suppress
+from types import SimpleNamespace
+
+import pytest
+
+viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
+
+import websockets.asyncio.server  # noqa: E402
+from viser import _messages as messages  # noqa: E402
+from viser.infra import _infra  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from completesplat.errors import CompleteSplatError  # noqa: E402
+from completesplat.viewer import access  # noqa: E402
+from completesplat.viewer.access import MOST_FRAME, cookie_name, told  # noqa: E402
+from completesplat.viewer.page import start_server  # noqa: E402
+
+SECONDS = 30
+MIB = 2**20
+EVIL = "evil.example"
+HANDSHAKE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+}
+
+
+@pytest.fixture(scope="module")
+def server():
+    made = start_server(0)
+    yield made
+    made.stop()
+
+
+def headers_of(server, host: str = "127.0.0.1:{port}", origin: str | None = None, cookie: str = "") -> dict[str, str]:
+    places = {"port": server.get_port(), "token": server.token}
+    found = {"Host": host, "Origin": origin or "", "Cookie": cookie}
+    return {name: text.format(**places) for name, text in found.items() if text}
+
+
+def status(server, path: str, headers: dict[str, str]) -> tuple[int, http.client.HTTPMessage]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=SECONDS)
+    connection.request("GET", path, headers=headers)
+    with closing(connection), connection.getresponse() as response:
+        return response.status, response.msg
+
+
+def statuses(server, query: str, **headers: str) -> tuple[int, int]:
+    """Of a request for the page, and of a websocket's handshake."""
+    path, asked = "/" + query.format(token=server.token), headers_of(server, **headers)
+    return status(server, path, asked)[0], status(server, path, asked | HANDSHAKE)[0]
+
+
+def open_socket(server, path: str = "", cookie: str = ""):
+    address = ("127.0.0.1", server.get_port())
+    host = "{}:{}".format(*address)
+    return connect(
+        f"ws://{host}{path}",
+        sock=socket.create_connection(address, timeout=SECONDS),  # past a proxy that may be set
+        origin=f"http://{host}",
+        additional_headers={"Cookie": cookie},
+        subprotocols=[f"viser-v{viser.__version__}"],
+    )
+
+
+OWN = "http://127.0.0.1:{port}"
+COOKIE = "other=1; completesplat-{port}={token}"
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "LocalHost:{port}", "[::1]:{port}"])
+@pytest.mark.parametrize(("query", "cookie"), [("?token={token}", ""), ("", COOKIE), ("?a=b&token={token}", "x")])
+def test_the_page_and_its_socket_open_with_the_token(server, host, query, cookie):
+    assert statuses(server, query, host=host, origin=f"http://{host}".lower(), cookie=cookie) == (200, 101)
+
+
+def test_the_page_brings_the_token_as_a_cookie_for_itself_only(server):
+    assert server.address == f"http://127.0.0.1:{server.get_port()}/?token={server.token}"
+    of_the_page, headers = status(server, f"/?token={server.token}", headers_of(server))
+    assert of_the_page == 200  # a request of the address bar has no origin
+    cookie, *attributes = headers["Set-Cookie"].split("; ")
+    assert cookie == f"{cookie_name(server.get_port())}={server.token}"
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} == set(attributes)
+    assert headers["Referrer-Policy"] == "no-referrer"
+    with open_socket(server, cookie=cookie) as opened:
+        assert opened.recv(timeout=SECONDS)
+
+
+@pytest.mark.parametrize("cookie", ["", COOKIE])
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        (EVIL, OWN),
+        (f"{EVIL}:{{port}}", f"http://{EVIL}:{{port}}"),  # a name that its owner points at this machine
+        ("127.0.0.1", OWN),
+        ("127.0.0.1:1", OWN),
+        (f"127.0.0.1:{{port}}.{EVIL}", OWN),
+        (f"{EVIL}@127.0.0.1:{{port}}", OWN),
+        ("127.0.0.1:{port}", f"http://{EVIL}"),
+        ("127.0.0.1:{port}", f"http://{EVIL}:{{port}}"),
+        ("127.0.0.1:{port}", "http://127.0.0.1:1"),  # another program's page on this machine
+        ("127.0.0.1:{port}", "https://127.0.0.1:{port}"),
+        ("127.0.0.1:{port}", "null"),  # a file, a sandbox
+        ("127.0.0.1:{port}", f"{OWN}.{EVIL}"),
+    ],
+)
+def test_other_sites_get_nothing_though_they_had_the_token(server, host, origin, cookie):
+    assert statuses(server, "" if cookie else "?token={token}", host=host, origin=origin, cookie=cookie) == (403, 403)
+
+
+@pytest.mark.parametrize("query", ["", "?token=", "?token=wrong", "?token={token}x", "?token=%ff", "?Token={token}"])
+@pytest.mark.parametrize("cookie", ["", "completesplat-{port}=wrong", "completesplat-1={token}", "\xfc; =;;"])
+def test_nobody_gets_anything_without_the_token(server, query, cookie):
+    assert statuses(server, query, origin=OWN, cookie=cookie) == (403, 403)
+
+
+def test_a_handshake_says_where_its_page_comes_from_and_every_request_has_one_host(server):
+    assert statuses(server, "?token={token}") == (200, 403)
+    for hosts in ([], [f"127.0.0.1:{server.get_port()}"] * 2):
+        connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=SECONDS)
+        connection.putrequest("GET", f"/?token={server.token}", skip_host=True)
+        for host in hosts:
+            connection.putheader("Host", host)
+        connection.endheaders()
+        assert connection.getresponse().status == 403
+
+
+def test_tokens_are_compared_in_constant_time_and_differ(server, monkeypatch):
+    compared = []
+    original = access.secrets.compare_digest
+    monkeypatch.setattr(access.secrets, "compare_digest", lambda *two: compared.append(two) or original(*two))
+    statuses(server, "?token=wrong", origin=OWN)
+    assert compared == [(b"wrong", server.token.encode())] * 2
+    assert len(server.token) >= 43  # 256 bits
+    second = start_server(0)
+    second.stop()
+    assert second.token != server.token
+
+
+def own_socket(server):
+    return open_socket(server, f"/?token={server.token}")
+
+
+def closed_with(opened) -> int:
+    """The code with which the server ends the connection."""
+    with suppress(ConnectionClosed):
+        while True:
+            opened.recv(timeout=SECONDS)
+    return opened.close_code
+
+
+def test_a_message_that_is_too_long_is_refused_when_it_is_announced(server):
+    with own_socket(server) as opened:
+        announced = struct.pack("!BBQI", 0x82, 0x80 | 127, MOST_FRAME + 1, 0)  # the head of a frame, and nothing of it
+        opened.socket.sendall(announced)
+        assert closed_with(opened) == 1009
+    with own_socket(server) as opened:
+        opened.send(iter([bytes(MOST_FRAME // 2)] * 3))  # one message in three frames
+        assert closed_with(opened) == 1009
+
+
+class Uploader:
+    """What viser's page does to send a file."""
+
+    def __init__(self, server, opened) -> None:
+        self.server, self.opened = server, opened
+        self.button = server.gui.add_upload_button("file")
+        self.received: list[bytes] = []
+        self.arrived = threading.Event()
+        self.button.on_upload(lambda event: (self.received.append(event.target.value.content), self.arrived.set()))
+        camera = {"fov": 1.0, "near": 0.1, "far": 9.0, "image_height": 8, "image_width": 8}
+        three = (0.0, 0.0, 1.0)
+        self.send(messages.ViewerCameraMessage((1.0, 0, 0, 0), three, **camera, look_at=three, up_direction=three))
+        until(server.get_clients)
+
+    def send(self, message) -> None:
+        self.opened.send(_infra.msgspec.msgpack.encode(message.as_serializable_dict()))
+
+    def start(self, name: str, size: int, parts: int) -> None:
+        self.send(messages.FileTransferStartUpload(self.button._impl.uuid, name, f"{name}.png", "", parts, size))
+
+    def part(self, name: str, index: int, content: bytes) -> None:
+        self.send(messages.FileTransferPart(self.button._impl.uuid, name, index, content))
+
+    def whole(self, name: str, content: bytes) -> None:
+        """A file that is let in; what was sent before has been received when this returns."""
+        self.arrived.clear()
+        self.start(name, len(content), 1)
+        self.part(name, 0, content)
+        assert self.arrived.wait(SECONDS)
+
+    def uploads(self) -> dict[str, int]:
+        """Bytes that are kept of the files that are being received."""
+        states = self.server.gui._current_file_upload_states
+        return {name: state["transferred_bytes"] for name, state in states.items()}
+
+
+def until(true) -> None:
+    waited = threading.Event()
+    assert any(true() or waited.wait(0.02) for _ in range(50 * SECONDS))
+
+
+@pytest.fixture
+def uploader(server, monkeypatch):
+    monkeypatch.setattr(access, "MOST_BYTES", 2 * MIB)
+    with own_socket(server) as opened:
+        yield Uploader(server, opened)
+    until(lambda: not server.get_clients())
+    assert server.gui._current_file_upload_states == {}  # a browser that leaves takes them with it
+    server.gui.reset()
+
+
+def test_a_file_is_refused_by_the_size_that_is_announced(uploader, monkeypatch):
+    told = []
+    client = next(iter(uploader.server.get_clients().values()))
+    monkeypatch.setattr(type(client), "add_notification", lambda _, title, body, **__: told.append(body))
+    uploader.start("big", 3 * MIB, 6)
+    uploader.part("big", 0, bytes(MIB // 2))
+    uploader.start("negative", -1, 1)
+    uploader.start("crumbs", 10, 10**9)
+    uploader.whole("good", b"picture")
+    assert uploader.received == [b"picture"]
+    assert uploader.uploads() == {}
+    assert told[0] == "big.png: 3 MiB; at most 2 MiB are taken at a time"
+    assert len(told) == 3
+
+
+def test_no_more_is_received_than_was_announced(uploader):
+    uploader.start("liar", 10, 4)
+    uploader.part("liar", 0, bytes(8))
+    uploader.part("liar", 1, bytes(MIB // 2))
+    uploader.part("liar", 2, bytes(MIB // 2))
+    uploader.whole("good", b"picture")
+    assert uploader.uploads() == {}
+    assert uploader.received == [b"picture"]
+
+
+def test_files_that_are_received_at_once_share_the_room(uploader):
+    uploader.start("first", MIB, 2)
+    uploader.part("first", 0, bytes(MIB // 2))
+    uploader.start("second", MIB + 1, 3)
+    uploader.part("second", 0, bytes(MIB // 2))
+    uploader.whole("third", b"picture")
+    assert uploader.uploads() == {"first": MIB // 2}
+    uploader.arrived.clear()
+    uploader.part("first", 1, bytes(MIB // 2))
+    assert uploader.arrived.wait(SECONDS)
+    assert [len(content) for content in uploader.received] == [7, MIB]
+
+
+def test_who_leaves_before_looking_takes_its_files_with_it(server):
+    """viser knows a browser from its first camera on."""
+    button = server.gui.add_upload_button("file")
+    uploads = server.gui._current_file_upload_states
+    with own_socket(server) as opened:
+        start = messages.FileTransferStartUpload(button._impl.uuid, "early", "a.png", "", 2, MIB)
+        opened.send(_infra.msgspec.msgpack.encode(start.as_serializable_dict()))
+        until(lambda: uploads)
+    until(lambda: not uploads)
+    button.remove()
+
+
+def test_names_of_files_are_shown_as_one_short_line():
+    assert told("a\n\x1b[31mb") == "a??[31mb"
+    assert told("") == "the file"
+    assert len(told("x" * 10**6)) == 80
+
+
+def test_a_viser_that_leaves_the_checks_out_is_not_served(monkeypatch):
+    """It calls another function than the one that is replaced."""
+    serve = websockets.asyncio.server.serve
+    other = SimpleNamespace(asyncio=SimpleNamespace(server=SimpleNamespace(serve=serve)))
+    monkeypatch.setattr(_infra, "websockets", other)
+    ports = []
+    stop = access.GuardedServer.stop
+    monkeypatch.setattr(access.GuardedServer, "stop", lambda self: (ports.append(self.get_port()), stop(self)))
+    with pytest.raises(CompleteSplatError, match="cannot guard viser"):
+        start_server(0)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", ports[0]), timeout=SECONDS).close()
+    assert websockets.asyncio.server.serve is serve
+
+
+def test_refusals_are_not_logged(server, caplog):
+    with caplog.at_level(logging.WARNING):
+        assert statuses(server, "") == (403, 403)
+    assert caplog.text == ""
