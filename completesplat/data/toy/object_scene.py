@@ -157,7 +157,7 @@ def bear(rng: np.random.Generator) -> Blueprint:
             _arm(side, wide, tall, rng, paint),
             ball((side * 0.62 * wide, -0.85 * tall, 0.75 * deep), (0.13, 0.13, rng.uniform(0.2, 0.28)), paint.detail()),
         ]
-    return Blueprint("bear", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.4))
+    return Blueprint("bear", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.6))
 
 
 def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _Painter) -> Part:
@@ -190,7 +190,7 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
             _frustum((side * (radius + 0.4 * reach), outlets, 0), 0.38 * radius, reach, coat, axis="x"),
             _frustum((side * (radius + 1.5 * reach), outlets, 0), 0.45 * radius, 0.4 * reach, paint.detail(), axis="x"),
         ]
-    return Blueprint("hydrant", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.6))
+    return Blueprint("hydrant", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.8))
 
 
 FAMILIES = (hydrant, bear)
@@ -239,7 +239,7 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     chances = np.full(len(PATCH_COLORS), 1 / len(PATCH_COLORS))
     name = str(rng.choice(list(PATCH_COLORS)))
     facing, heights = away / np.linalg.norm(away), np.array(blueprint.patch_heights)
-    patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights, edge=0.5, rim=0.5)
+    patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights, edge=0.4, rim=0.4)
     return placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, chances)
 
 
