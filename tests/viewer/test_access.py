@@ -266,6 +266,7 @@ def test_who_leaves_before_looking_takes_its_files_with_it(server):
         opened.send(_infra.msgspec.msgpack.encode(start.as_serializable_dict()))
         until(lambda: uploads)
     until(lambda: not uploads)
+    assert uploads == {}
     button.remove()
 
 
