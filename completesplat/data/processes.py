@@ -1,6 +1,7 @@
 """Work for several processes: the same results in the same order, however many they are."""
 
 import os
+import pickle
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -27,7 +28,9 @@ def map_in_processes(
     if workers <= 1:
         yield from map(function, items)
         return
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start, (function,)) as pool:
+    # As bytes: torch would share each tensor as an open file, and a data set has more cameras than those may be.
+    contents = pickle.dumps(function)
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start, (contents,)) as pool:
         try:
             yield from pool.map(_call, items)
         except BrokenProcessPool:
@@ -40,11 +43,11 @@ def map_in_processes(
 _function: Callable[[Any], Any]
 
 
-def _start(function: Callable[[Any], Any]) -> None:
+def _start(contents: bytes) -> None:
     """Remember in a new process what it is for."""
     global _function
     torch.set_num_threads(1)  # There is one process for each core.
-    _function = function
+    _function = pickle.loads(contents)  # by this process's parent
 
 
 def _call(item: Any) -> Any:
