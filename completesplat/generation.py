@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.data.pictures.photograph import Photograph, read_photograph
+from completesplat.data.pictures.photograph import Photograph, Picture, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -166,12 +166,12 @@ class CompleteSplat(nn.Module):
         return gaussians
 
     def forward(
-        self, image: Photograph | Path | str, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
+        self, image: Photograph | Picture, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
     ) -> list[Gaussians]:
         """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
 
         Args:
-            image: a file, or a photograph read with `completesplat.data.pictures.photograph.read_photograph`.
+            image: a file, a PIL image, an array, a tensor (`read`), or a photograph that was read.
             visible: 0 where it is hidden; see `completesplat.data.pictures.photograph`.
             **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
 
@@ -234,9 +234,9 @@ class CompleteSplat(nn.Module):
         self.sampler = build(config)
         self.architecture["sampler"] = config
 
-    def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
-        """Read a photograph at the model's size; an unknown field of view is taken to be the training set's."""
-        return read_photograph(Path(path), self.image_size, fov_degrees, self.fov_degrees.item())
+    def read(self, picture: Picture, fov_degrees: float | None = None) -> Photograph:
+        """A picture at the model's size (`read_photograph`); an unknown field of view is the training set's."""
+        return read_photograph(picture, self.image_size, fov_degrees, self.fov_degrees.item())
 
     def camera(self, photograph: Photograph) -> Cameras:
         """The camera that took a photograph, at the origin of the world."""

@@ -3,10 +3,10 @@
 import io
 import math
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -41,18 +41,22 @@ class Photograph(TensorDataclass):
     fov_source: Literal["given", "exif", "default"]
 
 
+Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
+
+
 def read_photograph(
-    path: str | Path, size: int, fov_degrees: float | None = None, default_fov_degrees: float = 50.0
+    picture: Picture, size: int, fov_degrees: float | None = None, default_fov_degrees: float = 50.0
 ) -> Photograph:
-    """Read an image file upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
+    """Turn a picture upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
 
     Transparency is laid over white; of an animation the first frame is taken; an embedded colour profile is
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1], grey images of floats must lie in it.
 
     Args:
-        path: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content.
+        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content; a PIL image; an
+            array [height, width, 3] of bytes, or of floats in [0, 1]; a tensor [3, height, width] of the same.
         fov_degrees: field of view of the square crop, if it is known.
-        default_fov_degrees: the same for files without usable EXIF focal length (50 is close to a phone's main camera).
+        default_fov_degrees: the same for pictures without usable EXIF focal length (50 is close to a phone's camera).
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
@@ -63,24 +67,68 @@ def read_photograph(
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        _check_file(Path(path))
-        with opened(path, FORMATS) as picture:
-            if min(picture.size) < SMALLEST_SIDE:
-                raise ImageError(f"{picture.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
-            picture.load()
-            exif = read_exif(picture)
-        turned = upright(picture, exif.get(ORIENTATION))
-        side = min(turned.size)
-        left, top = (turned.width - side) // 2, (turned.height - side) // 2
-        square = turned.crop((left, top, left + side, top + side))
-        image = _to_tensor(square, picture, size)
+        image, recorded = _square(picture, size)
     except ImageError as error:
-        raise ImageError(f"{path}: {error}") from error.__cause__
+        name = picture if isinstance(picture, (str, Path)) else "the picture"
+        raise ImageError(f"{name}: {error}") from error.__cause__
     if fov_degrees is not None:
         return Photograph(image, float(fov_degrees), "given")
-    if (recorded := crop_fov(exif, picture.size)) is not None:
+    if recorded is not None:
         return Photograph(image, recorded, "exif")
     return Photograph(image, float(default_fov_degrees), "default")
+
+
+def _square(picture: Picture, size: int) -> tuple[Float[Tensor, "3 size size"], float | None]:
+    """The central square, resized, and its field of view in degrees where EXIF tells it."""
+    if isinstance(picture, (np.ndarray, Tensor)):
+        picture = _pixels(picture)
+        if isinstance(picture, np.ndarray):
+            return _resized(picture, size), None
+    if not isinstance(picture, Image.Image):
+        _check_file(Path(picture))
+    with nullcontext(picture) if isinstance(picture, Image.Image) else opened(picture, FORMATS) as file:
+        _check_side(*file.size)
+        file.load()
+        exif = read_exif(file)
+    turned = upright(file, exif.get(ORIENTATION))
+    image = _to_tensor(turned.crop(_central_square(*turned.size)), file, size)
+    return image, crop_fov(exif, file.size)
+
+
+def _check_side(width: int, height: int) -> None:
+    if min(width, height) < SMALLEST_SIDE:
+        raise ImageError(f"{width, height} pixels; at least {SMALLEST_SIDE} on a side are needed")
+
+
+def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, upper, right and lower edge."""
+    side = min(width, height)
+    left, top = (width - side) // 2, (height - side) // 2
+    return left, top, left + side, top + side
+
+
+def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
+    """Bytes as an image, floats as they are, of an array with the channel last, or of a tensor with it first."""
+    channel = 0 if isinstance(picture, Tensor) else -1
+    if picture.ndim != 3 or picture.shape[channel] != 3:
+        raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
+    values = picture.detach().cpu().movedim(0, -1).numpy() if isinstance(picture, Tensor) else picture
+    if values.dtype == np.uint8:
+        return Image.fromarray(values)
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ImageError(f"values are {values.dtype}; bytes, or floats in [0, 1], have one meaning")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ImageError("values outside of [0, 1]")
+    return values.astype(np.float32)
+
+
+def _resized(pixels: Float[np.ndarray, "height width 3"], size: int) -> Float[Tensor, "3 size size"]:
+    height, width = pixels.shape[:2]
+    _check_side(width, height)
+    box = _central_square(width, height)
+    channels = [Image.fromarray(np.ascontiguousarray(channel)).crop(box) for channel in np.moveaxis(pixels, -1, 0)]
+    resized = [np.asarray(channel.resize((size, size), Image.Resampling.LANCZOS)) for channel in channels]
+    return torch.from_numpy(np.stack(resized).clip(0, 1))
 
 
 def _check_file(path: Path) -> None:
