@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser check lock bench notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser check lock bench docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -76,6 +76,10 @@ bench: $(READY) ## Time the rasterizer backends, data loading, and stage 2, side
 	$(BIN)/completesplat bench rasterizers
 	$(BIN)/completesplat bench data
 	$(BIN)/completesplat bench diffusion
+
+docs: $(READY) ## The API reference, from the docstrings, in outputs/api
+	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat
+	@echo "outputs/api/completesplat.html"
 
 notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb

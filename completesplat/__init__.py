@@ -9,11 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from completesplat.export.ply import read_ply, write_ply
-    from completesplat.gaussians import Gaussians
-    from completesplat.generation import CompleteSplat
+    from completesplat.export.ply import read_ply as read_ply
+    from completesplat.export.ply import write_ply as write_ply
+    from completesplat.gaussians import Gaussians as Gaussians
+    from completesplat.generation import CompleteSplat as CompleteSplat
 
-__all__ = ["CompleteSplat", "Gaussians", "read_ply", "write_ply"]
 __version__ = "0.1.0"
 
 _PLACES = {"CompleteSplat": "generation", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
@@ -27,4 +27,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_PLACES})
