@@ -178,7 +178,7 @@ class LatentDiffusion(SceneModule):
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
-        self.log("train/loss", errors.mean(), batch_size=len(errors))
+        self.log("train/loss", errors.mean(), prog_bar=True, batch_size=len(errors))
         trainer: Any = self.trainer
         if (self.global_step + 1) % trainer.log_every_n_steps == 0:
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)

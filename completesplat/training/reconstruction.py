@@ -11,6 +11,7 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
 from completesplat.training.checkpoints import load_part
 from completesplat.training.scene_module import SceneModule, prepare_network
@@ -91,8 +92,12 @@ class ReconstructionModule(SceneModule):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, scenes.all_views(), self.global_step)
+            shown, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
+            quality = psnr(shown.flatten(0, 1), truth.flatten(0, 1)).mean()
         logged = {f"train/{name}": value for name, value in values.items()}
-        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(scenes.names))
+        self.log("train/psnr", quality, prog_bar=True, batch_size=len(scenes.names))
+        self.log_dict(logged, batch_size=len(scenes.names))
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:

@@ -1,6 +1,7 @@
 """What the data modules of all data sets share: loaders and settings."""
 
 import logging
+import os
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property, partial
@@ -24,6 +25,7 @@ from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import CompleteSplatError, DataError
 
+MOST_WORKERS = 4  # by default
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
 logger = logging.getLogger(__name__)
@@ -60,7 +62,7 @@ class SceneDataModule(LightningDataModule):
         mask_threshold: masks are cut at this probability; None: they stay soft.
         color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: none.
         horizontal_flip: mirror half of the training scenes horizontally.
-        workers: processes that load data; 0: none.
+        workers: processes that load data; 0: none; None: one for each core, at most four.
         cache: keep decoded pictures in memory.
         latent_cache: train stage 2 from the latents in this folder (`CachedTrainingScenes`), without augmentation of
             pictures; validation and test read pictures. An empty name is one that is still to be given.
@@ -80,7 +82,7 @@ class SceneDataModule(LightningDataModule):
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
-        workers: int = 0,
+        workers: int | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
         on_bad: str = "skip",
@@ -100,7 +102,8 @@ class SceneDataModule(LightningDataModule):
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, horizontal_flip=horizontal_flip)
-        self.workers, self.cache = workers, cache
+        self.workers = min(MOST_WORKERS, os.cpu_count() or 1) if workers is None else workers
+        self.cache = cache
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
         self.policy = on_bad, max_bad_fraction
         self.seed = seed
