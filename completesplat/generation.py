@@ -15,6 +15,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from completesplat.atomic import atomic_path, write_text
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.pictures.photograph import Photograph, Picture, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
@@ -245,11 +246,16 @@ class CompleteSplat(nn.Module):
         return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
 
     def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub."""
+        """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub.
+
+        `DiskError`: the disk is full.
+        """
         folder = Path(path)
         folder.mkdir(parents=True, exist_ok=True)
-        save_file({key: value.contiguous().cpu() for key, value in self.state_dict().items()}, folder / WEIGHTS_FILE)
-        (folder / CONFIG_FILE).write_text(json.dumps(self.architecture, indent=2) + "\n")
+        weights = {key: value.contiguous().cpu() for key, value in self.state_dict().items()}
+        with atomic_path(folder / WEIGHTS_FILE, size=sum(value.nbytes for value in weights.values())) as temporary:
+            save_file(weights, temporary)
+        write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
 
     @classmethod

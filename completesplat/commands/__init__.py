@@ -45,6 +45,8 @@ def launch(verb: str, arguments: list[str]) -> None:
         return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
+    logging.raiseExceptions = False
     if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
     if verb == "view":
@@ -60,7 +62,8 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: Any) -> None:
         try:
-            jobs.run_job(verb, config, program, given)
+            with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
+                jobs.run_job(verb, config, program, given)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end

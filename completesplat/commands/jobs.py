@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import platform
 import re
 import sys
 import time
@@ -12,13 +13,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import get_method, instantiate
 from omegaconf import OmegaConf
 
 from completesplat import __version__
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, writing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.schema import check_settings
@@ -26,6 +28,7 @@ from completesplat.schema import check_settings
 LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
+LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
@@ -39,6 +42,35 @@ def conf_folder() -> Path:
 def one_of_several() -> bool:
     """Whether a launcher started several of this process: torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`)."""
     return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
+
+
+def is_first() -> bool:
+    """Whether this is the first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone."""
+    return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
+
+
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Hold the lock of a job's directory, in its first process; the lock's file names the process and the computer.
+
+    The system gives it up when the process ends, however that is. `CompleteSplatError`: another process holds it.
+    """
+    path = out / LOCK
+    if not is_first():
+        yield
+        return
+    try:
+        with writing(path):
+            lock = FileLock(path).acquire(blocking=False)
+    except Timeout:
+        holder = path.read_text().split()
+        named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
+        said = f"{out}: {named} is at work in it: wait for it or end it, or choose another out=DIR"
+        raise CompleteSplatError(said) from None
+    with lock:
+        with writing(path):
+            path.write_text(f"{os.getpid()}\n{platform.node()}\n")
+        yield
 
 
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
@@ -93,8 +125,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
-    # The first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone.
-    if int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0:
+    if is_first():
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
             OmegaConf.save(resolved, temporary)
         _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
@@ -131,7 +162,7 @@ def is_finished(out: Path, config: Any) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different.discard("ckpt_path")
+    different -= {"ckpt_path", "data.allow_changed"}
     if different:
         first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
         raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")

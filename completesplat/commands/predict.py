@@ -21,7 +21,7 @@ from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.commands.trained import open_generator
 from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
@@ -128,7 +128,8 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
 def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
-    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others.
+    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others;
+    a full disk does (`DiskError`).
     """
     console, failed = Console(), []
     rasterizer = instantiate(config.rasterizer, _convert_="all")
@@ -141,6 +142,8 @@ def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path]
             start = time.perf_counter()
             try:
                 _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
+            except DiskError:  # it would be the same with the others
+                raise
             except Exception as error:
                 message, expected = _told(error, picture), isinstance(error, CompleteSplatError | OSError)
                 if len(pictures) == 1 and expected:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import write_bytes
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned
 from completesplat.export.ply import write_ply
@@ -66,8 +66,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
     records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
     records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(records.tobytes())
+    write_bytes(path, records.tobytes())
     return kept.count
 
 

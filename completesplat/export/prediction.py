@@ -11,10 +11,18 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.atomic import make_folder, write_text
 from completesplat.export.cleaning import cleaned, with_screen_space_dilation
 from completesplat.export.formats import write_formats
-from completesplat.export.pictures import SheetCell, color_depth, color_normals, picture_sheet, surface_depth, to_bytes
+from completesplat.export.pictures import (
+    SheetCell,
+    color_depth,
+    color_normals,
+    picture_sheet,
+    surface_depth,
+    to_bytes,
+    write_png,
+)
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
@@ -85,11 +93,12 @@ def write_prediction(
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_sample: called when a sample's files are written.
 
-    `CompleteSplatError`: a sample without anything to draw, or a converter that fails.
+    `CompleteSplatError`: a sample without anything to draw, or a converter that fails; `DiskError`: a full disk, or the
+    folder's own one is missing.
     """
     # Before anything is written: a sample of which nothing is left is refused.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     rows: list[SampleViews] = []
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
@@ -161,8 +170,7 @@ def contact_sheet(
     rows[0][0] = SheetCell(reference)
     views = len(samples[0].images)
     headings = ["input", *(f"{360 / views * k:g}°" for k in range(views)), f"depth {near:.3g} to {far:.3g}"]
-    with atomic_path(path) as temporary:
-        picture_sheet(headings, rows, title).save(temporary, format="PNG")
+    write_png(Path(path), picture_sheet(headings, rows, title))
 
 
 @torch.no_grad()
@@ -190,8 +198,7 @@ def write_maps(
         for kind, picture in pictures.items():
             name = f"{kind}_{index:02}"
             files[name] = f"{name}.png"
-            with atomic_path(folder / files[name]) as temporary:
-                Image.fromarray(to_bytes(picture)).save(temporary, format="PNG")
+            write_png(folder / files[name], Image.fromarray(to_bytes(picture)))
     return files, ends
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
+from completesplat.atomic import make_folder
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -197,7 +198,12 @@ class ExportWeights(Callback):
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
 
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, LatentDiffusion)
         if trainer.is_global_zero:
+            make_folder(self.folder)
             pl_module.completesplat.save_pretrained(self.folder)

@@ -40,8 +40,8 @@ class CheckpointFiles(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
-        """Replace what is at this path."""
-        with _replaced(Path(path)) as unfinished:
+        """Replace what is at this path; `DiskError` if the disk refuses, and the old file stays."""
+        with _replaced(Path(path), bytes_of(checkpoint)) as unfinished:
             torch.save(checkpoint, unfinished)
             _add_checksum(unfinished)
 
@@ -96,6 +96,8 @@ class Checkpoints(Checkpoint):
                 one.experiment.goes_on_from = trainer.global_step
         begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
         last = self.folder / LAST
+        if trainer.is_global_zero:
+            self.folder.mkdir(parents=True, exist_ok=True)  # once: a run whose folder is removed is not to go on
         if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
             link(begun, last)  # in the place of a damaged one, which is not to become the one before
 
@@ -167,9 +169,18 @@ def link(source: Path, target: Path) -> None:
             shutil.copyfile(source, unfinished)
 
 
-def _replaced(path: Path) -> AbstractContextManager[Path]:
+def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
     """A file that is unfinished always has the same name: a run that is killed again and again leaves one of them."""
-    return atomic_path(path, f".{path.name}.unfinished")
+    return atomic_path(path, f".{path.name}.unfinished", size)
+
+
+def bytes_of(contents: Any) -> int:
+    """Of the tensors in nested containers: a file that holds them is at least so large."""
+    if isinstance(contents, Tensor):
+        return contents.nbytes
+    if isinstance(contents, Mapping):
+        return sum(map(bytes_of, contents.values()))
+    return sum(map(bytes_of, contents)) if isinstance(contents, list | tuple) else 0
 
 
 def _add_checksum(path: Path) -> None:

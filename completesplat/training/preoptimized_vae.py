@@ -45,6 +45,7 @@ class FittedScenes:
     def __init__(
         self, folder: Path, stores: Sequence[SceneStore], fit: Callable[[SceneBatch], Gaussians], settings: str
     ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.stores = {name: store for store in stores for name in store.names}
         self.fit = fit

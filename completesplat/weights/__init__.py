@@ -11,6 +11,7 @@ from urllib.parse import urlparse
 
 import torch
 
+from completesplat.atomic import write_text
 from completesplat.errors import WeightsError
 
 BOX = Path(__file__).parent
@@ -57,7 +58,7 @@ def read_small(path: Path) -> str:
 def write_sums(folder: Path) -> None:
     """Write the checksums of the two files that a model is read from."""
     lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
-    (folder / SUMS_FILE).write_text("".join(lines))
+    write_text(folder / SUMS_FILE, "".join(lines))
 
 
 def _locate(weights: str) -> Path:

@@ -68,6 +68,7 @@ class SceneDataModule(LightningDataModule):
             pictures; validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
+        allow_changed: a run that is continued may go on with other training data than it had.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class SceneDataModule(LightningDataModule):
         latent_cache: str | None = None,
         on_bad: str = "skip",
         max_bad_fraction: float = 0.1,
+        allow_changed: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -106,6 +108,7 @@ class SceneDataModule(LightningDataModule):
         self.cache = cache
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
         self.policy = on_bad, max_bad_fraction
+        self.allow_changed = allow_changed
         self.seed = seed
         # The same data in the smaller pictures that a tested model sees.
         self.at_model_size: SceneDataModule | None = None
@@ -152,6 +155,8 @@ class SceneDataModule(LightningDataModule):
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
+        if stage == "fit":
+            _ = self.trained_on  # as they are now, whatever becomes of the files while the run lasts
         if stage == "fit" and self.latent_cache is not None:
             self._training_scenes()  # what is wrong with the cache is an error before training starts
 
@@ -222,14 +227,27 @@ class SceneDataModule(LightningDataModule):
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)
 
+    @cached_property
+    def trained_on(self) -> dict[str, Any]:
+        """Fingerprint and number of sequences of the training data, when first asked for."""
+        source = self.source("train")
+        return {"fingerprint": source.fingerprint(), "sequences": len(source.names)}
+
     def state_dict(self) -> dict[str, Any]:
-        """The data's fingerprint, for checkpoints."""
-        return {"fingerprint": self.source("train").fingerprint()}
+        """What the training data were, for checkpoints."""
+        return dict(self.trained_on)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Warn if the run that is resumed was trained on other data."""
-        if state_dict["fingerprint"] != self.source("train").fingerprint():
-            logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
+        """Of the run that is continued: `DataError` if it had other training data, with `allow_changed` a warning."""
+        now = self.trained_on
+        before = now | state_dict  # checkpoints of version 0.1 have no number of sequences
+        if before == now:
+            return
+        counts = f"{before['sequences']} sequences then, {now['sequences']} now"
+        said = f"not the training data that this run had before ({counts})"
+        if not self.allow_changed:
+            raise DataError(f"{said}; data.allow_changed=true goes on with these", str(self.root))
+        logger.warning("%s: %s", self.root, said)
 
     def typical_camera(self) -> TypicalCamera:
         """See `mean_camera`."""
