@@ -92,7 +92,7 @@ class ReconstructionModule(SceneModule):
             prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, scenes.all_views(), self.global_step)
         logged = {f"train/{name}": value for name, value in values.items()}
-        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        self.log_step({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
