@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser check lock bench docs notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser fuzz check lock bench docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -10,6 +10,7 @@ DEMO := outputs/demo
 DEMO_SCENES := 80
 DEMO_LAST := 00079
 TRAINED := outputs/demo_train
+FUZZ_MINUTES ?= 10
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -60,6 +61,10 @@ test-slow: $(READY) ## The tests that take minutes each
 
 test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
 	$(BIN)/python -m pytest -q -m browser -rs
+
+# What hypothesis finds is kept in .hypothesis/ and tried first the next time.
+fuzz: $(READY) ## Damaged files for each of seven readers, FUZZ_MINUTES=10 each
+	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 7 tests/test_fuzzed_readers.py
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check

@@ -43,6 +43,7 @@ def launch(verb: str, arguments: list[str]) -> None:
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         out = Path(arguments[0].partition("=")[2])
         return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+    program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
@@ -51,7 +52,6 @@ def launch(verb: str, arguments: list[str]) -> None:
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
     if verb == "view":
         arguments = overrides(arguments)
-    program, given = sys.argv[0], arguments
     if "-m" in arguments or "--multirun" in arguments:
         arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):

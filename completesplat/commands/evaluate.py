@@ -95,7 +95,7 @@ def run(
         results = module.test_results()
         if not testing.is_global_zero:
             return
-        described = protocol(evaluation, module, data, results) | tested.facts()
+        described = protocol(evaluation, module, data, results, out) | tested.facts()
         log_scores(results, testing)
         write_json(out / METRICS, {"protocol": described} | results)
         log_shown(results, shown, testing, out)
@@ -162,7 +162,7 @@ def run_hidden_modes(
     write_json(out / "calibration.json", calibration)
     write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
-    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used))
+    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
     draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
@@ -174,7 +174,7 @@ def run_hidden_modes(
 
 
 def _hidden_modes_protocol(
-    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]]
+    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]], out: Path
 ) -> dict[str, Any]:
     """The statement of what was measured and how, with the names of the scenes."""
     return {
@@ -185,6 +185,6 @@ def _hidden_modes_protocol(
         **scenes,
         **{key: evaluation[key] for key in ("samples", "views", "spread_views", "seed")},
         **drawing(module),
-        **provenance(data),
+        **provenance(data, out),
         **tested.facts(),
     }

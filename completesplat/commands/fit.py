@@ -82,7 +82,7 @@ def run(config: Any, out: Path) -> None:
         results |= metrics
         if scores is not None:
             show(evaluation_table(scores))
-            described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
+            described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
             log_scores(scores, trainer)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done

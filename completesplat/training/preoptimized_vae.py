@@ -156,8 +156,7 @@ class PreoptimizedVAE(Preoptimized):
             values = torch.stack(list(errors.values())).mean()
             total: Tensor = values + self.opacity_weight * opacity + self.kl_weight * kl
         logged = {f"train/{name}": value.detach() for name, value in (errors | {"opacity": opacity, "kl": kl}).items()}
-        self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(scenes.names))
-        self.log_dict(logged, batch_size=len(scenes.names))
+        self.log_step({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
         return total
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:

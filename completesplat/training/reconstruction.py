@@ -95,9 +95,7 @@ class ReconstructionModule(SceneModule):
             shown, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
             quality = psnr(shown.flatten(0, 1), truth.flatten(0, 1)).mean()
         logged = {f"train/{name}": value for name, value in values.items()}
-        self.log("train/loss", total.detach(), prog_bar=True, batch_size=len(scenes.names))
-        self.log("train/psnr", quality, prog_bar=True, batch_size=len(scenes.names))
-        self.log_dict(logged, batch_size=len(scenes.names))
+        self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:

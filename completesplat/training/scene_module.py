@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import psnr
@@ -92,6 +92,8 @@ class ScoredScene:
     images: Float[Tensor, "sample view 3 height width"]
     truth: Views
 
+IN_THE_BAR = ("train/loss", "train/psnr")
+
 
 class SceneModule(LightningModule):
     """A model that turns reference images into Gaussians.
@@ -149,6 +151,14 @@ class SceneModule(LightningModule):
         """The reference view and all targets, in full precision even where the network runs in less."""
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
+
+    def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
+        """Log figures of a training step: their means over all processes, as the step takes that of gradients.
+
+        One message has them all; Lightning's `sync_dist` would make processes wait for each other for each of them.
+        """
+        for name, value in mean_of_processes(values).items():
+            self.log(name, value, prog_bar=name in IN_THE_BAR, batch_size=batch_size)
 
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
         """Of the targets' views, in dB."""
