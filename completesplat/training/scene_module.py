@@ -27,6 +27,8 @@ from completesplat.scene import SceneBatch, Views
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
 
+IN_THE_BAR = ("train/loss", "train/psnr")  # of training; with the figures of validation
+
 
 def copy_reference(scenes: SceneBatch) -> Renders:
     """The reference image for every view. A model that does not beat this and `repeat_image` has learned nothing."""
@@ -91,8 +93,6 @@ class ScoredScene:
     cameras: Cameras
     images: Float[Tensor, "sample view 3 height width"]
     truth: Views
-
-IN_THE_BAR = ("train/loss", "train/psnr")
 
 
 class SceneModule(LightningModule):
