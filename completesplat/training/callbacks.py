@@ -165,7 +165,10 @@ def _steps(trainer: Trainer) -> str:
 
 
 class ExportWeights(Callback):
-    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`."""
+    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`.
+
+    Its configuration says what it was trained on (`completesplat.parts.Training`).
+    """
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
@@ -173,4 +176,6 @@ class ExportWeights(Callback):
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         assert isinstance(pl_module, LatentDiffusion)
         if trainer.is_global_zero:
+            data: Any = trainer.datamodule  # type: ignore[attr-defined]
+            pl_module.completesplat.architecture["training"] = data.training_facts()
             pl_module.completesplat.save_pretrained(self.folder)
