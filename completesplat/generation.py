@@ -37,7 +37,7 @@ class CompleteSplat(nn.Module):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
         image_size: side of the square images, in pixels.
-        training: what is known of the training pictures (`completesplat.parts.Training`).
+        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
 
     Raises:
         WeightsError: a part or a setting that weights may not name (`parts`).

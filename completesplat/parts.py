@@ -55,7 +55,7 @@ NETWORKS = ("autoreconstructor", "conditioning", "denoiser")
 Part = Mapping[str, Any]
 
 
-class Training(TypedDict, total=False):
+class TrainingPictures(TypedDict, total=False):
     """What weights say about the pictures that they were trained on; older ones say nothing.
 
     `box_masks`: how often parts of a picture were hidden. The others: mean and deviation of the training pictures'
@@ -80,7 +80,7 @@ class Needed(TypedDict):
 class Architecture(Needed, total=False):
     """The settings of `CompleteSplat`."""
 
-    training: Training
+    training: TrainingPictures
 
 
 class SchedulerSettings(TypedDict, total=False):

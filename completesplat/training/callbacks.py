@@ -167,7 +167,7 @@ def _steps(trainer: Trainer) -> str:
 class ExportWeights(Callback):
     """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`.
 
-    Its configuration says what it was trained on (`completesplat.parts.Training`).
+    Its configuration says what it was trained on (`completesplat.parts.TrainingPictures`).
     """
 
     def __init__(self, folder: str) -> None:

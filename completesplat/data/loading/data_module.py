@@ -234,7 +234,7 @@ class SceneDataModule(LightningDataModule):
             return mean_camera(self.store("train"))
 
     def training_facts(self) -> dict[str, Any]:
-        """What weights say about the pictures that they were trained on, see `completesplat.parts.Training`."""
+        """What weights say about the pictures that they were trained on, see `completesplat.parts.TrainingPictures`."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         return {"box_masks": hidden, **feature_moments(self.store("train"))}
 
