@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from completesplat.atomic import atomic_path, write_text
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.data.pictures.photograph import Photograph, Picture, read_photograph
+from completesplat.data.pictures.photograph import Photograph, Picture, picture_features, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -38,6 +38,7 @@ class CompleteSplat(nn.Module):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
         image_size: side of the square images, in pixels.
+        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
 
     Raises:
         WeightsError: a part or a setting that weights may not name (`parts`).
@@ -56,6 +57,7 @@ class CompleteSplat(nn.Module):
         denoiser: Mapping[str, Any],
         sampler: Mapping[str, Any],
         image_size: int,
+        training: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
@@ -65,6 +67,7 @@ class CompleteSplat(nn.Module):
             for name, part in parts.items()
         }
         self.architecture: dict[str, Any] = {**saved, "sampler": dict(sampler), "image_size": image_size}
+        self.architecture |= {} if training is None else {"training": dict(training)}
         check_architecture(self.architecture)
         self.image_size = image_size
         # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
@@ -235,9 +238,25 @@ class CompleteSplat(nn.Module):
         self.sampler = build(config)
         self.architecture["sampler"] = config
 
-    def read(self, picture: Picture, fov_degrees: float | None = None) -> Photograph:
+    def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """A picture at the model's size (`read_photograph`); an unknown field of view is the training set's."""
-        return read_photograph(picture, self.image_size, fov_degrees, self.fov_degrees.item())
+        return read_photograph(picture, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
+
+    @property
+    def knows_hidden(self) -> bool:
+        """Whether parts of the pictures were hidden in training; weights that do not say it count as not."""
+        return bool(self.architecture.get("training", {}).get("box_masks", 0) > 0)
+
+    def distance(self, photograph: Photograph) -> float | None:
+        """How far a photograph lies from the training pictures, in their deviations; None: the weights do not say.
+
+        The root mean square over the `picture_features`: about 1 for a picture of the same kind.
+        """
+        training = self.architecture.get("training", {})
+        if not {"picture_mean", "picture_std"} <= training.keys():
+            return None
+        mean, deviation = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
+        return ((picture_features(photograph.image) - mean) / deviation).square().mean().sqrt().item()
 
     def camera(self, photograph: Photograph) -> Cameras:
         """The camera that took a photograph, at the origin of the world."""

@@ -30,7 +30,7 @@ from completesplat.diffusion.conditioning import LearnedConditioning, StableDiff
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.schema import AtMost, Range, Share, hints_of, refused, shown
+from completesplat.schema import AtMost, Exactly, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, read_small
 
@@ -55,14 +55,32 @@ NETWORKS = ("autoreconstructor", "conditioning", "denoiser")
 Part = Mapping[str, Any]
 
 
-class Architecture(TypedDict):
-    """The settings of `CompleteSplat`."""
+class TrainingPictures(TypedDict, total=False):
+    """What weights say about the pictures that they were trained on; older ones say nothing.
+
+    `box_masks`: how often parts of a picture were hidden. The others: mean and deviation of the training pictures'
+    features, see `completesplat.data.pictures.photograph.picture_features`.
+    """
+
+    box_masks: Share
+    picture_mean: Annotated[Sequence[Share], Exactly(8)]
+    picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Exactly(8)]
+
+
+class Needed(TypedDict):
+    """The settings of `CompleteSplat` that all weights have."""
 
     autoreconstructor: Part
     conditioning: Part
     denoiser: Part
     sampler: Part
     image_size: Annotated[int, Range(8, 1024)]
+
+
+class Architecture(Needed, total=False):
+    """The settings of `CompleteSplat`."""
+
+    training: TrainingPictures
 
 
 class SchedulerSettings(TypedDict, total=False):
@@ -142,7 +160,7 @@ def check_architecture(architecture: Any) -> None:
         WeightsError: names the first setting that does not fit.
     """
     hints = hints_of(Architecture)
-    if not isinstance(architecture, Mapping) or architecture.keys() != hints.keys():
+    if not isinstance(architecture, Mapping) or not Needed.__required_keys__ <= architecture.keys() <= hints.keys():
         raise WeightsError(f"a model's settings are {', '.join(hints)}")
     _check_settings("", hints, architecture)
 

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.utils import instantiate
 from jaxtyping import Float
@@ -34,6 +34,9 @@ from completesplat.schema import Positive, Range, Share, check_settings
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
+UNLIKE = 2.0
+"""Distance from the training pictures (`CompleteSplat.distance`) from which a warning is given."""
+REMOVE = "remove"
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +52,7 @@ class PredictNumbers(TypedDict):
     batch: Positive | None
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]
-    background: Share
+    background: Share | Literal["remove"]
 
 
 def run(config: Any, out: Path) -> None:
@@ -109,7 +112,7 @@ def wanted_files(config: Any) -> Wanted:
         formats=formats,
         videos=_chosen("video", config.video, tuple(PATHS)),
         frames=config.frames,
-        background=config.background,
+        background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
         converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
@@ -132,6 +135,12 @@ def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path]
     a full disk does (`DiskError`).
     """
     console, failed = Console(), []
+    if (config.mask is not None or config.box is not None) and not model.knows_hidden:
+        log.warning(
+            "%s: these weights were not trained with parts of the picture hidden (data.box_masks, conf/experiment/"
+            "*_masked.yaml): what is hidden may come out black or grey",
+            "mask" if config.mask is not None else "box",
+        )
     rasterizer = instantiate(config.rasterizer, _convert_="all")
     folders = folder_names(picture.stem for picture in pictures)
     with Progress(console=console, disable=not console.is_terminal) as bar:
@@ -178,7 +187,9 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
     """
     if len(pictures) < 2:
         raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")
-    if beside := [name for name in ("mask", "box", "fov") if config[name] is not None]:
+    beside = [name for name in ("mask", "box", "fov") if config[name] is not None]
+    beside += ["background=remove"] if config.background == REMOVE else []
+    if beside:
         raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
     model = open_generator(config)
     views = read_photographs(pictures, Path(config.cameras), model.image_size)
@@ -206,9 +217,9 @@ def _predict(
     folder: Path,
     on_sample: Callable[[], None],
 ) -> None:
-    photograph = model.read(image, config.fov)
-    if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
-        log.warning("%s: %s", printable(image.name), warning)
+    photograph = model.read(image, config.fov, config.background == REMOVE)
+    if found := remarks(photograph, model):
+        log.warning("%s: %s", printable(image.name), "; ".join(found))
     visible = visible_part(config, image, model.image_size)
     settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
     settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
@@ -225,9 +236,24 @@ def _predict(
         "fov_source": photograph.fov_source,
         "depth_range": model.depth_range.tolist(),
     }
+    if (distance := model.distance(photograph)) is not None:
+        recorded["distance_from_training"] = distance
+    if config.background == REMOVE:
+        recorded["background"] = REMOVE
     shown = photograph.image if visible is None else photograph.image * visible
     camera = model.camera(photograph)
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
+
+
+def remarks(photograph: Photograph, model: CompleteSplat) -> list[str]:
+    """What makes a photograph unlike those that the model was trained on."""
+    found = [unusual_field_of_view(photograph, model.fov_degrees.item())]
+    if (distance := model.distance(photograph)) is not None and distance > UNLIKE:
+        found.append(
+            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training pictures'"
+            f" ({UNLIKE:g} is far): expect little of it in the scenes"
+        )
+    return [remark for remark in found if remark]
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

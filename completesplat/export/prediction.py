@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.atomic import make_folder, write_text
-from completesplat.export.cleaning import cleaned, with_screen_space_dilation
+from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import write_formats
 from completesplat.export.pictures import (
     SheetCell,
@@ -109,6 +109,9 @@ def write_prediction(
         on_sample()
     contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows)
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
+    recorded["colors_clipped"] = [int(beyond_gamut(scene).sum()) for scene in scenes]
+    if "spz" in wanted.formats:
+        recorded["left_out_of_spz"] = [int(transparent(scene).sum()) for scene in scenes]
     if wanted.maps:
         written, ends = write_maps(folder, scenes, reference, rasterizer)
         files |= written

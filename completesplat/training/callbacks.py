@@ -193,7 +193,10 @@ def _steps(trainer: Trainer) -> str:
 
 
 class ExportWeights(Callback):
-    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`."""
+    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`.
+
+    Its configuration says what it was trained on (`completesplat.parts.TrainingPictures`).
+    """
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
@@ -206,4 +209,6 @@ class ExportWeights(Callback):
         assert isinstance(pl_module, LatentDiffusion)
         if trainer.is_global_zero:
             make_folder(self.folder)
+            data: Any = trainer.datamodule  # type: ignore[attr-defined]
+            pl_module.completesplat.architecture["training"] = data.training_facts()
             pl_module.completesplat.save_pretrained(self.folder)

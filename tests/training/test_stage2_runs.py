@@ -76,6 +76,12 @@ def test_the_weights_need_no_vae_any_more(run, pipeline):
     assert len(model(pipeline.photograph(), samples=1)) == 1
 
 
+def test_the_weights_say_what_they_were_trained_on(run):
+    said = CompleteSplat.from_pretrained(run.folder / "weights").architecture["training"]
+    assert said["box_masks"] == 0
+    assert [len(said[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
+
+
 def test_the_latents_and_the_losses_by_timestep_are_logged(run):
     table = pandas.read_csv(run.folder / "metrics.csv")
     rows = table.groupby("step")[[name for name in table if name.startswith("train/loss")]].max()

@@ -18,7 +18,7 @@ from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augme
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
-from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
+from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
@@ -253,6 +253,11 @@ class SceneDataModule(LightningDataModule):
         """See `mean_camera`."""
         with at(file=self.root):
             return mean_camera(self.store("train"))
+
+    def training_facts(self) -> dict[str, Any]:
+        """What weights say about the pictures that they were trained on, see `completesplat.parts.TrainingPictures`."""
+        hidden = 0.0 if self.box_masks is None else self.box_masks.probability
+        return {"box_masks": hidden, **feature_moments(self.store("train"))}
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
         """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""

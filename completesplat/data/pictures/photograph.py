@@ -1,12 +1,16 @@
-"""Any photograph as the square image that a model takes, with its field of view, and what of it is hidden."""
+"""Any photograph as the square image that a model takes, with its field of view, and what of it is hidden.
+
+Also what tells pictures of one kind from those of another, and the object cut out of its background.
+"""
 
 import io
 import math
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -30,6 +34,7 @@ FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
 LANCZOS_REACH = 3  # of the filter, in pixels of the coarser picture
+CUTTER = "u2net"  # rembg's own default is a network under a licence for non-commercial use
 
 
 @dataclass(frozen=True)
@@ -45,7 +50,11 @@ Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
 
 
 def read_photograph(
-    picture: Picture, size: int, fov_degrees: float | None = None, default_fov_degrees: float = 50.0
+    picture: Picture,
+    size: int,
+    fov_degrees: float | None = None,
+    default_fov_degrees: float = 50.0,
+    remove_background: bool = False,
 ) -> Photograph:
     """Turn a picture upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
 
@@ -57,17 +66,18 @@ def read_photograph(
             array [height, width, 3] of bytes, or of floats in [0, 1]; a tensor [3, height, width] of the same.
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for pictures without usable EXIF focal length (50 is close to a phone's camera).
+        remove_background: cut the object out, see `without_background`.
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
             before decoding), less than 8 pixels on a side, or pixel values without one plain meaning.
-        CompleteSplatError: a field of view outside (0, 180) degrees.
+        CompleteSplatError: a field of view outside (0, 180) degrees, or what `without_background` raises.
     """
     for fov in (fov_degrees, default_fov_degrees):
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        image, recorded = _square(picture, size)
+        image, recorded = _square(picture, size, remove_background)
     except ImageError as error:
         name = picture if isinstance(picture, (str, Path)) else "the picture"
         raise ImageError(f"{name}: {error}") from error.__cause__
@@ -78,11 +88,13 @@ def read_photograph(
     return Photograph(image, float(default_fov_degrees), "default")
 
 
-def _square(picture: Picture, size: int) -> tuple[Float[Tensor, "3 size size"], float | None]:
+def _square(picture: Picture, size: int, remove_background: bool) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """The central square, resized, and its field of view in degrees where EXIF tells it."""
     if isinstance(picture, (np.ndarray, Tensor)):
         picture = _pixels(picture)
         if isinstance(picture, np.ndarray):
+            if remove_background:
+                raise ImageError("a picture whose background is to be removed is given in bytes, not in floats")
             return _resized(picture, size), None
     if not isinstance(picture, Image.Image):
         _check_file(Path(picture))
@@ -91,7 +103,7 @@ def _square(picture: Picture, size: int) -> tuple[Float[Tensor, "3 size size"], 
         file.load()
         exif = read_exif(file)
     turned = upright(file, exif.get(ORIENTATION))
-    image = _to_tensor(turned.crop(_central_square(*turned.size)), file, size)
+    image = _to_tensor(turned.crop(_central_square(*turned.size)), file, size, remove_background)
     return image, crop_fov(exif, file.size)
 
 
@@ -142,15 +154,21 @@ def _check_file(path: Path) -> None:
         raise ImageError("the file is empty")
 
 
-def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Tensor, "3 size size"]:
+def _to_tensor(
+    square: Image.Image, source: Image.Image, size: int, remove_background: bool
+) -> Float[Tensor, "3 size size"]:
     """Pixels as sRGB in [0, 1]; `source` is the opened file, which alone knows its TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
+        if remove_background:
+            raise ImageError(f"colour mode {square.mode} goes without background=remove")
         grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
         return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
     if square.mode not in EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
-    small = _to_srgb(square).resize((size, size), Image.Resampling.LANCZOS)
+    rgb = _to_srgb(square)
+    cut = over_white(without_background(rgb)) if remove_background else rgb
+    small = cut.resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
 
 
@@ -167,6 +185,46 @@ def _to_srgb(square: Image.Image) -> Image.Image:
             converted = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
             return converted if converted is not None else native
     return square.convert("RGB")
+
+
+def without_background(picture: Image.Image) -> Image.Image:
+    """An RGB picture as RGBA, transparent where a network sees background: U2-Net (Qin et al. 2020), by rembg.
+
+    Raises:
+        CompleteSplatError: rembg is not installed, or fails: it downloads the network (176 MB) on first use.
+        ImageError: nothing is left of the picture.
+    """
+    try:
+        import rembg
+    except (ImportError, SystemExit) as error:  # it exits where it has no onnxruntime
+        advice = 'pip install "completesplat[background]"'
+        raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
+    pixels = Image.fromarray(np.array(picture))  # without EXIF, by which rembg would turn it a second time
+    try:
+        cut: Image.Image = rembg.remove(pixels, session=_session())
+    except Exception as error:  # of its HTTP library, of onnxruntime and of the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
+    if not cut.getchannel("A").getbbox():
+        raise ImageError("background=remove leaves nothing of it: no object is found")
+    return cut
+
+
+@cache
+def _session() -> Any:
+    import rembg
+
+    return rembg.new_session(CUTTER)
+
+
+def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
+    """What tells pictures of one kind from others: mean and deviation of red, green and blue, and how fine they are.
+
+    The last two are the mean differences between neighbours in a row, and in a column. All lie in [0, 1].
+    """
+    means, deviations = images.mean((-2, -1)), images.std((-2, -1), correction=0)
+    steps = [images.diff(dim=axis).abs().mean((-3, -2, -1))[..., None] for axis in (-1, -2)]
+    return torch.cat([means, deviations, *steps], dim=-1)
 
 
 def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
