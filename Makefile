@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser check lock bench notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser reliability check lock bench notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -10,6 +10,9 @@ DEMO := outputs/demo
 DEMO_SCENES := 80
 DEMO_LAST := 00079
 TRAINED := outputs/demo_train
+KILLS := 200
+RESUMES := 40
+SIGNALS := 1
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -60,6 +63,10 @@ test-slow: $(READY) ## The tests that take minutes each
 
 test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
 	$(BIN)/python -m pytest -q -m browser -rs
+
+# One thread, so that the processes that it forks have no others to lose.
+reliability: $(READY) ## Count what runs survive: kills, continued runs, signals (CPU, under 40 minutes on two idle cores)
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python tests/reliability.py --kills $(KILLS) --resumes $(RESUMES) --signals $(SIGNALS)
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check

@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -80,6 +81,7 @@ class _Observer(_ChildProcessObserver):
         if signals.received() is None:  # waits for the process that has ended, where Python's handlers do not run
             for process in self._child_processes:
                 process.kill()
+            print(f"ended by {signal.Signals(number).name}", file=sys.stderr, flush=True)
             os._exit(128 + number)
         return True
 

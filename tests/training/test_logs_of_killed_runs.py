@@ -13,8 +13,9 @@ from pathlib import Path
 import pandas
 import pytest
 import torch
+from reliability import comparable
 from small_runs import STEPS, fit, rows
-from support import SMALL, script, strict_json
+from support import SMALL, script
 
 from completesplat.training.loggers import MetricsFile
 
@@ -66,18 +67,6 @@ def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
     given += ["trainer.val_check_interval=4", "trainer.log_every_n_steps=2", "data.references_per_sequence=4"]
     program = [sys.executable, script(folder), *given]
     return subprocess.Popen(program, start_new_session=True, stdout=subprocess.DEVNULL)
-
-
-def comparable(out: Path) -> tuple[pandas.DataFrame, dict]:
-    """Without times, speeds, and what names the run."""
-    times = ("speed/", "memory/")
-    table = pandas.read_csv(out / "metrics.csv")
-    table = table[[column for column in table if not column.startswith(times) and "seconds" not in column]]
-    found = {key: value for key, value in strict_json(out / "metrics.json").items() if not key.startswith(times)}
-    for key in ("machine", "command", "checkpoint"):
-        found["test"]["protocol"].pop(key)
-    found["test"]["model"].pop("seconds")
-    return table, found
 
 
 @pytest.mark.slow
