@@ -60,6 +60,11 @@ def keep_signals(kept: bool) -> None:
     _kept = kept
 
 
+def are_kept() -> bool:
+    """Whether signals wait."""
+    return _kept
+
+
 def end(number: int) -> None:
     """`Interrupted`, as after this signal, which another process may have got."""
     global _received

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from socket import socketpair
 from typing import Any, cast
 
 import torch
@@ -50,6 +51,8 @@ def stopped_together() -> Iterator[None]:
         raise
     finally:
         connector.register_signal_handlers, launcher._launch_process_observer = before
+        if started:
+            signal.set_wakeup_fd(-1)
 
 
 def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
@@ -63,27 +66,43 @@ def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
 
 
 class _Observer(_ChildProcessObserver):
-    """A process that was ended by a signal ends this one as if it had got it; after other failures, as Lightning's."""
+    """A process that was ended by a signal ends this one as if it had got it; after other failures, as Lightning's.
+
+    While this process waits for another one, Python's handlers do not run. Outside of training the signal ends it then
+    after `GRACE_SECONDS` all the same.
+    """
 
     def __init__(self, main_pid: int, processes: list[subprocess.Popen[bytes]]) -> None:
         super().__init__(main_pid, processes, LOOK_SECONDS)  # type: ignore[arg-type]
+        self._signals, self._written = socketpair()
+        self._signals.setblocking(False)
+        self._written.setblocking(False)
+        signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
 
     def _run(self) -> bool:
         codes = [process.poll() for process in self._child_processes]
-        numbers = {code - 128 if code > 0 else -code for code in codes if code}
+        theirs = {code - 128 if code > 0 else -code for code in codes if code} & set(signals.ENDING)
+        own = set() if signals.are_kept() else self._own() & set(signals.ENDING)
         if signals.received() is not None:
             return True
-        if not numbers & set(signals.ENDING):
+        if not theirs | own:
             return super()._run()
-        number = min(numbers & set(signals.ENDING))
-        os.kill(self._main_pid, number)
+        number = min(theirs | own)
+        if not own:
+            os.kill(self._main_pid, number)
         time.sleep(GRACE_SECONDS)
-        if signals.received() is None:  # waits for the process that has ended, where Python's handlers do not run
+        if signals.received() is None:
             for process in self._child_processes:
                 process.kill()
             print(f"ended by {signal.Signals(number).name}", file=sys.stderr, flush=True)
             os._exit(128 + number)
         return True
+
+    def _own(self) -> set[int]:
+        try:
+            return set(self._signals.recv(64))
+        except BlockingIOError:
+            return set()
 
 
 def agreed(trainer: Trainer) -> int | None:

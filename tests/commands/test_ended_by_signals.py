@@ -11,6 +11,8 @@ from completesplat.training import encoding
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.reconstruction import ReconstructionModule
 
+pytestmark = pytest.mark.usefixtures("plain_signals")
+
 
 @pytest.fixture
 def signalled(monkeypatch):
