@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from filelock import FileLock
 from support import SMALL, call, tiny_generator
 
 from completesplat.data.toy import write_objects
+from completesplat.signals import ENDING
 
 # W&B would go on reading what later tests of the process print, and complain in their logs that its run has ended.
 os.environ.setdefault("WANDB_CONSOLE", "off")
@@ -101,6 +103,16 @@ def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> 
 def tiny_weights(built_once: Folders) -> Path:
     """Of an untrained model for pictures of 32 x 32."""
     return built_once("weights", lambda folder: tiny_generator().save_pretrained(folder))
+
+
+@pytest.fixture
+def plain_signals():
+    """The system's handlers, as a new process has them; trainers of other tests may have left Lightning's."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 class Finished(NamedTuple):

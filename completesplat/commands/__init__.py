@@ -20,6 +20,7 @@ from completesplat.commands import jobs
 from completesplat.commands.jobs import conf_folder
 from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
+from completesplat.signals import ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 TASKS = ("data", "bench", "report")
@@ -42,7 +43,8 @@ def launch(verb: str, arguments: list[str]) -> None:
     # A further process of a job: Lightning starts one for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         out = Path(arguments[0].partition("=")[2])
-        return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+        with ended_by_signals():
+            return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
     program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")

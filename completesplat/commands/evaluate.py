@@ -23,6 +23,7 @@ from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_modes, log_scores, log_shown
 from completesplat.schema import Natural, Positive, Range
 from completesplat.training.loggers import finished
+from completesplat.training.stopping import stopped_together
 
 
 def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
@@ -67,6 +68,7 @@ def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
 
 
+@stopped_together()
 def run(
     trained: Mapping[str, Any],
     evaluation: Mapping[str, Any],

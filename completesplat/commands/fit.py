@@ -22,6 +22,7 @@ from completesplat.results.tables import Table, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_scores, log_shown
 from completesplat.training.checkpoints import check_whole, newest_whole
 from completesplat.training.loggers import finished
+from completesplat.training.stopping import stopped_together
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +50,7 @@ def parameter_table(module: nn.Module) -> Table:
     return table("Model", COLUMNS, rows)
 
 
+@stopped_together()
 def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     quieten()
@@ -126,10 +128,7 @@ def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict
     """Everything that was logged, in the end; a model that has nothing to learn beforehand is not trained."""
     if not any(parameter.requires_grad for parameter in module.parameters()):
         return {}
-    try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
-        raise KeyboardInterrupt from stop
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 

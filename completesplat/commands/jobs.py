@@ -16,6 +16,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.types import RunMode
 from hydra.utils import get_method, instantiate
 from omegaconf import OmegaConf
 
@@ -23,7 +24,9 @@ from completesplat import __version__
 from completesplat.atomic import atomic_path, writing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
+from completesplat.results.runs import typed
 from completesplat.schema import check_settings
+from completesplat.signals import Interrupted, ended_by_signals
 
 LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
@@ -125,7 +128,8 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
-    if is_first():
+    first = is_first()
+    if first:
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
             OmegaConf.save(resolved, temporary)
         _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
@@ -133,9 +137,26 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
         # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
         if OmegaConf.select(config, f"model.{key}") is not None:
             config.model[key] = resolved["model"][key]
-    with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
-        start(verb, config, out)
+    try:
+        with ended_by_signals(), _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
+            start(verb, config, out)
+    except Interrupted as stop:
+        if first:
+            print(_said(stop, verb, given, out), file=sys.stderr)
+        raise
     print(out)
+
+
+def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
+    """One line: what ended a job, its checkpoint, and the command that goes on with it (in a sweep, with all jobs)."""
+    hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
+    of_a_sweep = hydra_config.mode == RunMode.MULTIRUN
+    dropped = ("out=", "ckpt_path=") if begun and not of_a_sweep else ("out=",)
+    again = [f"completesplat {verb}", *(argument for argument in given if not argument.startswith(dropped))]
+    again += ["ckpt_path=last"] if begun and not of_a_sweep else []
+    again.append(f"out={hydra_config.sweep.dir if of_a_sweep else out}")
+    checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
+    return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {typed(again)}"
 
 
 def start(verb: str, config: Any, out: Path) -> None:

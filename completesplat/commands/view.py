@@ -4,11 +4,13 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from signal import SIGINT
 from typing import Annotated, Any, TypedDict
 
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
 from completesplat.schema import Range, Share, check_settings
+from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
 
 EXPORT = "--export"
@@ -62,8 +64,9 @@ def run(config: Any, out: Path) -> None:
         print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(3600)
-    except KeyboardInterrupt:
-        pass
+    except Interrupted as stop:
+        if stop.signal != SIGINT:
+            raise
     finally:
         page.close()
 

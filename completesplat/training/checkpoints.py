@@ -19,7 +19,9 @@ from torch import Tensor, nn
 
 from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
+from completesplat.training.stopping import agreed, end_training
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 FIGURES = "figures"
@@ -62,6 +64,9 @@ class Checkpoints(Checkpoint):
     Lightning takes for the end of an epoch): where a run goes on, nothing that the step had to log is missing. It holds
     the figures that were logged so far, too, which the end of a run reports.
 
+    While training lasts, signals are kept: after the step in which one came to any of the processes, all save, and end
+    with `Interrupted`.
+
     Args:
         every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
         keep_every: optimizer steps between milestones (at least 1); None: none are kept.
@@ -82,6 +87,7 @@ class Checkpoints(Checkpoint):
         self.every_minutes = every_minutes
         self.keep_every = keep_every
         self.due = False
+        self.asked: int | None = None
         self.end_of_step: dict[str, Any] | None = None
         self.figures: dict[str, Tensor] = {}
 
@@ -100,6 +106,7 @@ class Checkpoints(Checkpoint):
             self.folder.mkdir(parents=True, exist_ok=True)  # once: a run whose folder is removed is not to go on
         if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
             link(begun, last)  # in the place of a damaged one, which is not to become the one before
+        keep_signals(True)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -108,17 +115,26 @@ class Checkpoints(Checkpoint):
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped:
             self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
-            self.due = self._is_milestone() or self._is_due(trainer)
+            self.asked = agreed(trainer)
+            self.due = self._is_milestone() or self._is_due(trainer) or self.asked is not None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         if self.due:
             self._save(trainer, pl_module)
+        if self.asked is not None:
+            end_training(trainer, self.asked)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step != self.saved_step:
             self._save(trainer, pl_module)
         if trainer.is_global_zero:
             (self.folder / PREVIOUS).unlink(missing_ok=True)
+        keep_signals(False)
+        if (asked := agreed(trainer)) is not None:
+            end_training(trainer, asked)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        keep_signals(False)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if self.end_of_step is not None:
