@@ -151,7 +151,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
     run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
-    user's own, too; the changes may name anything.
+    user's own, too, such as those in the working folder; the changes may name anything.
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
@@ -211,9 +211,12 @@ def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
 
 
 def _belongs_to_user(config: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there."""
+    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+
+    In the run's own folder, modules that came with it would count as the user's.
+    """
     run = config.resolve().parent
-    return run.is_relative_to(Path.cwd()) and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
+    return Path.cwd() in run.parents and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
 
 
 def _is_own(target: str) -> bool:
