@@ -29,6 +29,7 @@ from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.names import folder_names, printable, safe_name
 from completesplat.rasterizers import Rasterizer
+from completesplat.scene_model import SceneModel
 from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
@@ -125,7 +126,7 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
     `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others.
@@ -196,7 +197,7 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
 
 def _predict(
     config: Any,
-    model: CompleteSplat,
+    model: SceneModel,
     rasterizer: Rasterizer,
     wanted: Wanted,
     image: Path,
@@ -207,13 +208,17 @@ def _predict(
     if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
         log.warning("%s: %s", printable(image.name), warning)
     visible = visible_part(config, image, model.image_size)
-    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
-    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
-    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+    settings = {name: config[name] for name in ("samples", "seed")}
+    how = {}
+    if isinstance(model, CompleteSplat):
+        settings["guidance_weight"] = config.guidance_weight
+        settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
+        settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+        how = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
-        "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
+        **how,
         "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),

@@ -15,6 +15,7 @@ from completesplat.atomic import atomic_path, write_text
 from completesplat.export.cleaning import cleaned, with_screen_space_dilation
 from completesplat.export.formats import write_formats
 from completesplat.export.pictures import SheetCell, color_depth, color_normals, picture_sheet, surface_depth, to_bytes
+from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
@@ -105,6 +106,38 @@ def write_prediction(
         files |= written
         recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+
+
+def write_fitted_scene(
+    folder: Path,
+    name: str,
+    scene: Gaussians,
+    cameras: Cameras,
+    images: Float[Tensor, "view 3 height width"],
+    truth: Float[Tensor, "view 3 height width"],
+    seed: int,
+) -> None:
+    """Write `scene.ply`, `sheet.png` (true pictures and those of the scene, at most 8) and `scene.json`.
+
+    Args:
+        scene: in the frame of the first camera, where up is where it is in that camera's picture.
+        images, truth: what the cameras see of the scene, and what they should see.
+
+    `CompleteSplatError`: nothing of the scene can be stored.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    write_ply(folder / "scene.ply", stored, [f"scene {name}"])
+    shown = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
+    rows = [
+        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in shown]
+        for label, pictures in (("true", truth), ("fitted", images))
+    ]
+    with atomic_path(folder / "sheet.png") as temporary:
+        picture_sheet([f"view {i}" for i in shown], rows, name).save(temporary, format="PNG")
+    files = {"scene": "scene.ply", "sheet": "sheet.png"}
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
+    write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
 
 
 def _write_sample(

@@ -1,9 +1,8 @@
-"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar, exported weights."""
+"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar."""
 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
-from completesplat.training.latent_diffusion import LatentDiffusion
 
 BAD_STEPS = "train/bad_steps"
 
@@ -162,15 +160,3 @@ class Progress(RichProgressBar):
 
 def _steps(trainer: Trainer) -> str:
     return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
-
-
-class ExportWeights(Callback):
-    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`."""
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, LatentDiffusion)
-        if trainer.is_global_zero:
-            pl_module.completesplat.save_pretrained(self.folder)

@@ -86,7 +86,7 @@ FOREIGN = [
     {"_target_": "completesplat.cli.main"},
     {"_target_": "completesplat.data.toy.write", "out": "SPRUNG"},
     {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
-    {"_target_": "completesplat.training.callbacks.ExportWeights"},
+    {"_target_": "completesplat.training.callbacks.Progress"},
     {"_target_": "__main__.open", "file": "SPRUNG", "mode": "w"},
     {"_target_": "missing_module.Thing"},
     {"_target_": ""},
