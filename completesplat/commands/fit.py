@@ -18,11 +18,16 @@ from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.generation import OneAnswer
 from completesplat.results.tables import Table, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_scores, log_shown
-from completesplat.training.checkpoints import check_whole, newest_whole
+from completesplat.training.checkpoints import newest_whole
+from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import finished
+from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stopping import stopped_together
+from completesplat.weights import RUN_WEIGHTS
+from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +77,8 @@ def run(config: Any, out: Path) -> None:
     with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train(trainer, module, data, checkpoint)
+        if trainer.is_global_zero:
+            export_weights(config, module, data, out / RUN_WEIGHTS)
         if tested is not None:
             metrics |= _test(config, module, tested)
         for one in loggers:  # a run shorter than the logging interval leaves its figures too
@@ -122,6 +129,25 @@ def refuse_missing(config: Any) -> None:
         for key in sorted(OmegaConf.missing_keys(part)):
             example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
             raise CompleteSplatError(f"{key} is needed: give {key}={example}")
+
+
+def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:
+    """Write what `predict` and `from_pretrained` read: of either stage, and of the baseline Splatter Image.
+
+    A network that weights may not name is left out, with a warning.
+    """
+    if isinstance(module, LatentDiffusion):
+        module.completesplat.architecture["training"] = data.training_facts()
+        return module.completesplat.save_pretrained(folder)
+    if type(module) is not ReconstructionModule:
+        return None
+    architecture: Any = {"network": OmegaConf.to_container(config.model.model), "image_size": config.data.image_size}
+    try:
+        model = OneAnswer.with_trained(architecture, module.model.state_dict(), module.camera)
+    except WeightsError as error:
+        return logger.warning("no weights are written to %s: %s", folder, error)
+    model.architecture["training"] = data.training_facts()
+    return model.save_pretrained(folder)
 
 
 def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict[str, float]:

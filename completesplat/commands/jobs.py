@@ -14,8 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_method, instantiate
 from omegaconf import OmegaConf
@@ -33,6 +37,7 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
+CONFIG_DIR = ("--config-dir", "-cd")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -40,6 +45,49 @@ def conf_folder() -> Path:
     """The configuration tree: inside an installed package, or beside it in the repository."""
     package = Path(__file__).parents[1]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+class SettingsOfWorkingFolder(SearchPathPlugin):
+    """`./conf`, where it is, holds further options of the groups; the package's own come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add it (hydra's name for what a plugin does)."""
+        folder = Path.cwd() / "conf"
+        if folder.is_dir() and not folder.samefile(conf_folder()):
+            search_path.append("working-folder", f"file://{folder}")
+
+
+def use_working_folder() -> None:
+    """Have modules found in the working folder, behind all others, and settings in its `conf`; in each process."""
+    folder = str(Path.cwd())
+    if not {"", folder} & set(sys.path):
+        sys.path.append(folder)
+    Plugins.instance().register(SettingsOfWorkingFolder)
+
+
+def composed(verb: str, *overrides: str) -> Any:
+    """A verb's configuration, as the command line would compose it in this folder, without starting anything."""
+    use_working_folder()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        return compose(verb, overrides=list(overrides))
+
+
+def split_config_dir(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """What names a further folder of settings (`--config-dir DIR`), in one piece, and the other arguments.
+
+    Hydra takes its flags before or behind the settings, not between them. `CompleteSplatError`: no folder is named.
+    """
+    flags, others, given = [], [], iter(arguments)
+    for argument in given:
+        name, equals, folder = argument.partition("=")
+        if name not in CONFIG_DIR:
+            others.append(argument)
+            continue
+        folder = folder if equals else next(given, "")
+        if not folder:
+            raise CompleteSplatError(f"{name} needs a folder: {name} DIR")
+        flags.append(f"{CONFIG_DIR[0]}={folder}")
+    return flags, others
 
 
 def one_of_several() -> bool:
@@ -120,6 +168,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
     started with the arguments `given` behind the verb.
     """
+    use_working_folder()  # a cluster may have started this process
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)

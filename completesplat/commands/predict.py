@@ -29,13 +29,14 @@ from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.names import folder_names, printable, safe_name
 from completesplat.rasterizers import Rasterizer
+from completesplat.scene_model import SceneModel
 from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
 UNLIKE = 2.0
-"""Distance from the training pictures (`CompleteSplat.distance`) from which a warning is given."""
+"""Distance from the training pictures (`SceneModel.distance`) from which a warning is given."""
 REMOVE = "remove"
 
 log = logging.getLogger(__name__)
@@ -128,7 +129,7 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
     `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others;
@@ -210,7 +211,7 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
 
 def _predict(
     config: Any,
-    model: CompleteSplat,
+    model: SceneModel,
     rasterizer: Rasterizer,
     wanted: Wanted,
     image: Path,
@@ -221,13 +222,17 @@ def _predict(
     if found := remarks(photograph, model):
         log.warning("%s: %s", printable(image.name), "; ".join(found))
     visible = visible_part(config, image, model.image_size)
-    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
-    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
-    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+    settings = {name: config[name] for name in ("samples", "seed")}
+    how = {}
+    if isinstance(model, CompleteSplat):
+        settings["guidance_weight"] = config.guidance_weight
+        settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
+        settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+        how = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
-        "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
+        **how,
         "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),
@@ -245,7 +250,7 @@ def _predict(
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 
-def remarks(photograph: Photograph, model: CompleteSplat) -> list[str]:
+def remarks(photograph: Photograph, model: SceneModel) -> list[str]:
     """What makes a photograph unlike those that the model was trained on."""
     found = [unusual_field_of_view(photograph, model.fov_degrees.item())]
     if (distance := model.distance(photograph)) is not None and distance > UNLIKE:

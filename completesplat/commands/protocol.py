@@ -106,7 +106,7 @@ def drawing(module: Any) -> dict[str, Any]:
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
     """Path, checksum and step of a checkpoint, and whether it holds an average (Lightning's `WeightAveraging`)."""
-    from completesplat.training.checkpoints import read_checkpoint
+    from completesplat.weights.checkpoint_reading import read_checkpoint
 
     contents = read_checkpoint(path)
     facts = {"path": str(path), "sha256": sha256_of(path), "step": contents.get("global_step")}

@@ -33,6 +33,7 @@ OF_A_RUN = ["model", "data"]
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
 GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
 TARGET = re.compile(r"_target_: *([\w.]+)")
+WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 
 
@@ -82,7 +83,7 @@ class Trained:
             WeightsError: the weights do not fit.
             CompleteSplatError: a sampler for a model that draws nothing.
         """
-        from completesplat.training.checkpoints import load_part
+        from completesplat.weights.checkpoint_reading import load_part
 
         module = instantiate(configuration.model, _convert_="all")
         if self.ckpt is not None:
@@ -99,27 +100,51 @@ class Trained:
         return {"checkpoint": {"path": str(self.weights), "sha256": digest, "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
-        """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
+        """A stage's module around a model that is loaded; what it would be trained with does not matter."""
         folder = weights_folder(weights)
+        architecture = read_architecture(folder)
+        if "network" in architecture:
+            mse = {"weight": 1.0, "term": {"_target_": "completesplat.losses.mse.MeanSquaredError"}}
+            stage: dict[str, Any] = {
+                "_target_": "completesplat.training.reconstruction.ReconstructionModule",
+                "model": {"_target_": "completesplat.commands.trained.network_of", "folder": str(folder)},
+                "loss": {
+                    "_target_": "completesplat.losses.WeightedSum",
+                    "terms": {"mse": {"weight": 1.0, "term": mse}},
+                },
+            }
+        else:
+            loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": str(folder)}
+            stage = {
+                "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
+                "completesplat": loaded,
+            }
         model = {
-            "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
-            "completesplat": {
-                "_target_": "completesplat.generation.CompleteSplat.from_pretrained",
-                "path": str(folder),
-            },
+            **stage,
             "rasterizer": self.rasterizer,
             "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
             "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
-        found.data.image_size = read_architecture(folder)["image_size"]
+        found.data.image_size = architecture["image_size"]
         return found
 
 
-def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given.
+def network_of(folder: str) -> Any:
+    """The network of weights that give one answer."""
+    from completesplat.generation import CompleteSplat
 
-    `WeightsError`: as `from_pretrained`, or weights that are not finite.
+    return CompleteSplat.from_pretrained(folder).reconstructing
+
+
+def open_generator(config: Any) -> Any:
+    """The model of `config.weights`, with `config.sampler` if given; what it cannot do is printed.
+
+    Of one that draws nothing, `config.samples` becomes 1.
+
+    Raises:
+        WeightsError: as `from_pretrained`, or weights that are not finite.
+        CompleteSplatError: a sampler for a model that draws nothing.
     """
     from completesplat.generation import CompleteSplat
 
@@ -131,7 +156,12 @@ def open_generator(config: Any) -> Any:
         raise WeightsError(
             f"{config.weights}: weights that are not finite in {len(broken)} tensors, such as {broken[0]}"
         )
-    if config.get("sampler") is not None:
+    if not model.draws_samples:
+        if config.get("sampler") is not None:
+            raise CompleteSplatError(f"{config.weights}: these weights draw no samples: leave out sampler")
+        print(f"weights: {config.weights} gives one answer for each picture and draws no samples: {WITHOUT_EFFECT}")
+        config.samples = 1
+    if isinstance(model, CompleteSplat) and config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)
         model.replace_sampler(sampler)
     return model
@@ -151,7 +181,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
     run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
-    user's own, too; the changes may name anything.
+    user's own, too, such as those in the working folder; the changes may name anything.
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
@@ -211,9 +241,12 @@ def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
 
 
 def _belongs_to_user(config: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there."""
+    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+
+    In the run's own folder, modules that came with it would count as the user's.
+    """
     run = config.resolve().parent
-    return run.is_relative_to(Path.cwd()) and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
+    return Path.cwd() in run.parents and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
 
 
 def _is_own(target: str) -> bool:

@@ -23,6 +23,7 @@ from completesplat.export.pictures import (
     to_bytes,
     write_png,
 )
+from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
@@ -117,6 +118,37 @@ def write_prediction(
         files |= written
         recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+
+
+def write_fitted_scene(
+    folder: Path,
+    name: str,
+    scene: Gaussians,
+    cameras: Cameras,
+    images: Float[Tensor, "view 3 height width"],
+    truth: Float[Tensor, "view 3 height width"],
+    seed: int,
+) -> None:
+    """Write `scene.ply`, `sheet.png` (true pictures and those of the scene, at most 8) and `scene.json`.
+
+    Args:
+        scene: in the frame of the first camera, where up is where it is in that camera's picture.
+        images, truth: what the cameras see of the scene, and what they should see.
+
+    `CompleteSplatError`: nothing of the scene can be stored.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    write_ply(folder / "scene.ply", stored, [f"scene {name}"])
+    shown = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
+    rows = [
+        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in shown]
+        for label, pictures in (("true", truth), ("fitted", images))
+    ]
+    write_png(folder / "sheet.png", picture_sheet([f"view {i}" for i in shown], rows, name))
+    files = {"scene": "scene.ply", "sheet": "sheet.png"}
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
+    write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
 
 
 def _write_sample(

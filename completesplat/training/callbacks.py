@@ -1,9 +1,8 @@
-"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar, exported weights."""
+"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar."""
 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,8 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from completesplat.atomic import make_folder
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
-from completesplat.training.latent_diffusion import LatentDiffusion
 
 BAD_STEPS = "train/bad_steps"
 
@@ -190,25 +187,3 @@ class Progress(RichProgressBar):
 
 def _steps(trainer: Trainer) -> str:
     return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
-
-
-class ExportWeights(Callback):
-    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`.
-
-    Its configuration says what it was trained on (`completesplat.parts.TrainingPictures`).
-    """
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.is_global_zero:
-            self.folder.parent.mkdir(parents=True, exist_ok=True)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, LatentDiffusion)
-        if trainer.is_global_zero:
-            make_folder(self.folder)
-            data: Any = trainer.datamodule  # type: ignore[attr-defined]
-            pl_module.completesplat.architecture["training"] = data.training_facts()
-            pl_module.completesplat.save_pretrained(self.folder)

@@ -15,19 +15,17 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import Tensor, nn
+from torch import Tensor
 
 from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed, end_training
+from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 FIGURES = "figures"
-END, END_BYTES = b"PK\5\6", 22
-"""How the last record of a zip archive begins, and its length without the comment behind it."""
-CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 
 logger = logging.getLogger(__name__)
 
@@ -210,26 +208,6 @@ def _add_checksum(path: Path) -> None:
         file.write(digest.encode())
 
 
-def check_whole(path: Path) -> None:
-    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end."""
-    bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - bytes_of_end))
-        end = file.read()
-        if not end.startswith(END):
-            if end[-END_BYTES:].startswith(END) and end.endswith(b"\0\0"):
-                return
-            raise WeightsError(f"{path}: not a readable checkpoint (damaged at its end, or cut off)")
-        digest, left = hashlib.sha256(), size - DIGEST_BYTES
-        file.seek(0)
-        while left and (part := file.read(min(left, 2**20))):
-            digest.update(part)
-            left -= len(part)
-    if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
-        raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
-
-
 def newest_whole(last: Path) -> Path | None:
     """`last.ckpt`, or with a warning the one before it or the latest milestone beside it; None if there is no last one.
 
@@ -256,37 +234,3 @@ def _newest_first(last: Path) -> Iterator[Path]:
         yield previous
     steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
     yield from sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents.
-
-    `WeightsError`: the file is missing, damaged, no checkpoint of plain tensors, or its weights are not finite.
-    """
-    if not Path(path).is_file():
-        raise WeightsError(f"{path}: no such checkpoint")
-    check_whole(Path(path))
-    try:
-        contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        name = not_finite(contents["state_dict"])
-    except Exception as error:
-        raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
-    if name is not None:
-        raise WeightsError(f"{path}: {name} is not finite")
-    return contents
-
-
-def not_finite(weights: Mapping[str, Any]) -> str | None:
-    """The name of the first tensor that holds NaN or infinities, if there is one."""
-    return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
-
-
-def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
-    """Load the weights below `prefix` of a checkpoint into a module; `WeightsError` unless all are there and fit."""
-    weights = read_checkpoint(path)["state_dict"]
-    part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    try:
-        module.load_state_dict(part)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
-        raise WeightsError(f"{path}: weights of another architecture: {first}") from error

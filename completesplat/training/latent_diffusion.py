@@ -17,9 +17,9 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
-from completesplat.training.checkpoints import load_part
 from completesplat.training.encoding import check_cache
 from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.weights.checkpoint_reading import load_part
 
 LOSS_BUCKETS = 4
 """Equal ranges of timesteps, for each of which the loss is logged."""

@@ -13,8 +13,9 @@ from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
-from completesplat.training.checkpoints import load_part
 from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.weights import CAMERA
+from completesplat.weights.checkpoint_reading import load_part
 
 
 class ReconstructionModule(SceneModule):
@@ -50,7 +51,10 @@ class ReconstructionModule(SceneModule):
         prepare_network(model, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior."""
+        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior.
+
+        The camera of a typical photograph is measured for those whose camera is not known (`OneAnswer`).
+        """
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
         if self.sees_views and data.targets < 2:
             raise CompleteSplatError(
@@ -60,6 +64,11 @@ class ReconstructionModule(SceneModule):
             raise CompleteSplatError(
                 "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
             )
+        self.camera = {name: torch.tensor(value).tolist() for name, value in data.typical_camera()._asdict().items()}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """With the training set's typical camera."""
+        checkpoint[CAMERA] = self.camera
 
     @property
     def method(self) -> str:

@@ -188,11 +188,15 @@ class SceneModule(LightningModule):
             depths = truth.depths
             if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
-            if self.on_scene_scored is not None:
-                shown = seen.reference.images[b] * seen.visible[b]
-                self.on_scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
+            shown = seen.reference.images[b] * seen.visible[b]
+            self.scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
         evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
+
+    def scene_scored(self, scene: ScoredScene) -> None:
+        """Pass on what a test made of a scene."""
+        if self.on_scene_scored is not None:
+            self.on_scene_scored(scene)
 
     def on_test_end(self) -> None:
         loader: Any = self.trainer.test_dataloaders

@@ -14,6 +14,7 @@ from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
+from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import told
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
@@ -25,7 +26,7 @@ PAUSE = 0.2  # seconds between two pictures of a scene that forms
 class Completion:
     """The controls that complete a photograph, added to a page; the model works in the page's worker only."""
 
-    def __init__(self, page: Page, model: CompleteSplat, start: dict[str, Any]) -> None:
+    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
         self.page, self.model = page, model
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_drawing(page.server.gui, model, start)
@@ -58,6 +59,8 @@ class Completion:
             self.page.tell(error, event.client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
+        if not isinstance(self.model, CompleteSplat):
+            return  # nothing is drawn, and no slider shown
         steps = self.controls.steps
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
@@ -72,7 +75,7 @@ class Completion:
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
-        layers = self.model.autoreconstructor.reconstructor.parameterization.layers
+        layers = self.model.parameterization.layers
         reference, last_shown = self.model.camera(photograph), 0.0
 
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
@@ -99,7 +102,7 @@ class Completion:
             progress.visible = False
 
 
-def read_upload(model: CompleteSplat, name: str, content: bytes) -> Photograph:
+def read_upload(model: SceneModel, name: str, content: bytes) -> Photograph:
     """The picture at the model's size; `ImageError` if it is none. Its name is for refusals only, never a path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "upload"

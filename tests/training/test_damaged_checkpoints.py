@@ -8,8 +8,9 @@ import torch
 from support import SMALL, refused, strict_json
 
 from completesplat.errors import WeightsError
-from completesplat.training.checkpoints import CheckpointFiles, check_whole, load_part, read_checkpoint
+from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.weights.checkpoint_reading import check_whole, load_part, read_checkpoint
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 from support import NETWORKS, SMALL, call, compose_config, refused
 
 from completesplat.generation import CompleteSplat
-from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.weights.checkpoint_reading import read_checkpoint
 
 VAE = ["conditioning=stable_diffusion", "conditioning.channels=[8,8,16,16]"]
 VAE += ["conditioning.layers_per_block=1", "conditioning.norm_groups=4"]
