@@ -67,6 +67,7 @@ def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dic
         **data.describe(),
         "image_size": (data.at_model_size or data).image_size,
         "resolution": data.image_size,
+        **({} if data.background is None else {"background": data.background}),
         "precision": evaluation["precision"],
         "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},
