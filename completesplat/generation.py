@@ -42,6 +42,7 @@ class CompleteSplat(nn.Module):
         WeightsError: a part or a setting that weights may not name (`parts`).
     """
 
+    draws_samples = True
     latent_mean: Tensor
     latent_std: Tensor
     fov_degrees: Tensor
@@ -78,6 +79,16 @@ class CompleteSplat(nn.Module):
         self.register_buffer("fov_degrees", torch.tensor(50.0))
         self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
         self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
+
+    @property
+    def layers(self) -> int:
+        """Gaussians of a pixel."""
+        layers: int = self.autoreconstructor.reconstructor.parameterization.layers
+        return layers
+
+    def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
+        """Near and far of what is made of a photograph: those of the training set."""
+        return self.depth_range
 
     def train(self, mode: bool = True) -> "CompleteSplat":
         """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""

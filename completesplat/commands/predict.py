@@ -28,12 +28,15 @@ from completesplat.export.splat_transform import find_splat_transform
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.names import folder_names, printable, safe_name
+from completesplat.published import PublishedGenerator
 from completesplat.rasterizers import Rasterizer
 from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
+
+Generator = CompleteSplat | PublishedGenerator
 
 log = logging.getLogger(__name__)
 
@@ -125,19 +128,20 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def predict_pictures(config: Any, model: CompleteSplat, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_pictures(config: Any, model: Generator, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
     `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others.
     """
     console, failed = Console(), []
     rasterizer = instantiate(config.rasterizer, _convert_="all")
+    samples = config.samples if model.draws_samples else 1
     folders = folder_names(picture.stem for picture in pictures)
     with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(pictures) * config.samples)
+        task = bar.add_task("", total=len(pictures) * samples)
         for index, (picture, folder) in enumerate(zip(pictures, folders, strict=True)):
             name = printable(picture.name)
-            bar.update(task, description=escape(name), completed=index * config.samples)
+            bar.update(task, description=escape(name), completed=index * samples)
             start = time.perf_counter()
             try:
                 _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
@@ -178,6 +182,8 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
     if beside := [name for name in ("mask", "box", "fov") if config[name] is not None]:
         raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
     model = open_generator(config)
+    if not model.draws_samples:
+        raise CompleteSplatError(f"cameras=FILE: these weights see one picture: {model.said}")
     views = read_photographs(pictures, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_own_units(views.cameras))
     scene = model.reconstruct(views)
@@ -196,7 +202,7 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
 
 def _predict(
     config: Any,
-    model: CompleteSplat,
+    model: Generator,
     rasterizer: Rasterizer,
     wanted: Wanted,
     image: Path,
@@ -207,24 +213,32 @@ def _predict(
     if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
         log.warning("%s: %s", printable(image.name), warning)
     visible = visible_part(config, image, model.image_size)
-    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
-    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
-    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+    settings, drawn_by = drawing_settings(config, model, visible)
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
-        "sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2],
+        **drawn_by,
         "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),
         "box": None if config.box is None else list(config.box),
         "fov_degrees": photograph.fov_degrees,
         "fov_source": photograph.fov_source,
-        "depth_range": model.depth_range.tolist(),
+        "depth_range": model.depth_range_of(photograph).tolist(),
     }
     shown = photograph.image if visible is None else photograph.image * visible
     camera = model.camera(photograph)
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
+
+
+def drawing_settings(config: Any, model: Generator, visible: Tensor | None) -> tuple[dict[str, Any], dict[str, str]]:
+    """What samples are drawn with, and by what; of weights that draw none, the seed that files record."""
+    if isinstance(model, PublishedGenerator):
+        return {"seed": config.seed}, {}
+    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
+    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
+    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+    return settings, {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

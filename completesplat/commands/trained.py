@@ -18,6 +18,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.parts import read_architecture
 from completesplat.schema import shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
+from completesplat.weights.splatter_image import find, is_published
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -32,6 +33,11 @@ ONLY_FOR_TRAINING = (
 OF_A_RUN = ["model", "data"]
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
 GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
+MSE = {"mse": {"weight": 1.0, "term": {"_target_": "completesplat.losses.mse.MeanSquaredError"}}}
+UNTRAINED = {
+    "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
+    "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
+}
 TARGET = re.compile(r"_target_: *([\w.]+)")
 OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 
@@ -95,11 +101,15 @@ class Trained:
         """As `checkpoint_facts`; a folder of weights does not say how training ended."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
-        digest = sha256_of(weights_folder(str(self.weights)) / WEIGHTS_FILE)
+        weights = str(self.weights)
+        file = find(weights).weights if is_published(weights) else weights_folder(weights) / WEIGHTS_FILE
+        digest = sha256_of(file)
         return {"checkpoint": {"path": str(self.weights), "sha256": digest, "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
-        """Stage 2's module around a generator that is loaded; what it would be trained with does not matter."""
+        """A module around what is loaded; what it would be trained with does not matter."""
+        if is_published(weights):
+            return self._config_of_published(weights)
         folder = weights_folder(weights)
         model = {
             "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
@@ -108,30 +118,62 @@ class Trained:
                 "path": str(folder),
             },
             "rasterizer": self.rasterizer,
-            "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
-            "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
+            **UNTRAINED,
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
         found.data.image_size = read_architecture(folder)["image_size"]
         return found
 
+    def _config_of_published(self, weights: str) -> Any:
+        """The baseline with published weights, and data as these know them: objects only, on their background."""
+        known = find(weights).data
+        background = float(known["white_background"])
+        model = {
+            "_target_": "completesplat.training.reconstruction.ReconstructionModule",
+            "model": {"_target_": "completesplat.baselines.published.PublishedSplatterImage", "weights": weights},
+            "loss": {"_target_": "completesplat.losses.WeightedSum", "terms": MSE},
+            "rasterizer": {
+                "_target_": "completesplat.rasterizers.directional.DirectionalRasterizer",
+                "rasterizer": self.rasterizer,
+            },
+            "background": background,
+            **UNTRAINED,
+        }
+        found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
+        found.data.image_size, found.data.background = known["training_resolution"], background
+        if known["origin_distances"]:  # the far end of the depth range says where the object is
+            if "depth_after" not in found.data:
+                raise CompleteSplatError(f"weights={weights}: know objects; these data do not say where objects are")
+            found.data.depth_after = known["zfar"]
+        return found
+
 
 def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given.
+    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given, or a `PublishedGenerator`.
 
-    `WeightsError`: as `from_pretrained`, or weights that are not finite.
+    Raises:
+        WeightsError: as these, or weights that are not finite.
+        CompleteSplatError: a sampler for weights that draw nothing.
     """
     from completesplat.generation import CompleteSplat
+    from completesplat.published import PublishedGenerator
 
+    model: Any
     if config.weights in in_the_box():
         print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
-    model = CompleteSplat.from_pretrained(config.weights)
+    if is_published(config.weights):
+        model = PublishedGenerator(config.weights)
+        print(f"weights: {config.weights}, {model.said}")
+    else:
+        model = CompleteSplat.from_pretrained(config.weights)
     broken = [name for name, values in model.state_dict().items() if not values.isfinite().all()]
     if broken:
         raise WeightsError(
             f"{config.weights}: weights that are not finite in {len(broken)} tensors, such as {broken[0]}"
         )
     if config.get("sampler") is not None:
+        if not model.draws_samples:
+            raise CompleteSplatError(f"sampler: nothing is drawn with these weights: {model.said}")
         sampler: Any = OmegaConf.to_container(config.sampler)
         model.replace_sampler(sampler)
     return model
@@ -168,8 +210,9 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
         if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
     # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
-    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
-        config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
+    for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
+        if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
+            OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
     return config
 
 

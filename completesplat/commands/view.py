@@ -112,9 +112,11 @@ def make_page(config: Any, out: Path) -> Any:
         saver = Saver(out, stage, rasterizer, config.frames, config.background)
         if model is None:
             return Page(server, stage, saver, max(sample.layers for sample in samples))
-        page = Page(server, stage, saver, model.autoreconstructor.reconstructor.parameterization.layers)
-        steps = model.sampler.steps if config.steps is None else config.steps
-        completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
+        page = Page(server, stage, saver, model.layers)
+        start = {name: config[name] for name in SLIDERS}
+        if model.draws_samples and config.steps is None:
+            start["steps"] = model.sampler.steps
+        completion = Completion(page, model, start)
         if photograph is not None:
             completion.load(printable(Path(config.image).name), photograph)
         return page

@@ -20,7 +20,7 @@ from completesplat.data.pictures.files import (
     SIXTEEN_BIT_MODES,
     deep_grey,
     opened,
-    over_white,
+    over_grey,
     upright,
 )
 from completesplat.errors import CompleteSplatError, ImageError
@@ -42,17 +42,25 @@ class Photograph(TensorDataclass):
 
 
 def read_photograph(
-    path: str | Path, size: int, fov_degrees: float | None = None, default_fov_degrees: float = 50.0
+    path: str | Path,
+    size: int,
+    fov_degrees: float | None = None,
+    default_fov_degrees: float = 50.0,
+    background: float = 1.0,
+    object_share: float | None = None,
 ) -> Photograph:
     """Read an image file upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
 
-    Transparency is laid over white; of an animation the first frame is taken; an embedded colour profile is
+    Transparency is laid over the background; of an animation the first frame is taken; an embedded colour profile is
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1], grey images of floats must lie in it.
 
     Args:
         path: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content.
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for files without usable EXIF focal length (50 is close to a phone's main camera).
+        background: grey value from 0 to 1, white by default.
+        object_share: of pictures that are transparent around an object, the square around that object is taken whose
+            side the object fills by this share; None: the central square, as of all others.
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
@@ -70,10 +78,8 @@ def read_photograph(
             picture.load()
             exif = read_exif(picture)
         turned = upright(picture, exif.get(ORIENTATION))
-        side = min(turned.size)
-        left, top = (turned.width - side) // 2, (turned.height - side) // 2
-        square = turned.crop((left, top, left + side, top + side))
-        image = _to_tensor(square, picture, size)
+        square = (None if object_share is None else _around_object(turned, object_share)) or _central(turned)
+        image = _to_tensor(square, picture, size, background)
     except ImageError as error:
         raise ImageError(f"{path}: {error}") from error.__cause__
     if fov_degrees is not None:
@@ -81,6 +87,29 @@ def read_photograph(
     if (recorded := crop_fov(exif, picture.size)) is not None:
         return Photograph(image, recorded, "exif")
     return Photograph(image, float(default_fov_degrees), "default")
+
+
+def _central(picture: Image.Image) -> Image.Image:
+    side = min(picture.size)
+    left, top = (picture.width - side) // 2, (picture.height - side) // 2
+    return picture.crop((left, top, left + side, top + side))
+
+
+def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
+    """The square around what is not transparent, which may reach beyond the picture; None: all of it is opaque."""
+    if not picture.has_transparency_data:
+        return None
+    cut_out = picture.convert("RGBA")
+    alpha = cut_out.getchannel("A")
+    if alpha.getextrema()[0] == 255:
+        return None
+    box = alpha.getbbox()
+    if box is None:
+        raise ImageError("nothing but transparency")
+    left, top, right, bottom = box
+    side = round(max(right - left, bottom - top) / share)
+    left, top = (left + right - side) // 2, (top + bottom - side) // 2
+    return cut_out.crop((left, top, left + side, top + side))
 
 
 def _check_file(path: Path) -> None:
@@ -94,7 +123,7 @@ def _check_file(path: Path) -> None:
         raise ImageError("the file is empty")
 
 
-def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Tensor, "3 size size"]:
+def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
     """Pixels as sRGB in [0, 1]; `source` is the opened file, which alone knows its TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
         grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
@@ -102,15 +131,15 @@ def _to_tensor(square: Image.Image, source: Image.Image, size: int) -> Float[Ten
         return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
     if square.mode not in EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
-    small = _to_srgb(square).resize((size, size), Image.Resampling.LANCZOS)
+    small = _to_srgb(square, background).resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
 
 
-def _to_srgb(square: Image.Image) -> Image.Image:
-    """An RGB image, transparency laid over white, converted from its own colour profile where it has one."""
+def _to_srgb(square: Image.Image, background: float) -> Image.Image:
+    """An RGB image, transparency laid over the background, converted from its own colour profile where it has one."""
     profile = square.info.get("icc_profile")
     if square.has_transparency_data:
-        square = over_white(square)
+        square = over_grey(square, background)
     if profile:
         # A damaged profile, or one of another colour model than the pixels, is ignored, as viewers do.
         with suppress(ImageCms.PyCMSError, OSError):
