@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser check lock bench notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser fuzz reliability check lock bench docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -10,6 +10,10 @@ DEMO := outputs/demo
 DEMO_SCENES := 80
 DEMO_LAST := 00079
 TRAINED := outputs/demo_train
+FUZZ_MINUTES ?= 10
+KILLS := 200
+RESUMES := 40
+SIGNALS := 1
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
@@ -61,6 +65,14 @@ test-slow: $(READY) ## The tests that take minutes each
 test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
 	$(BIN)/python -m pytest -q -m browser -rs
 
+# What hypothesis finds is kept in .hypothesis/ and tried first the next time.
+fuzz: $(READY) ## Damaged files for each of seven readers, FUZZ_MINUTES=10 each
+	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 7 tests/test_fuzzed_readers.py
+
+# One thread, so that the processes that it forks have no others to lose.
+reliability: $(READY) ## Count what runs survive: kills, continued runs, signals (CPU, under 40 minutes on two idle cores)
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=. $(BIN)/python tests/reliability.py --kills $(KILLS) --resumes $(RESUMES) --signals $(SIGNALS)
+
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -76,6 +88,10 @@ bench: $(READY) ## Time the rasterizer backends, data loading, and stage 2, side
 	$(BIN)/completesplat bench rasterizers
 	$(BIN)/completesplat bench data
 	$(BIN)/completesplat bench diffusion
+
+docs: $(READY) ## The API reference, from the docstrings, in outputs/api
+	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat
+	@echo "outputs/api/completesplat.html"
 
 notebooks: $(READY) ## Run every notebook from top to bottom
 	$(BIN)/jupyter execute notebooks/*.ipynb

@@ -1,3 +1,30 @@
-"""Complete Gaussian splats from a single image with latent diffusion."""
+"""Complete Gaussian splats from a single image with latent diffusion.
+
+model = completesplat.CompleteSplat.from_pretrained("toy_objects")
+scenes = model("photo.jpg", samples=4, seed=0)
+completesplat.write_ply("scene.ply", scenes[0])
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from completesplat.export.ply import read_ply as read_ply
+    from completesplat.export.ply import write_ply as write_ply
+    from completesplat.gaussians import Gaussians as Gaussians
+    from completesplat.generation import CompleteSplat as CompleteSplat
 
 __version__ = "0.1.0"
+
+_PLACES = {"CompleteSplat": "generation", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, so that the package itself is there without waiting for torch."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PLACES})

@@ -48,3 +48,9 @@ class DivergenceError(CompleteSplatError):
     """A training whose losses, gradients or weights are not finite any more."""
 
     exit_status = 1
+
+
+class DiskError(CompleteSplatError):
+    """A file that cannot be written: the disk is full, or the folder is not there any more."""
+
+    exit_status = 1

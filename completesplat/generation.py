@@ -4,7 +4,6 @@ model = CompleteSplat.from_pretrained("toy_objects")
 scenes = model("photo.jpg", samples=4, seed=0)
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,23 +11,34 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from safetensors.torch import load_file
+from torch import Tensor
 
 from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.data.pictures.photograph import Photograph, read_photograph
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
-from completesplat.parts import build, check_architecture, check_sizes, read_architecture
+from completesplat.geometry.cameras import Cameras
+from completesplat.parts import (
+    architecture_of_run,
+    build,
+    check_architecture,
+    check_sizes,
+    read_architecture,
+    sizes_in,
+    untrained,
+)
+from completesplat.published import PublishedGenerator
 from completesplat.scene import Views
+from completesplat.scene_model import SceneModel, require_one
 from completesplat.tensors import concatenate
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, weights_folder, write_sums
+from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
+from completesplat.weights.checkpoint_reading import read_checkpoint
+from completesplat.weights.splatter_image import is_published
 
 
-class CompleteSplat(nn.Module):
+class CompleteSplat(SceneModel):
     """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
 
     The four parts are given as configurations (`_target_` and arguments, as in `conf/`), so that they can be written
@@ -37,17 +47,16 @@ class CompleteSplat(nn.Module):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
         image_size: side of the square images, in pixels.
+        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
 
     Raises:
         WeightsError: a part or a setting that weights may not name (`parts`).
     """
 
-    draws_samples = True
     latent_mean: Tensor
     latent_std: Tensor
-    fov_degrees: Tensor
-    depth_range: Tensor
-    up: Tensor
+
+    draws_samples = True
 
     def __init__(
         self,
@@ -56,39 +65,28 @@ class CompleteSplat(nn.Module):
         denoiser: Mapping[str, Any],
         sampler: Mapping[str, Any],
         image_size: int,
+        training: Mapping[str, Any] | None = None,
     ) -> None:
-        super().__init__()
         parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
-        # Weights that training starts from are not needed again: all are saved together.
-        saved = {
-            name: {key: None if key == "pretrained" else value for key, value in part.items()}
-            for name, part in parts.items()
-        }
-        self.architecture: dict[str, Any] = {**saved, "sampler": dict(sampler), "image_size": image_size}
-        check_architecture(self.architecture)
-        self.image_size = image_size
+        saved = {name: untrained(part) for name, part in parts.items()}
+        facts = {} if training is None else {"training": dict(training)}
+        architecture = {**saved, "sampler": dict(sampler), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
         # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
         self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
         self.sampler = build(sampler)
-        # Measured on the training set by the training stage; the last three serve photographs of unknown cameras.
+        # Measured on the training set by the training stage.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
         self.register_buffer("latent_std", torch.ones(channels, 1, 1))
-        self.register_buffer("fov_degrees", torch.tensor(50.0))
-        self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
-        self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
 
     @property
-    def layers(self) -> int:
-        """Gaussians of a pixel."""
-        layers: int = self.autoreconstructor.reconstructor.parameterization.layers
-        return layers
-
-    def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
-        """Near and far of what is made of a photograph: those of the training set."""
-        return self.depth_range
+    def reconstructing(self) -> Any:
+        """The autoreconstructor."""
+        return self.autoreconstructor
 
     def train(self, mode: bool = True) -> "CompleteSplat":
         """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""
@@ -176,68 +174,6 @@ class CompleteSplat(nn.Module):
         gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
         return gaussians
 
-    def forward(
-        self, image: Photograph | Path | str, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
-    ) -> list[Gaussians]:
-        """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
-
-        Args:
-            image: a file, or a photograph read with `completesplat.data.pictures.photograph.read_photograph`.
-            visible: 0 where it is hidden; see `completesplat.data.pictures.photograph`.
-            **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
-
-        Raises:
-            CompleteSplatError: not a readable image, or what `generate` refuses.
-        """
-        photograph = image if isinstance(image, Photograph) else self.read(image)
-        device = self.latent_std.device
-        scenes = self.eval().generate(
-            photograph.image[None].to(device),
-            self.camera(photograph)[None],
-            self.depth_range[None],
-            visible=None if visible is None else visible[None].to(device),
-            **settings,
-        )
-        return [scenes[i] for i in range(len(scenes.means))]
-
-    @torch.no_grad()
-    def reconstruct(self, views: Views) -> Gaussians:
-        """The scene that several views show, at the posterior's mean: nothing is drawn.
-
-        Args:
-            views: [view ...], the first the reference and its frame the world, in the model's units (`in_own_units`).
-
-        Returns:
-            Gaussians in the frame of the first camera.
-
-        Raises:
-            WeightsError: the posterior of these weights sees one picture.
-        """
-        if not self.autoreconstructor.sees_views:
-            raise WeightsError("these weights reconstruct from one picture: they were trained with posterior=image")
-        batch, depth_range = views.to(self.latent_std.device)[None], self.depth_range[None]
-        posterior, features = self.eval().autoreconstructor.posterior(batch.images[:, 0], batch, depth_range)
-        splatter_image = self.autoreconstructor.reconstructor(posterior.mode(), features)
-        scene: Gaussians = splatter_image.gaussians(batch.cameras[:, 0], depth_range)[0]
-        return scene
-
-    def in_own_units(self, cameras: Cameras) -> Cameras:
-        """Cameras of any units, in a world that is scaled to what the model knows.
-
-        The point nearest to all optical axes comes to the depth at which untrained Gaussians start
-        (`Parameterization.first_depth`), which a data set's objects are meant to lie at.
-
-        Raises:
-            CompleteSplatError: axes that are parallel, or meet behind the first camera.
-        """
-        center = nearest_to_axes(cameras)
-        depth = 0.0 if center is None else transform_points(cameras[0].world_to_camera, center[None])[0, 2].item()
-        if depth <= 0:
-            raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
-        near, far = self.depth_range.tolist()
-        share = self.autoreconstructor.reconstructor.parameterization.first_depth
-        return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
-
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Draw with another sampler from now on; noise schedule and prediction type stay those of training."""
         config = with_forward_process(sampler, self.architecture["sampler"])
@@ -245,45 +181,117 @@ class CompleteSplat(nn.Module):
         self.sampler = build(config)
         self.architecture["sampler"] = config
 
-    def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
-        """Read a photograph at the model's size; an unknown field of view is taken to be the training set's."""
-        return read_photograph(Path(path), self.image_size, fov_degrees, self.fov_degrees.item())
-
-    def camera(self, photograph: Photograph) -> Cameras:
-        """The camera that took a photograph, at the origin of the world."""
-        device = self.latent_std.device
-        intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(device)
-        return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
-
-    def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub."""
-        folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
-        save_file({key: value.contiguous().cpu() for key, value in self.state_dict().items()}, folder / WEIGHTS_FILE)
-        (folder / CONFIG_FILE).write_text(json.dumps(self.architecture, indent=2) + "\n")
-        write_sums(folder)
-
-    @classmethod
-    def from_pretrained(cls, path: Path | str) -> "CompleteSplat":
-        """Build the model that `save_pretrained` wrote, in evaluation mode on the CPU.
+    @staticmethod
+    def from_pretrained(path: Path | str) -> "SceneModel":
+        """Build what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
 
         Args:
-            path: a folder, a name of the weights in the package, or an id of the Hugging Face hub (`weights_folder`).
+            path: a folder of weights, a run's, a checkpoint of a run, a name of the weights in the package, or an id of
+                the Hugging Face hub (`weights_folder`); or `splatter_image:NAME`, or a file or folder of these weights,
+                which are a `PublishedGenerator`.
 
         Raises:
-            WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not.
+            WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not;
+                or the run is of a model that makes no scene of a photograph.
         """
-        folder = weights_folder(path)
+        if is_published(path):
+            return PublishedGenerator(str(path))
+        checkpoint = checkpoint_of(path)
+        place = weights_folder(path) if checkpoint is None else checkpoint
         try:
-            architecture = read_architecture(folder)
-            check_sizes(architecture, folder / WEIGHTS_FILE)
-            model = cls(**architecture)
-            model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+            return _read_folder(place) if checkpoint is None else _read_checkpoint(place)
         except WeightsError:
             raise
         except Exception as error:
             reason = str(error).strip().splitlines()
-            raise WeightsError(
-                f"{folder}: cannot be loaded: {reason[0] if reason else type(error).__name__}"
-            ) from error
+            raise WeightsError(f"{place}: cannot be loaded: {reason[0] if reason else type(error).__name__}") from error
+
+
+class OneAnswer(SceneModel):
+    """One pass from a photograph to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
+
+    Args:
+        network: configuration of the network, as in `conf/`.
+        image_size: side of the square images, in pixels.
+        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
+
+    Raises:
+        WeightsError: a part or a setting that weights may not name (`parts`).
+    """
+
+    def __init__(self, network: Mapping[str, Any], image_size: int, training: Mapping[str, Any] | None = None) -> None:
+        facts = {} if training is None else {"training": dict(training)}
+        architecture = {"network": untrained(network), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
+        self.network = build(self.architecture["network"])
+
+    @property
+    def reconstructing(self) -> Any:
+        """The network."""
+        return self.network
+
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: int = 1,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        **settings: Any,
+    ) -> Gaussians:
+        """The scene of each image, in its camera's frame.
+
+        Args:
+            visible: 0 where an image is hidden: what is there has no influence.
+            **settings: those of `CompleteSplat.generate` that are about drawing; they have no effect.
+
+        Raises:
+            CompleteSplatError: several samples.
+        """
+        require_one(samples)
+        splatter_image = self.eval().network(images if visible is None else images * visible).splatter_image
+        gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
+        return gaussians
+
+    @staticmethod
+    def with_trained(
+        architecture: Mapping[str, Any], network: Mapping[str, Tensor], camera: Mapping[str, Any]
+    ) -> "OneAnswer":
+        """The model with a trained network's weights, and with its training set's typical camera.
+
+        `WeightsError`: the camera has other values than `fov_degrees`, `depth_range` and `up`, or they are no numbers.
+        """
+        with torch.random.fork_rng(devices=[]):  # the first weights are random; what a run draws later does not change
+            model = OneAnswer(**architecture)
+        names = ("fov_degrees", "depth_range", "up")
+        try:
+            measured = {name: torch.tensor(camera[name], dtype=torch.float32) for name in names}
+        except (KeyError, TypeError, ValueError) as error:
+            raise WeightsError("the training set's typical camera is not known") from error
+        model.load_state_dict({f"network.{name}": x for name, x in network.items()} | measured)
         return model.eval()
+
+
+def _read_folder(folder: Path) -> SceneModel:
+    architecture = read_architecture(folder)
+    check_sizes(architecture, sizes_in(folder / WEIGHTS_FILE), (WEIGHTS_FILE, CONFIG_FILE))
+    model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+    return model.eval()
+
+
+def _read_checkpoint(checkpoint: Path) -> SceneModel:
+    """Averaged weights, if the run averages them."""
+    architecture, prefix = architecture_of_run(checkpoint)
+    contents = read_checkpoint(checkpoint)
+    state = {k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
+    whose = "network." if "network" in architecture else ""
+    sizes = {f"{whose}{name}": value.shape for name, value in state.items()}
+    check_sizes(architecture, sizes, (checkpoint.name, RUN_CONFIG_FILE))
+    if whose:
+        return OneAnswer.with_trained(architecture, state, contents.get(CAMERA, {}))
+    model = CompleteSplat(**architecture)
+    model.load_state_dict(state)
+    return model.eval()

@@ -1,8 +1,8 @@
-"""What a generator is made of: its configuration (`config.json` of weights), held against a list, and only then built.
+"""What a model is made of: its configuration (`config.json` of weights), held against a list, and only then built.
 
-Anyone can publish weights. Their configuration names classes of this list with settings of these classes, by value, and
-nothing else: nothing is imported or called that it names, and no memory is asked for that the weights' file does not
-have.
+Anyone can publish weights, and runs. Their configuration names classes of this list with settings of these classes, by
+value, and nothing else: nothing is imported or called that it names, and no memory is asked for that the weights' file
+does not have.
 """
 
 import inspect
@@ -19,6 +19,7 @@ from diffusers import (
     FlowMatchEulerDiscreteScheduler,
     UniPCMultistepScheduler,
 )
+from omegaconf import OmegaConf
 from safetensors import safe_open
 from torch import nn
 
@@ -26,13 +27,14 @@ from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.autoreconstructor.view_encoders import CrossAttention, PlaneSweep
+from completesplat.baselines.regressor import SplatterImageUNet
 from completesplat.diffusion.conditioning import LearnedConditioning, StableDiffusionConditioning
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.schema import AtMost, Range, Share, hints_of, refused, shown
+from completesplat.schema import AtMost, Exactly, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
-from completesplat.weights import CONFIG_FILE, read_small
+from completesplat.weights import CONFIG_FILE, RUN_CONFIG_FILE, SCENES, read_small
 
 # What each setting that is a part may be.
 PARTS: dict[str, tuple[type, ...]] = {
@@ -43,6 +45,7 @@ PARTS: dict[str, tuple[type, ...]] = {
     "view_encoder": (PlaneSweep, CrossAttention),
     "conditioning": (LearnedConditioning, StableDiffusionConditioning),
     "denoiser": (Denoiser, TextlessStableDiffusion),
+    "network": (VariationalAutoReconstructor, SplatterImageUNet),
     "sampler": (Sampler,),
     "scheduler": (
         DDIMScheduler,
@@ -51,18 +54,54 @@ PARTS: dict[str, tuple[type, ...]] = {
         UniPCMultistepScheduler,
     ),
 }
-NETWORKS = ("autoreconstructor", "conditioning", "denoiser")
+NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")
+# Of a run's model: where its configuration has a model's settings, and its checkpoints the tensors.
+STAGES = {
+    "completesplat.training.latent_diffusion.LatentDiffusion": "completesplat",
+    "completesplat.training.reconstruction.ReconstructionModule": "model",
+}
 Part = Mapping[str, Any]
 
 
-class Architecture(TypedDict):
-    """The settings of `CompleteSplat`."""
+class TrainingPictures(TypedDict, total=False):
+    """What weights say about the pictures that they were trained on; older ones say nothing.
+
+    `box_masks`: how often parts of a picture were hidden. The others: mean and deviation of the training pictures'
+    features, see `completesplat.data.pictures.photograph.picture_features`.
+    """
+
+    box_masks: Share
+    picture_mean: Annotated[Sequence[Share], Exactly(8)]
+    picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Exactly(8)]
+
+
+class Needed(TypedDict):
+    """The settings of `CompleteSplat` that all weights have."""
 
     autoreconstructor: Part
     conditioning: Part
     denoiser: Part
     sampler: Part
     image_size: Annotated[int, Range(8, 1024)]
+
+
+class Architecture(Needed, total=False):
+    """The settings of `CompleteSplat`."""
+
+    training: TrainingPictures
+
+
+class NeededOfOneAnswer(TypedDict):
+    """What every configuration of `OneAnswer` has."""
+
+    network: Part
+    image_size: Annotated[int, Range(8, 1024)]
+
+
+class OneAnswerArchitecture(NeededOfOneAnswer, total=False):
+    """The settings of `OneAnswer`."""
+
+    training: TrainingPictures
 
 
 class SchedulerSettings(TypedDict, total=False):
@@ -135,14 +174,60 @@ def read_architecture(folder: Path) -> dict[str, Any]:
     return architecture
 
 
+def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
+    """The configuration of the model that a run trained, and the prefix of its tensors in the run's checkpoints.
+
+    It is read from the `config.yaml` beside the checkpoint's folder.
+
+    Raises:
+        WeightsError: it cannot be read, is of a model that makes no scene of a picture, or as `check_architecture`.
+    """
+    run = checkpoint.absolute().parent.parent
+    path = run / RUN_CONFIG_FILE
+    if not path.is_file():
+        raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.create(read_small(path)), resolve=False)
+        model, image_size = config["model"], config["data"]["image_size"]
+        target = str(model["_target_"])
+    except WeightsError:
+        raise
+    except Exception as error:  # of YAML and of OmegaConf, and where it is no mapping
+        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
+    if target not in STAGES:
+        said = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
+        fitted = f"; those that it fitted are in {run / SCENES}" if (run / SCENES).is_dir() else ""
+        raise WeightsError(f"{path} names {shown(target)}: {said}{fitted}")
+    part = model.get(STAGES[target])
+    if STAGES[target] == "model":
+        architecture: dict[str, Any] = {"network": untrained(part), "image_size": image_size}
+    else:
+        settings = part if isinstance(part, Mapping) else {}
+        architecture = {name: untrained(x) for name, x in settings.items() if name not in ("_target_", "_recursive_")}
+    try:
+        check_architecture(architecture)
+    except WeightsError as error:
+        raise WeightsError(f"{path}: {error}") from error
+    return architecture, f"{STAGES[target]}."
+
+
+def untrained(part: Any) -> Any:
+    """A part's configuration without the weights that its training started from: all are saved together."""
+    if not isinstance(part, Mapping):
+        return part
+    return {key: None if key == "pretrained" else value for key, value in part.items()}
+
+
 def check_architecture(architecture: Any) -> None:
     """Hold a configuration against `PARTS`, the signatures of these classes, and the bounds in their annotations.
 
     Raises:
         WeightsError: names the first setting that does not fit.
     """
-    hints = hints_of(Architecture)
-    if not isinstance(architecture, Mapping) or architecture.keys() != hints.keys():
+    one_answer = isinstance(architecture, Mapping) and "network" in architecture
+    hints = hints_of(OneAnswerArchitecture if one_answer else Architecture)
+    needed = (NeededOfOneAnswer if one_answer else Needed).__required_keys__
+    if not isinstance(architecture, Mapping) or not needed <= architecture.keys() <= hints.keys():
         raise WeightsError(f"a model's settings are {', '.join(hints)}")
     _check_settings("", hints, architecture)
 
@@ -174,17 +259,25 @@ def build(part: Part) -> Any:
     return CLASSES[settings.pop("_target_")](**settings)
 
 
-def check_sizes(architecture: Mapping[str, Any], file: Path) -> None:
-    """Compare the networks' tensors with those of a `safetensors` file, of which only the header is read.
+def check_sizes(architecture: Mapping[str, Any], held: Mapping[str, Sequence[int]], files: tuple[str, str]) -> None:
+    """Compare the networks' tensors with the sizes of those that are held.
+
+    Args:
+        files: names of the one that holds them, and of the one that the configuration is from.
 
     Raises:
-        WeightsError: one is not in the file, or has another size.
+        WeightsError: one is not there, or has another size.
     """
-    with safe_open(file, "pt") as tensors:
-        held = {name: tensors.get_slice(name).get_shape() for name in tensors.keys()}  # noqa: SIM118
     with torch.device("meta"):  # which gives tensors sizes and no memory
-        networks = nn.ModuleDict({name: build(architecture[name]) for name in NETWORKS})
+        networks = nn.ModuleDict({name: build(architecture[name]) for name in NETWORKS if name in architecture})
     for name, value in networks.state_dict().items():
-        if held.get(name) != list(value.shape):
-            there = held.get(name, "missing")
-            raise WeightsError(f"{name} is {there} in {file.name} and {list(value.shape)} by {CONFIG_FILE}")
+        there = held.get(name)
+        if there is None or list(there) != list(value.shape):
+            found = "missing" if there is None else list(there)
+            raise WeightsError(f"{name} is {found} in {files[0]} and {list(value.shape)} by {files[1]}")
+
+
+def sizes_in(file: Path) -> dict[str, list[int]]:
+    """Of the tensors in a `safetensors` file, of which only the header is read."""
+    with safe_open(file, "pt") as tensors:
+        return {name: tensors.get_slice(name).get_shape() for name in tensors.keys()}  # noqa: SIM118

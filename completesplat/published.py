@@ -1,4 +1,4 @@
-"""Scenes from photographs by weights that others published: one answer for each, in the place of `CompleteSplat`.
+"""Scenes from photographs by weights that others published: one answer for each.
 
 Splatter Image (Szymanowicz et al., CVPR 2024) sees an object on a plain background and gives one Gaussian a pixel. It
 draws nothing: there are no samples, and what is hidden stays an average.
@@ -10,51 +10,50 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from completesplat.baselines.published import PublishedSplatterImage
-from completesplat.data.pictures.photograph import Photograph, read_photograph
-from completesplat.errors import CompleteSplatError
+from completesplat.data.pictures.photograph import Photograph, Picture, read_photograph
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
-from completesplat.geometry.cameras import Cameras, pinhole
+from completesplat.geometry.cameras import Cameras
+from completesplat.scene_model import SceneModel, require_one
 
 OBJECT_SHARE = 0.65
 """Of the picture that a cut-out object fills (`gradio_app.py`, `resize_foreground`)."""
 PHONE_FOV = 50.0
 
 
-class PublishedGenerator(nn.Module):
-    """What `predict` and `view` ask of a generator, by published weights of Splatter Image.
+class PublishedGenerator(SceneModel):
+    """Published weights of Splatter Image, as `CompleteSplat.from_pretrained` and `predict` take them.
+
+    Its field of view is that of the training's pictures, or where each had its own, that of a phone's main camera; up
+    is upwards in the photograph.
 
     Attributes:
-        image_size: side of the square images, in pixels.
-        layers: Gaussians of a pixel.
-        fov_degrees: of the training's pictures, or where each had its own, of a phone's main camera.
-        up: where up is in a scene, which no weights know: upwards in the photograph.
+        said: what it is, and which pictures it wants.
 
     Args, Raises: those of `PublishedSplatterImage`.
     """
 
-    draws_samples = False
-    layers = 1
-    fov_degrees: Tensor
-    up: Tensor
-
     def __init__(self, weights: str) -> None:
-        super().__init__()
-        self.network = PublishedSplatterImage(weights).eval().requires_grad_(False)
-        self.image_size = self.network.image_size
-        fov = self.network.fov_degrees
-        self.register_buffer("fov_degrees", torch.tensor(PHONE_FOV if fov is None else fov))
-        self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
-        color = "white" if self.network.background else "black"
+        network = PublishedSplatterImage(weights)
+        super().__init__({"image_size": network.image_size})
+        self.network = network.eval().requires_grad_(False)
+        self.fov_degrees.fill_(PHONE_FOV if network.fov_degrees is None else network.fov_degrees)
+        color = "white" if network.background else "black"
         self.said = (
-            "Splatter Image (Szymanowicz et al., CVPR 2024), another method: one answer, no samples. It knows objects "
-            f"on {color}: give pictures that are transparent or {color} around one"
+            "Splatter Image (Szymanowicz et al., CVPR 2024), another method. It knows objects on "
+            f"{color}: give pictures that are transparent or {color} around one, or background=remove"
         )
 
-    def read(self, path: Path | str, fov_degrees: float | None = None) -> Photograph:
-        """Read a picture at the model's size, transparency laid over the background that the weights know.
+    @property
+    def reconstructing(self) -> PublishedSplatterImage:
+        """The network."""
+        return self.network
+
+    def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+        """A picture at the model's size, on the background that the weights know (`read_photograph`).
 
         Where the weights know one camera, each picture counts as that one's, and a cut-out object is put into its
         middle, as large as in training.
@@ -65,15 +64,16 @@ class PublishedGenerator(nn.Module):
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every picture as of {known:.0f} degrees")
-        share = None if known is None else OBJECT_SHARE
-        background = self.network.background
-        photograph = read_photograph(Path(path), self.image_size, fov_degrees, PHONE_FOV, background, share)
+        photograph = read_photograph(
+            picture,
+            self.image_size,
+            fov_degrees,
+            PHONE_FOV,
+            remove_background,
+            self.network.background,
+            None if known is None else OBJECT_SHARE,
+        )
         return photograph if known is None else replace(photograph, fov_degrees=known, fov_source="default")
-
-    def camera(self, photograph: Photograph) -> Cameras:
-        """The camera that took a photograph, at the origin of the world."""
-        intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(self.up.device)
-        return Cameras(torch.eye(4, device=self.up.device), intrinsics, (self.image_size, self.image_size))
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
         """Near and far; of captures around the distance at which the object has the size of training's."""
@@ -83,16 +83,23 @@ class PublishedGenerator(nn.Module):
         return self.network.depths.range(known)
 
     @torch.no_grad()
-    def forward(self, image: Photograph | Path | str, visible: Tensor | None = None, **_: Any) -> list[Gaussians]:
-        """The scene of one photograph, in its camera's frame (+x right, +y down, +z forward), in the colours it sees.
-
-        Raises:
-            CompleteSplatError: not a readable image, or something of it is hidden (`visible`).
-        """
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: int = 1,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        **settings: Any,
+    ) -> Gaussians:
+        """As `OneAnswer.generate`, in the colours that the cameras see; what is hidden counts as background."""
+        require_one(samples)
         if visible is not None:
-            raise CompleteSplatError(f"box and mask hide something, and these weights complete nothing: {self.said}")
-        photograph = image if isinstance(image, Photograph) else self.read(image)
-        camera = self.camera(photograph)
-        splatter_image = self.network(photograph.image[None].to(self.up.device)).splatter_image
-        scene = splatter_image.gaussians(camera[None], self.depth_range_of(photograph)[None])[0]
-        return [scene.seen_from(camera.centers)]
+            images = images * visible + self.network.background * (1 - visible)
+        scenes = self.network(images).splatter_image.gaussians(cameras, depth_range)
+        seen: Gaussians = scenes.seen_from(cameras.centers)
+        return seen
+
+    def save_pretrained(self, path: Path | str) -> None:
+        """`WeightsError`: what others published stays in their files."""
+        raise WeightsError("published weights are kept as their authors' files: copy these")

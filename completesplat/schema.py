@@ -58,6 +58,17 @@ class AtMost:
         return None if len(value) <= self.entries else f"must have at most {self.entries} entries"
 
 
+@dataclass(frozen=True)
+class Exactly:
+    """A rule for `Annotated`: a list has this many entries."""
+
+    entries: int
+
+    def refusal(self, value: Any) -> str | None:
+        """Why the value is refused; None if it is not."""
+        return None if len(value) == self.entries else f"must have {self.entries} entries"
+
+
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
 Share = Annotated[float, Range(0, 1)]

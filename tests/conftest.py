@@ -2,15 +2,22 @@
 
 import os
 import shutil
+import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from filelock import FileLock
+from PIL import Image, ImageOps
 from support import SMALL, call, tiny_generator
 
+from completesplat.data.pictures import photograph
 from completesplat.data.toy import write_objects
+from completesplat.signals import ENDING
 
 # W&B would go on reading what later tests of the process print, and complain in their logs that its run has ended.
 os.environ.setdefault("WANDB_CONSOLE", "off")
@@ -103,6 +110,16 @@ def tiny_weights(built_once: Folders) -> Path:
     return built_once("weights", lambda folder: tiny_generator().save_pretrained(folder))
 
 
+@pytest.fixture
+def plain_signals():
+    """The system's handlers, as a new process has them; trainers of other tests may have left Lightning's."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 class Finished(NamedTuple):
     """What a command left behind."""
 
@@ -122,3 +139,22 @@ def command(capfd, monkeypatch, tmp_path):
         return Finished(status, *capfd.readouterr())
 
     return run
+
+
+@pytest.fixture
+def rembg(monkeypatch):
+    """rembg's interface as it is used (2.0.86): it turns pictures by their EXIF; here red is the background."""
+    module = ModuleType("rembg")
+    module.sessions = []
+
+    def remove(picture, session=None):
+        turned = ImageOps.exif_transpose(picture).convert("RGBA")
+        pixels = np.array(turned)
+        pixels[..., 3] = np.where(pixels[..., 0] > 128, 0, 255)
+        return Image.fromarray(pixels)
+
+    module.new_session, module.remove = lambda name: module.sessions.append(name), remove
+    monkeypatch.setitem(sys.modules, "rembg", module)
+    photograph._session.cache_clear()
+    yield module
+    photograph._session.cache_clear()

@@ -1,6 +1,16 @@
 """What tests of training need that a model of one layer can show."""
 
+import csv
+from pathlib import Path
+
 import torch
+from lightning import Trainer
+from lightning.pytorch.demos.boring_classes import BoringModel
+
+from completesplat.training.checkpoints import LAST, CheckpointFiles, Checkpoints
+from completesplat.training.loggers import ContinuedCSVLogger
+
+STEPS = 15  # an epoch of `Batches` has twelve
 
 
 class Batches:
@@ -22,3 +32,39 @@ class Batches:
 
     def load_state_dict(self, state):
         self.start = state["given"]
+
+
+class Logging(BoringModel):
+    """Rows of every second step, of validation at every third, and of some steps by itself."""
+
+    def training_step(self, batch, index):
+        loss = self.layer(batch).square().mean()
+        self.log("train/loss", loss.detach())
+        if self.global_step % 4 == 1:
+            self.logger.log_metrics({"own": loss.item()}, step=self.global_step)
+        return loss
+
+    def validation_step(self, batch, index):
+        self.log("val/loss", self.layer(batch).square().mean())
+
+
+def fit(folder: Path, steps: int = STEPS, every: int = 1, model: type[Logging] = Logging, **settings: object) -> None:
+    """Go on in a folder, as `completesplat fit ckpt_path=last` does, and write the final row."""
+    torch.manual_seed(0)
+    module, logger = model(), ContinuedCSVLogger(str(folder))
+    checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=every, keep_every=5 * every)
+    trainer = Trainer(
+        max_steps=steps, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
+        log_every_n_steps=2, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0,
+        enable_progress_bar=False, enable_model_summary=False, **settings,
+    )  # fmt: skip
+    last = folder / "checkpoints" / LAST
+    validation = torch.utils.data.DataLoader(torch.ones(1, 32))
+    trainer.fit(module, Batches(), validation, ckpt_path=last if last.is_file() else None, weights_only=True)
+    figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
+    logger.log_metrics(figures, step=trainer.global_step)
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file))

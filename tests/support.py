@@ -28,6 +28,7 @@ SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     monkeypatch.setattr(sys, "argv", ["completesplat", *map(str, arguments)])
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the working folder is added
     try:
         cli.main()
     except SystemExit as stop:

@@ -7,8 +7,8 @@ import pytest
 from completesplat.atomic import atomic_path, write_text
 
 
-def test_a_file_takes_the_place_of_the_old_one_in_a_folder_that_is_made(tmp_path: Path) -> None:
-    path = tmp_path / "new/x.txt"
+def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
     for text in ("one", "two ±"):
         write_text(path, text)
         assert path.read_text(encoding="utf-8") == text

@@ -23,6 +23,7 @@ NEVER_IMPORTED = {
     "beartype": "checks the types of jaxtyping in all tests (pytest's options)",
     "hydra-submitit-launcher": "found by hydra: hydra/launcher=submitit_slurm",
     "ipykernel": "runs the notebooks",
+    "pdoc": "`make docs`",
     "mypy": "a program",
     "nbclient": "runs the notebooks",
     "pytest-xdist": "an option of pytest",

@@ -129,6 +129,11 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, tmp_pa
         (f"{SCHEDULER}.num_train_timesteps", 10**9, "must lie between 1 and 10000"),
         (f"{SCHEDULER}.trained_betas", [0.1] * 20_000, "must have at most 10000 entries"),
         ("more", {}, "a model's settings are autoreconstructor, "),
+        ("training", None, "training=None: must be a mapping"),
+        ("training", {"box_masks": 2}, "must lie between 0 and 1"),
+        ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
+        ("training", {"picture_std": [0.5] * 7 + [0]}, "must lie between 1e-06 and 1"),
+        ("training", {"picture_mean": [math.nan] * 8}, "must lie between 0 and 1"),
     ],
 )
 def test_settings_are_of_their_kinds_and_within_bounds(folder, place, value, said):

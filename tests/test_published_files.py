@@ -16,7 +16,7 @@ def test_a_file_a_folder_and_a_name_of_the_hub_are_known(tmp_path, tiny_weights)
     path = write_published(tmp_path, "hydrants")
     for weights in ("splatter_image:hydrants", str(path), str(tmp_path)):
         assert is_published(weights)
-    for weights in (None, "toy_objects", str(tiny_weights), "some/splats"):
+    for weights in ("toy_objects", str(tiny_weights), "some/splats"):
         assert not is_published(weights)
     for weights in (path, tmp_path):
         assert find(str(weights)).weights == path

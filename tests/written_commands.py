@@ -8,7 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from support import compose_config
 
 from completesplat.cli import VERBS
-from completesplat.commands import TASKS, conf_folder
+from completesplat.commands import SHORT_FORMS, TASKS, conf_folder
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -72,8 +72,8 @@ def composed(command: str):
     arguments = [argument for argument in arguments if argument not in ("-m", "--multirun")]
     if verb in TASKS and arguments and "=" not in arguments[0]:
         arguments[0] = f"{verb}_task={arguments[0]}"
-    if verb == "view" and arguments and "=" not in arguments[0]:
-        arguments[0] = f"path={arguments[0]}"
+    if verb in SHORT_FORMS:
+        arguments = SHORT_FORMS[verb](arguments)
     return compose_config(verb, *map(_first_job, arguments))
 
 

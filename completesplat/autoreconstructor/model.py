@@ -12,7 +12,7 @@ from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.scene import Views
 from completesplat.schema import Share
-from completesplat.splatter_image import SplatterImage
+from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import TensorDataclass
 
 
@@ -68,6 +68,11 @@ class VariationalAutoReconstructor(nn.Module):
     def sees_views(self) -> bool:
         """Whether the posterior takes in other views than the reference."""
         return self.view_encoder is not None
+
+    @property
+    def parameterization(self) -> Parameterization:
+        """How the raw values of its Splatter Images are read."""
+        return self.reconstructor.parameterization
 
     def posterior(
         self,

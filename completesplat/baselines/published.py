@@ -101,6 +101,7 @@ class PublishedSplatterImage(nn.Module):
     """
 
     ray_dirs: Tensor
+    parameterization = PARAMETERIZATION
 
     def __init__(self, weights: str) -> None:
         super().__init__()

@@ -1,6 +1,5 @@
 """The regression baseline "Splatter Image (full images)": one pass of a U-Net, nothing drawn, no latent."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from diffusers import UNet2DModel
@@ -9,6 +8,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.schema import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 
@@ -36,11 +36,11 @@ class SplatterImageUNet(nn.Module):
     def __init__(
         self,
         parameterization: Parameterization,
-        channels: Sequence[int] = (128, 256, 256, 256),
-        attention_levels: Sequence[int] = (3,),
-        layers_per_block: int = 4,
-        dropout: float = 0.1,
-        norm_groups: int = 32,
+        channels: Widths = (128, 256, 256, 256),
+        attention_levels: Levels = (3,),
+        layers_per_block: Few = 4,
+        dropout: Share = 0.1,
+        norm_groups: Width = 32,
         gradient_checkpointing: bool = False,
     ) -> None:
         super().__init__()

@@ -16,13 +16,14 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.commands import jobs
+from completesplat.commands import jobs, new, view
 from completesplat.commands.jobs import conf_folder
-from completesplat.commands.view import overrides
 from completesplat.errors import CompleteSplatError
+from completesplat.signals import ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 TASKS = ("data", "bench", "report")
+SHORT_FORMS = {"view": view.overrides, "new": new.overrides}
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -37,19 +38,25 @@ def launch(verb: str, arguments: list[str]) -> None:
     """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
     `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`. `view PATH` is short
-    for `view path=PATH`.
+    for `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
     """
+    jobs.use_working_folder()
     # A further process of a job: Lightning starts one for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         out = Path(arguments[0].partition("=")[2])
-        return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+        with ended_by_signals():
+            return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+    program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
+    logging.raiseExceptions = False
+    flags, arguments = jobs.split_config_dir(arguments)
     if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
         arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
-    if verb == "view":
-        arguments = overrides(arguments)
-    program, given = sys.argv[0], arguments
+    if verb in SHORT_FORMS:
+        arguments = SHORT_FORMS[verb](arguments)
+    arguments = [*flags, *arguments]
     if "-m" in arguments or "--multirun" in arguments:
         arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
@@ -60,7 +67,8 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     def job(config: Any) -> None:
         try:
-            jobs.run_job(verb, config, program, given)
+            with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
+                jobs.run_job(verb, config, program, given)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end
@@ -99,7 +107,11 @@ def refusal(error: BaseException) -> str | None:
         named = str(error).partition("Missing mandatory value: ")[2].split()  # omegaconf keeps it nowhere else
         key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
         return f"{key} is needed: give {key}=VALUE"
-    if isinstance(error, HydraException | OmegaConfBaseException) and not isinstance(error, InstantiationException):
+    if isinstance(error, InstantiationException):
+        # A module or name that is not there may be misspelt; what else is raised while parts are made is a fault.
+        missing = error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError)
+        return " ".join(str(error.__cause__).split()) if missing else None
+    if isinstance(error, HydraException | OmegaConfBaseException):
         return " ".join(str(error).split())
     return None
 

@@ -96,8 +96,8 @@ def latents(
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
     from completesplat.commands.trained import config_of_run
-    from completesplat.training.checkpoints import load_part
     from completesplat.training.encoding import encode_training_set
+    from completesplat.weights.checkpoint_reading import load_part
 
     run_config = config_of_run(Path(ckpt), list(overrides), trust)
     autoreconstructor = instantiate(run_config.model.get("model"), _convert_="all")

@@ -23,6 +23,7 @@ from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_modes, log_scores, log_shown
 from completesplat.schema import Natural, Positive, Range
 from completesplat.training.loggers import finished
+from completesplat.training.stopping import stopped_together
 
 
 def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
@@ -67,6 +68,7 @@ def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
 
 
+@stopped_together()
 def run(
     trained: Mapping[str, Any],
     evaluation: Mapping[str, Any],
@@ -95,7 +97,7 @@ def run(
         results = module.test_results()
         if not testing.is_global_zero:
             return
-        described = protocol(evaluation, module, data, results) | tested.facts()
+        described = protocol(evaluation, module, data, results, out) | tested.facts()
         log_scores(results, testing)
         write_json(out / METRICS, {"protocol": described} | results)
         log_shown(results, shown, testing, out)
@@ -162,7 +164,7 @@ def run_hidden_modes(
     write_json(out / "calibration.json", calibration)
     write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
-    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used))
+    write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
     draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
@@ -174,7 +176,7 @@ def run_hidden_modes(
 
 
 def _hidden_modes_protocol(
-    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]]
+    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]], out: Path
 ) -> dict[str, Any]:
     """The statement of what was measured and how, with the names of the scenes."""
     return {
@@ -185,6 +187,6 @@ def _hidden_modes_protocol(
         **scenes,
         **{key: evaluation[key] for key in ("samples", "views", "spread_views", "seed")},
         **drawing(module),
-        **provenance(data),
+        **provenance(data, out),
         **tested.facts(),
     }

@@ -18,10 +18,16 @@ from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.generation import OneAnswer
 from completesplat.results.tables import Table, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_scores, log_shown
-from completesplat.training.checkpoints import check_whole, newest_whole
+from completesplat.training.checkpoints import newest_whole
+from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import finished
+from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.training.stopping import stopped_together
+from completesplat.weights import RUN_WEIGHTS
+from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
 
@@ -49,6 +55,7 @@ def parameter_table(module: nn.Module) -> Table:
     return table("Model", COLUMNS, rows)
 
 
+@stopped_together()
 def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     quieten()
@@ -70,6 +77,8 @@ def run(config: Any, out: Path) -> None:
     with finished(loggers):
         shown = begin(module, trainer, config, out)
         metrics = _train(trainer, module, data, checkpoint)
+        if trainer.is_global_zero:
+            export_weights(config, module, data, out / RUN_WEIGHTS)
         if tested is not None:
             metrics |= _test(config, module, tested)
         for one in loggers:  # a run shorter than the logging interval leaves its figures too
@@ -82,7 +91,7 @@ def run(config: Any, out: Path) -> None:
         results |= metrics
         if scores is not None:
             show(evaluation_table(scores))
-            described = protocol(config.evaluation, module, tested, scores) | _facts(trainer, out)
+            described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
             log_scores(scores, trainer)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
@@ -122,14 +131,30 @@ def refuse_missing(config: Any) -> None:
             raise CompleteSplatError(f"{key} is needed: give {key}={example}")
 
 
+def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:
+    """Write what `predict` and `from_pretrained` read: of either stage, and of the baseline Splatter Image.
+
+    A network that weights may not name is left out, with a warning.
+    """
+    if isinstance(module, LatentDiffusion):
+        module.completesplat.architecture["training"] = data.training_facts()
+        return module.completesplat.save_pretrained(folder)
+    if type(module) is not ReconstructionModule:
+        return None
+    architecture: Any = {"network": OmegaConf.to_container(config.model.model), "image_size": config.data.image_size}
+    try:
+        model = OneAnswer.with_trained(architecture, module.model.state_dict(), module.camera)
+    except WeightsError as error:
+        return logger.warning("no weights are written to %s: %s", folder, error)
+    model.architecture["training"] = data.training_facts()
+    return model.save_pretrained(folder)
+
+
 def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict[str, float]:
     """Everything that was logged, in the end; a model that has nothing to learn beforehand is not trained."""
     if not any(parameter.requires_grad for parameter in module.parameters()):
         return {}
-    try:
-        trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
-    except SystemExit as stop:  # so Lightning ends the program after Ctrl-C
-        raise KeyboardInterrupt from stop
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 

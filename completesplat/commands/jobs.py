@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import platform
 import re
 import sys
 import time
@@ -12,21 +13,31 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.types import RunMode
 from hydra.utils import get_method, instantiate
 from omegaconf import OmegaConf
 
 from completesplat import __version__
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, writing
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
+from completesplat.results.runs import typed
 from completesplat.schema import check_settings
+from completesplat.signals import Interrupted, ended_by_signals
 
 LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
+LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
+CONFIG_DIR = ("--config-dir", "-cd")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -36,9 +47,81 @@ def conf_folder() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
+class SettingsOfWorkingFolder(SearchPathPlugin):
+    """`./conf`, where it is, holds further options of the groups; the package's own come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Add it (hydra's name for what a plugin does)."""
+        folder = Path.cwd() / "conf"
+        if folder.is_dir() and not folder.samefile(conf_folder()):
+            search_path.append("working-folder", f"file://{folder}")
+
+
+def use_working_folder() -> None:
+    """Have modules found in the working folder, behind all others, and settings in its `conf`; in each process."""
+    folder = str(Path.cwd())
+    if not {"", folder} & set(sys.path):
+        sys.path.append(folder)
+    Plugins.instance().register(SettingsOfWorkingFolder)
+
+
+def composed(verb: str, *overrides: str) -> Any:
+    """A verb's configuration, as the command line would compose it in this folder, without starting anything."""
+    use_working_folder()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        return compose(verb, overrides=list(overrides))
+
+
+def split_config_dir(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """What names a further folder of settings (`--config-dir DIR`), in one piece, and the other arguments.
+
+    Hydra takes its flags before or behind the settings, not between them. `CompleteSplatError`: no folder is named.
+    """
+    flags, others, given = [], [], iter(arguments)
+    for argument in given:
+        name, equals, folder = argument.partition("=")
+        if name not in CONFIG_DIR:
+            others.append(argument)
+            continue
+        folder = folder if equals else next(given, "")
+        if not folder:
+            raise CompleteSplatError(f"{name} needs a folder: {name} DIR")
+        flags.append(f"{CONFIG_DIR[0]}={folder}")
+    return flags, others
+
+
 def one_of_several() -> bool:
     """Whether a launcher started several of this process: torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`)."""
     return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
+
+
+def is_first() -> bool:
+    """Whether this is the first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone."""
+    return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
+
+
+@contextmanager
+def alone_in(out: Path) -> Iterator[None]:
+    """Hold the lock of a job's directory, in its first process; the lock's file names the process and the computer.
+
+    The system gives it up when the process ends, however that is. `CompleteSplatError`: another process holds it.
+    """
+    path = out / LOCK
+    if not is_first():
+        yield
+        return
+    try:
+        with writing(path):
+            lock = FileLock(path).acquire(blocking=False)
+    except Timeout:
+        holder = path.read_text().split()
+        named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
+        said = f"{out}: {named} is at work in it: wait for it or end it, or choose another out=DIR"
+        raise CompleteSplatError(said) from None
+    with lock:
+        with writing(path):
+            path.write_text(f"{os.getpid()}\n{platform.node()}\n")
+        yield
 
 
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
@@ -85,6 +168,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
     started with the arguments `given` behind the verb.
     """
+    use_working_folder()  # a cluster may have started this process
     hydra_config = HydraConfig.get()
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
@@ -93,8 +177,8 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return
-    # The first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone.
-    if int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0:
+    first = is_first()
+    if first:
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
             OmegaConf.save(resolved, temporary)
         _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
@@ -102,9 +186,26 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
         # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
         if OmegaConf.select(config, f"model.{key}") is not None:
             config.model[key] = resolved["model"][key]
-    with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
-        start(verb, config, out)
+    try:
+        with ended_by_signals(), _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
+            start(verb, config, out)
+    except Interrupted as stop:
+        if first:
+            print(_said(stop, verb, given, out), file=sys.stderr)
+        raise
     print(out)
+
+
+def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
+    """One line: what ended a job, its checkpoint, and the command that goes on with it (in a sweep, with all jobs)."""
+    hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
+    of_a_sweep = hydra_config.mode == RunMode.MULTIRUN
+    dropped = ("out=", "ckpt_path=") if begun and not of_a_sweep else ("out=",)
+    again = [f"completesplat {verb}", *(argument for argument in given if not argument.startswith(dropped))]
+    again += ["ckpt_path=last"] if begun and not of_a_sweep else []
+    again.append(f"out={hydra_config.sweep.dir if of_a_sweep else out}")
+    checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
+    return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {typed(again)}"
 
 
 def start(verb: str, config: Any, out: Path) -> None:
@@ -131,7 +232,7 @@ def is_finished(out: Path, config: Any) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different.discard("ckpt_path")
+    different -= {"ckpt_path", "data.allow_changed"}
     if different:
         first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
         raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")

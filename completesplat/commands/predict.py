@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.utils import instantiate
 from jaxtyping import Float
@@ -21,22 +21,23 @@ from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.commands.trained import open_generator
 from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
 from completesplat.generation import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
 from completesplat.names import folder_names, printable, safe_name
-from completesplat.published import PublishedGenerator
 from completesplat.rasterizers import Rasterizer
+from completesplat.scene_model import SceneModel
 from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
-
-Generator = CompleteSplat | PublishedGenerator
+UNLIKE = 2.0
+"""Distance from the training pictures (`SceneModel.distance`) from which a warning is given."""
+REMOVE = "remove"
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class PredictNumbers(TypedDict):
     batch: Positive | None
     fov: float | None
     frames: Annotated[int, Range(1, 1000)]
-    background: Share
+    background: Share | Literal["remove"]
 
 
 def run(config: Any, out: Path) -> None:
@@ -112,7 +113,7 @@ def wanted_files(config: Any) -> Wanted:
         formats=formats,
         videos=_chosen("video", config.video, tuple(PATHS)),
         frames=config.frames,
-        background=config.background,
+        background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
         screen_space_dilation=config.screen_space_dilation,
         converter=find_splat_transform() if set(formats) & set(CONVERTED) else None,
@@ -128,23 +129,31 @@ def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def predict_pictures(config: Any, model: Generator, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
 
-    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others.
+    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others;
+    a full disk does (`DiskError`).
     """
     console, failed = Console(), []
+    if (config.mask is not None or config.box is not None) and not model.knows_hidden:
+        log.warning(
+            "%s: these weights were not trained with parts of the picture hidden (data.box_masks, conf/experiment/"
+            "*_masked.yaml): what is hidden may come out black or grey",
+            "mask" if config.mask is not None else "box",
+        )
     rasterizer = instantiate(config.rasterizer, _convert_="all")
-    samples = config.samples if model.draws_samples else 1
     folders = folder_names(picture.stem for picture in pictures)
     with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(pictures) * samples)
+        task = bar.add_task("", total=len(pictures) * config.samples)
         for index, (picture, folder) in enumerate(zip(pictures, folders, strict=True)):
             name = printable(picture.name)
-            bar.update(task, description=escape(name), completed=index * samples)
+            bar.update(task, description=escape(name), completed=index * config.samples)
             start = time.perf_counter()
             try:
                 _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
+            except DiskError:  # it would be the same with the others
+                raise
             except Exception as error:
                 message, expected = _told(error, picture), isinstance(error, CompleteSplatError | OSError)
                 if len(pictures) == 1 and expected:
@@ -179,11 +188,11 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
     """
     if len(pictures) < 2:
         raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")
-    if beside := [name for name in ("mask", "box", "fov") if config[name] is not None]:
+    beside = [name for name in ("mask", "box", "fov") if config[name] is not None]
+    beside += ["background=remove"] if config.background == REMOVE else []
+    if beside:
         raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
     model = open_generator(config)
-    if not model.draws_samples:
-        raise CompleteSplatError(f"cameras=FILE: these weights see one picture: {model.said}")
     views = read_photographs(pictures, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_own_units(views.cameras))
     scene = model.reconstruct(views)
@@ -202,22 +211,28 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
 
 def _predict(
     config: Any,
-    model: Generator,
+    model: SceneModel,
     rasterizer: Rasterizer,
     wanted: Wanted,
     image: Path,
     folder: Path,
     on_sample: Callable[[], None],
 ) -> None:
-    photograph = model.read(image, config.fov)
-    if warning := unusual_field_of_view(photograph, model.fov_degrees.item()):
-        log.warning("%s: %s", printable(image.name), warning)
+    photograph = model.read(image, config.fov, config.background == REMOVE)
+    if found := remarks(photograph, model):
+        log.warning("%s: %s", printable(image.name), "; ".join(found))
     visible = visible_part(config, image, model.image_size)
-    settings, drawn_by = drawing_settings(config, model, visible)
+    settings = {name: config[name] for name in ("samples", "seed")}
+    how = {}
+    if isinstance(model, CompleteSplat):
+        settings["guidance_weight"] = config.guidance_weight
+        settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
+        settings["steps"] = model.sampler.steps if config.steps is None else config.steps
+        how = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
-        **drawn_by,
+        **how,
         "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),
@@ -226,19 +241,24 @@ def _predict(
         "fov_source": photograph.fov_source,
         "depth_range": model.depth_range_of(photograph).tolist(),
     }
+    if (distance := model.distance(photograph)) is not None:
+        recorded["distance_from_training"] = distance
+    if config.background == REMOVE:
+        recorded["background"] = REMOVE
     shown = photograph.image if visible is None else photograph.image * visible
     camera = model.camera(photograph)
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 
-def drawing_settings(config: Any, model: Generator, visible: Tensor | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """What samples are drawn with, and by what; of weights that draw none, the seed that files record."""
-    if isinstance(model, PublishedGenerator):
-        return {"seed": config.seed}, {}
-    settings = {name: config[name] for name in ("samples", "guidance_weight", "seed")}
-    settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
-    settings["steps"] = model.sampler.steps if config.steps is None else config.steps
-    return settings, {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
+def remarks(photograph: Photograph, model: SceneModel) -> list[str]:
+    """What makes a photograph unlike those that the model was trained on."""
+    found = [unusual_field_of_view(photograph, model.fov_degrees.item())]
+    if (distance := model.distance(photograph)) is not None and distance > UNLIKE:
+        found.append(
+            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training pictures'"
+            f" ({UNLIKE:g} is far): expect little of it in the scenes"
+        )
+    return [remark for remark in found if remark]
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:

@@ -3,7 +3,6 @@
 import json
 import math
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from completesplat import __version__
 from completesplat.atomic import write_text
 from completesplat.results.machine import machine
+from completesplat.results.runs import origin
 from completesplat.weights import sha256_of
 
 
@@ -58,8 +58,10 @@ METRICS: dict[str, dict[str, Any]] = {
 }
 
 
-def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any]) -> dict[str, Any]:
-    """The statement beside a test's results, which followed the configuration `evaluation` (`conf/evaluation/`)."""
+def protocol(
+    evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any], out: Path
+) -> dict[str, Any]:
+    """The statement beside a test's results in `out`, which followed a configuration of `conf/evaluation/`."""
     scored, model = module.evaluation, results["model"]
     described = {
         "name": evaluation["name"],
@@ -77,16 +79,16 @@ def protocol(evaluation: Mapping[str, Any], module: Any, data: Any, results: dic
         "average": "over the views of a scene, then over scenes",
         "metrics": {name: METRICS[name] for name in scored.metrics if name in METRICS},
         "missing": scored.missing,
-        **provenance(data),
+        **provenance(data, out),
     }
     for metric in scored.set_metrics:
         described["metrics"] |= metric.settings()
     return described
 
 
-def provenance(data: Any) -> dict[str, Any]:
-    """The test data, and which program measured with it where."""
-    program = {"version": __version__, "commit": git_commit(), "command": " ".join(sys.argv)}
+def provenance(data: Any, out: Path) -> dict[str, Any]:
+    """The test data, and which program measured with it where; its command is that of `run.json` in `out`."""
+    program = {"version": __version__, "commit": git_commit(), "command": origin(out, levels=0)["command"]}
     return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 
 
@@ -105,7 +107,7 @@ def drawing(module: Any) -> dict[str, Any]:
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
     """Path, checksum and step of a checkpoint, and whether it holds an average (Lightning's `WeightAveraging`)."""
-    from completesplat.training.checkpoints import read_checkpoint
+    from completesplat.weights.checkpoint_reading import read_checkpoint
 
     contents = read_checkpoint(path)
     facts = {"path": str(path), "sha256": sha256_of(path), "step": contents.get("global_step")}

@@ -33,12 +33,8 @@ ONLY_FOR_TRAINING = (
 OF_A_RUN = ["model", "data"]
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
 GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
-MSE = {"mse": {"weight": 1.0, "term": {"_target_": "completesplat.losses.mse.MeanSquaredError"}}}
-UNTRAINED = {
-    "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
-    "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
-}
 TARGET = re.compile(r"_target_: *([\w.]+)")
+WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 
 
@@ -88,7 +84,7 @@ class Trained:
             WeightsError: the weights do not fit.
             CompleteSplatError: a sampler for a model that draws nothing.
         """
-        from completesplat.training.checkpoints import load_part
+        from completesplat.weights.checkpoint_reading import load_part
 
         module = instantiate(configuration.model, _convert_="all")
         if self.ckpt is not None:
@@ -103,77 +99,93 @@ class Trained:
             return checkpoint_facts(Path(self.ckpt))
         weights = str(self.weights)
         file = find(weights).weights if is_published(weights) else weights_folder(weights) / WEIGHTS_FILE
-        digest = sha256_of(file)
-        return {"checkpoint": {"path": str(self.weights), "sha256": digest, "step": None}, "ema": None}
+        return {"checkpoint": {"path": weights, "sha256": sha256_of(file), "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
-        """A module around what is loaded; what it would be trained with does not matter."""
-        if is_published(weights):
-            return self._config_of_published(weights)
-        folder = weights_folder(weights)
+        """A stage's module around a model that is loaded; what it would be trained with does not matter."""
+        published = is_published(weights)
+        folder = weights if published else str(weights_folder(weights))
+        architecture = {} if published else read_architecture(Path(folder))
+        if published or "network" in architecture:
+            mse = {"weight": 1.0, "term": {"_target_": "completesplat.losses.mse.MeanSquaredError"}}
+            stage: dict[str, Any] = {
+                "_target_": "completesplat.training.reconstruction.ReconstructionModule",
+                "model": {"_target_": "completesplat.commands.trained.network_of", "weights": folder},
+                "loss": {"_target_": "completesplat.losses.WeightedSum", "terms": {"mse": mse}},
+            }
+        else:
+            loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": folder}
+            stage = {
+                "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
+                "completesplat": loaded,
+            }
         model = {
-            "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
-            "completesplat": {
-                "_target_": "completesplat.generation.CompleteSplat.from_pretrained",
-                "path": str(folder),
-            },
+            **stage,
             "rasterizer": self.rasterizer,
-            **UNTRAINED,
+            "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
+            "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
-        found.data.image_size = read_architecture(folder)["image_size"]
+        if published:
+            return _as_published(found, weights)
+        found.data.image_size = architecture["image_size"]
         return found
 
-    def _config_of_published(self, weights: str) -> Any:
-        """The baseline with published weights, and data as these know them: objects only, on their background."""
-        known = find(weights).data
-        background = float(known["white_background"])
-        model = {
-            "_target_": "completesplat.training.reconstruction.ReconstructionModule",
-            "model": {"_target_": "completesplat.baselines.published.PublishedSplatterImage", "weights": weights},
-            "loss": {"_target_": "completesplat.losses.WeightedSum", "terms": MSE},
-            "rasterizer": {
-                "_target_": "completesplat.rasterizers.directional.DirectionalRasterizer",
-                "rasterizer": self.rasterizer,
-            },
-            "background": background,
-            **UNTRAINED,
-        }
-        found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
-        found.data.image_size, found.data.background = known["training_resolution"], background
-        if known["origin_distances"]:  # the far end of the depth range says where the object is
-            if "depth_after" not in found.data:
-                raise CompleteSplatError(f"weights={weights}: know objects; these data do not say where objects are")
-            found.data.depth_after = known["zfar"]
-        return found
+
+def _as_published(config: Any, weights: str) -> Any:
+    """Data as published weights know them, objects only on their background, and renders of such Gaussians.
+
+    `CompleteSplatError`: weights that have to be told where objects are, and data that do not.
+    """
+    known = find(weights).data
+    config.model.rasterizer = {
+        "_target_": "completesplat.rasterizers.directional.DirectionalRasterizer",
+        "rasterizer": config.model.rasterizer,
+    }
+    config.model.background = config.data.background = float(known["white_background"])
+    config.data.image_size = known["training_resolution"]
+    if known["origin_distances"]:  # the far end of the depth range says where the object is
+        if "depth_after" not in config.data:
+            raise CompleteSplatError(f"weights={weights}: know objects; these data do not say where objects are")
+        config.data.depth_after = known["zfar"]
+    return config
+
+
+def network_of(weights: str) -> Any:
+    """The network of weights that give one answer."""
+    from completesplat.generation import CompleteSplat
+
+    return CompleteSplat.from_pretrained(weights).reconstructing
 
 
 def open_generator(config: Any) -> Any:
-    """The `CompleteSplat` of `config.weights`, with `config.sampler` if given, or a `PublishedGenerator`.
+    """The model of `config.weights`, with `config.sampler` if given; what it cannot do is printed.
+
+    Of one that draws nothing, `config.samples` becomes 1.
 
     Raises:
-        WeightsError: as these, or weights that are not finite.
-        CompleteSplatError: a sampler for weights that draw nothing.
+        WeightsError: as `from_pretrained`, or weights that are not finite.
+        CompleteSplatError: a sampler for a model that draws nothing.
     """
     from completesplat.generation import CompleteSplat
     from completesplat.published import PublishedGenerator
 
-    model: Any
     if config.weights in in_the_box():
         print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
-    if is_published(config.weights):
-        model = PublishedGenerator(config.weights)
-        print(f"weights: {config.weights}, {model.said}")
-    else:
-        model = CompleteSplat.from_pretrained(config.weights)
+    model = CompleteSplat.from_pretrained(config.weights)
     broken = [name for name, values in model.state_dict().items() if not values.isfinite().all()]
     if broken:
         raise WeightsError(
             f"{config.weights}: weights that are not finite in {len(broken)} tensors, such as {broken[0]}"
         )
-    if config.get("sampler") is not None:
-        if not model.draws_samples:
-            raise CompleteSplatError(f"sampler: nothing is drawn with these weights: {model.said}")
+    if not model.draws_samples:
+        if config.get("sampler") is not None:
+            raise CompleteSplatError(f"{config.weights}: these weights draw no samples: leave out sampler")
+        print(f"weights: {config.weights} gives one answer for each picture and draws no samples: {WITHOUT_EFFECT}")
+        if isinstance(model, PublishedGenerator):
+            print(f"weights: {model.said}")
+        config.samples = 1
+    if isinstance(model, CompleteSplat) and config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)
         model.replace_sampler(sampler)
     return model
@@ -193,7 +205,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
     run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
-    user's own, too; the changes may name anything.
+    user's own, too, such as those in the working folder; the changes may name anything.
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
@@ -254,9 +266,12 @@ def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
 
 
 def _belongs_to_user(config: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there."""
+    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+
+    In the run's own folder, modules that came with it would count as the user's.
+    """
     run = config.resolve().parent
-    return run.is_relative_to(Path.cwd()) and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
+    return Path.cwd() in run.parents and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
 
 
 def _is_own(target: str) -> bool:

@@ -4,16 +4,20 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from signal import SIGINT
 from typing import Annotated, Any, TypedDict
 
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
 from completesplat.schema import Range, Share, check_settings
-from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE
+from completesplat.signals import Interrupted
+from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
 EXPORT = "--export"
-WEIGHTS = (CONFIG_FILE, WEIGHTS_FILE)
+WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
+KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
+SCENE_FILES = ("sample_*.ply", "scene.ply")
 
 
 class ViewNumbers(TypedDict):
@@ -62,8 +66,9 @@ def run(config: Any, out: Path) -> None:
         print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(3600)
-    except KeyboardInterrupt:
-        pass
+    except Interrupted as stop:
+        if stop.signal != SIGINT:
+            raise
     finally:
         page.close()
 
@@ -71,19 +76,22 @@ def run(config: Any, out: Path) -> None:
 def settings_of(path: Path) -> dict[str, str]:
     """The setting that a path stands for: `scene`, `image` or `weights`; `CompleteSplatError` for none of these."""
     if path.is_file():
-        return {"scene" if path.suffix.lower() == ".ply" else "image": str(path)}
+        return {KINDS.get(path.suffix.lower(), "image"): str(path)}
     if not path.is_dir():
         raise CompleteSplatError(f"{path}: no such file or folder")
     for folder in (path, path / "weights"):
-        if all((folder / name).is_file() for name in WEIGHTS):
+        if all((folder / name).is_file() for name in WEIGHT_FILES):
             return {"weights": str(folder)}
-    folders = [folder for folder in (path, *sorted(path.iterdir())) if any(folder.glob("sample_*.ply"))]
+    if (path / RUN_CHECKPOINT).is_file():
+        return {"weights": str(path)}
+    inner = [*path.iterdir(), *((path / SCENES).iterdir() if (path / SCENES).is_dir() else [])]
+    folders = [folder for folder in (path, *sorted(inner)) if any(any(folder.glob(name)) for name in SCENE_FILES)]
     if len(folders) == 1 or path in folders:
         return {"scene": str(folders[0])}
     if folders:
         raise CompleteSplatError(f"{path} holds {len(folders)} predictions: give one of them, {folders[0]} for example")
     raise CompleteSplatError(
-        f"{path}: neither weights ({', '.join(WEIGHTS)}, here or in weights/) nor a prediction (sample_*.ply)"
+        f"{path}: neither weights ({', '.join(WEIGHT_FILES)}, here or in weights/) nor a prediction (sample_*.ply)"
     )
 
 
@@ -112,11 +120,10 @@ def make_page(config: Any, out: Path) -> Any:
         saver = Saver(out, stage, rasterizer, config.frames, config.background)
         if model is None:
             return Page(server, stage, saver, max(sample.layers for sample in samples))
-        page = Page(server, stage, saver, model.layers)
-        start = {name: config[name] for name in SLIDERS}
-        if model.draws_samples and config.steps is None:
-            start["steps"] = model.sampler.steps
-        completion = Completion(page, model, start)
+        page = Page(server, stage, saver, model.parameterization.layers)
+        own_steps = model.sampler.steps if model.draws_samples else 1
+        steps = own_steps if config.steps is None else config.steps
+        completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
         if photograph is not None:
             completion.load(printable(Path(config.image).name), photograph)
         return page

@@ -1,5 +1,6 @@
 """A latent cache on disk: rows written, read back memory-mapped, and drawn as training items."""
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from completesplat.atomic import writing
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as, write_json
@@ -109,35 +111,42 @@ def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
 class ArrayWriter:
     """Writes rows of the shape `row` behind each other; leaving the context puts their number into the header.
 
-    After an exception the file is removed.
+    After an exception the file is removed. `DiskError`: the disk is full.
     """
 
     def __init__(self, path: Path, row: tuple[int, ...], dtype: str) -> None:
         self.path = path
         self.row = row
         self.dtype = np.dtype(dtype)
+        self.bytes_of_row = math.prod(row) * self.dtype.itemsize
         self.count = 0
 
     def __enter__(self) -> "ArrayWriter":
-        self._file = self.path.open("wb")
-        self._begin = self._write_header()
+        with writing(self.path):
+            self._file = self.path.open("wb")
+            self._begin = self._write_header()
         return self
 
     def append(self, rows: Shaped[np.ndarray, "_ _ _ _"]) -> None:
         """Some more rows, of the writer's dtype."""
         assert (rows.shape[1:], rows.dtype) == (self.row, self.dtype)
-        self._file.write(np.ascontiguousarray(rows).data)
         self.count += len(rows)
+        with writing(self.path, self.count * self.bytes_of_row):
+            self._file.write(np.ascontiguousarray(rows).data)
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        with self._file:
-            self._file.seek(0)
-            # NumPy pads headers so that a first axis of any length fits.
-            assert self._write_header() == self._begin
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        if error is not None:
-            self.path.unlink()
+        whole = False
+        try:
+            with writing(self.path, self.count * self.bytes_of_row), self._file:
+                self._file.seek(0)
+                # NumPy pads headers so that a first axis of any length fits.
+                assert self._write_header() == self._begin
+                self._file.flush()
+                os.fsync(self._file.fileno())
+            whole = error is None
+        finally:
+            if not whole:
+                self.path.unlink(missing_ok=True)
 
     def _write_header(self) -> int:
         header = {"descr": self.dtype.str, "fortran_order": False, "shape": (self.count, *self.row)}

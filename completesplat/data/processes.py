@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 
 from completesplat.errors import CompleteSplatError
+from completesplat.signals import Interrupted, end_with_parent
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -23,6 +24,7 @@ def map_in_processes(
 
     Raises:
         CompleteSplatError: a process ended unexpectedly.
+        Interrupted: the processes end, too; what `function` was doing ends with the same exception.
     """
     workers = min(workers or os.cpu_count() or 1, len(items))
     if workers <= 1:
@@ -36,6 +38,10 @@ def map_in_processes(
         except BrokenProcessPool:
             advice = "run the same command again, with fewer workers"
             raise CompleteSplatError(f"a worker process ended unexpectedly (out of memory?): {advice}") from None
+        except (Interrupted, GeneratorExit):
+            for process in pool._processes.values():
+                process.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
@@ -46,9 +52,13 @@ _function: Callable[[Any], Any]
 def _start(contents: bytes) -> None:
     """Remember in a new process what it is for."""
     global _function
+    end_with_parent()
     torch.set_num_threads(1)  # There is one process for each core.
     _function = pickle.loads(contents)  # by this process's parent
 
 
 def _call(item: Any) -> Any:
-    return _function(item)
+    try:
+        return _function(item)
+    except Interrupted as stop:
+        os._exit(128 + stop.signal)  # the pool would send it to the parent as a result, and wait for the next item

@@ -39,6 +39,19 @@ def cleaned(gaussians: Gaussians, name: object) -> Gaussians:
     return gaussians.keep(kept)
 
 
+def beyond_gamut(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
+    """Which Gaussians have a colour outside of 0 to 1."""
+    return ((gaussians.colors < 0) | (gaussians.colors > 1)).any(-1)
+
+
+def transparent(gaussians: Gaussians) -> Bool[Tensor, " gaussian"]:
+    """Which Gaussians have an opacity that rounds to 0 of 255, and so a logit of minus infinity where it is read back.
+
+    Rasterizers leave them out, too: the original one draws nothing below 1/255.
+    """
+    return gaussians.opacities * 255 < 0.51  # files of logits are off by a rounding of float32
+
+
 def with_screen_space_dilation(gaussians: Gaussians, reference: Cameras) -> Gaussians:
     """Gaussians that are larger by the rasterizer's blur, as it is in the reference view.
 

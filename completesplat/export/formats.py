@@ -1,7 +1,8 @@
-"""One scene in several file formats; `.splat`, the smallest of them, is written here."""
+"""One scene in several file formats; `.splat`, the simplest of them, is written here."""
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,16 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import write_bytes
 from completesplat.errors import CompleteSplatError
-from completesplat.export.cleaning import cleaned
+from completesplat.export.cleaning import cleaned, transparent
+from completesplat.export.gltf import write_glb
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, write_page
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 
-FORMATS = ("ply", "splat", "spz", "sog", "html")
+FORMATS = ("ply", "splat", "glb", "spz", "sog", "html")
 CONVERTED = ("spz", "sog", "html")
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quaternions", "u1", 4)])
 
@@ -33,9 +35,11 @@ def write_formats(
 ) -> dict[str, str]:
     """Write `NAME.ply`, `NAME.spz` and so on.
 
-    All hold the Gaussians in the frame they are given in, save the page, which stands upright. `.ply`, `.splat` and
-    `.sog` keep our axes (+y down); `.spz` has +y up and +z towards the viewer, as its format prescribes, which its
-    readers undo.
+    Colours are clipped to 0 to 1, once for all formats but `.ply`: some of them and of their readers would do it,
+    others not. The `.ply` keeps Gaussians brighter than 1, which are seen through others. All hold the Gaussians in the
+    frame they are given in, save the page, which stands upright. `.ply`, `.splat` and `.sog` keep our axes (+y down);
+    `.glb` and `.spz` have +y up and +z towards the viewer, as their formats
+    prescribe, which readers of `.spz` undo. `.spz` goes without the Gaussians that are `transparent`.
 
     Returns:
         The files' names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
@@ -45,15 +49,26 @@ def write_formats(
     """
     if converter is None and set(formats) & set(CONVERTED):
         raise CompleteSplatError(f"a converter is needed for {', '.join(set(formats) & set(CONVERTED))}")
+    if "ply" in formats:
+        write_ply(folder / f"{name}.ply", gaussians, comments)
+    gaussians = replace(gaussians, colors=gaussians.colors.clamp(0, 1))
     with tempfile.TemporaryDirectory() as temporary:
-        source = (folder if "ply" in formats else Path(temporary)) / f"{name}.ply"
+        source = Path(temporary) / f"{name}.ply"
         write_ply(source, gaussians, comments)
         for kind in formats:
             target = folder / f"{name}.{kind}"
             if kind == "splat":
                 write_splat(target, gaussians)
+            elif kind == "glb":
+                write_glb(target, gaussians, comments)
             elif kind == "html" and converter is not None:
                 write_page(target, gaussians, view, converter)
+            elif kind == "spz" and converter is not None:
+                visible, seen = Path(temporary) / "visible.ply", gaussians.keep(~transparent(gaussians))
+                if not seen.count:
+                    raise CompleteSplatError(f"{target}: all {gaussians.count} Gaussians are transparent")
+                write_ply(visible, seen, comments)
+                converter.convert(visible, target)
             elif kind in CONVERTED and converter is not None:
                 converter.convert(source, target)
     return {name if kind == "ply" else f"{name}_{kind}": f"{name}.{kind}" for kind in formats}
@@ -66,8 +81,7 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
     records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
     records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(records.tobytes())
+    write_bytes(path, records.tobytes())
     return kept.count
 
 

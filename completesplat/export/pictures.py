@@ -1,7 +1,9 @@
 """Tensors as pictures for people: bytes, grids, sheets with labels, and depth and normals in colours."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,6 +12,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from completesplat.atomic import write_bytes
 from completesplat.rasterizers import Rendering
 
 READABLE_SIDE = 144
@@ -33,6 +36,13 @@ def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray
         raise ValueError("images hold values that are not finite")
     scaled = images.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
     return scaled.movedim(-3, -1).cpu().numpy()
+
+
+def write_png(path: Path, picture: Image.Image) -> None:
+    """Write a picture as PNG, as `write_bytes` does."""
+    content = io.BytesIO()
+    picture.save(content, format="PNG")
+    write_bytes(path, content.getvalue())
 
 
 def enlarge(

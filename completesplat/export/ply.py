@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import write_bytes
 from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
 from completesplat.gaussians import Gaussians
@@ -38,9 +38,8 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
         How many Gaussians the file holds: those that can be stored; `CompleteSplatError` if there are none.
     """
     table = _table(cleaned(gaussians, path))
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(header(len(table), [(name, "float") for name in WRITTEN], (AXES_COMMENT, *comments)))
-        file.write(table.numpy().astype("<f4").tobytes())
+    first = header(len(table), [(name, "float") for name in WRITTEN], (AXES_COMMENT, *comments))
+    write_bytes(path, first + table.numpy().astype("<f4").tobytes())
     return len(table)
 
 

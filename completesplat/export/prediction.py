@@ -11,10 +11,19 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, write_text
-from completesplat.export.cleaning import cleaned, with_screen_space_dilation
+from completesplat.atomic import make_folder, write_text
+from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import write_formats
-from completesplat.export.pictures import SheetCell, color_depth, color_normals, picture_sheet, surface_depth, to_bytes
+from completesplat.export.pictures import (
+    SheetCell,
+    color_depth,
+    color_normals,
+    picture_sheet,
+    surface_depth,
+    to_bytes,
+    write_png,
+)
+from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
@@ -85,11 +94,12 @@ def write_prediction(
         settings: recorded in `scene.json`; must hold the seed and the image's name.
         on_sample: called when a sample's files are written.
 
-    `CompleteSplatError`: a sample without anything to draw, or a converter that fails.
+    `CompleteSplatError`: a sample without anything to draw, or a converter that fails; `DiskError`: a full disk, or the
+    folder's own one is missing.
     """
     # Before anything is written: a sample of which nothing is left is refused.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     rows: list[SampleViews] = []
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
@@ -100,11 +110,45 @@ def write_prediction(
         on_sample()
     contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows)
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
+    recorded["colors_clipped"] = [int(beyond_gamut(scene).sum()) for scene in scenes]
+    if "spz" in wanted.formats:
+        recorded["left_out_of_spz"] = [int(transparent(scene).sum()) for scene in scenes]
     if wanted.maps:
         written, ends = write_maps(folder, scenes, reference, rasterizer)
         files |= written
         recorded["depth_map_ends"] = list(ends)
     write_scene_json(folder / "scene.json", reference, recorded, settings["seed"], {**files, "sheet": "sheet.png"})
+
+
+def write_fitted_scene(
+    folder: Path,
+    name: str,
+    scene: Gaussians,
+    cameras: Cameras,
+    images: Float[Tensor, "view 3 height width"],
+    truth: Float[Tensor, "view 3 height width"],
+    seed: int,
+) -> None:
+    """Write `scene.ply`, `sheet.png` (true pictures and those of the scene, at most 8) and `scene.json`.
+
+    Args:
+        scene: in the frame of the first camera, where up is where it is in that camera's picture.
+        images, truth: what the cameras see of the scene, and what they should see.
+
+    `CompleteSplatError`: nothing of the scene can be stored.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
+    write_ply(folder / "scene.ply", stored, [f"scene {name}"])
+    shown = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
+    rows = [
+        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in shown]
+        for label, pictures in (("true", truth), ("fitted", images))
+    ]
+    write_png(folder / "sheet.png", picture_sheet([f"view {i}" for i in shown], rows, name))
+    files = {"scene": "scene.ply", "sheet": "sheet.png"}
+    settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
+    write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
 
 
 def _write_sample(
@@ -161,8 +205,7 @@ def contact_sheet(
     rows[0][0] = SheetCell(reference)
     views = len(samples[0].images)
     headings = ["input", *(f"{360 / views * k:g}°" for k in range(views)), f"depth {near:.3g} to {far:.3g}"]
-    with atomic_path(path) as temporary:
-        picture_sheet(headings, rows, title).save(temporary, format="PNG")
+    write_png(Path(path), picture_sheet(headings, rows, title))
 
 
 @torch.no_grad()
@@ -190,8 +233,7 @@ def write_maps(
         for kind, picture in pictures.items():
             name = f"{kind}_{index:02}"
             files[name] = f"{name}.png"
-            with atomic_path(folder / files[name]) as temporary:
-                Image.fromarray(to_bytes(picture)).save(temporary, format="PNG")
+            write_png(folder / files[name], Image.fromarray(to_bytes(picture)))
     return files, ends
 
 

@@ -56,7 +56,7 @@ def find_splat_transform() -> SplatTransform:
         if npx is None:
             raise CompleteSplatError(
                 "formats spz, sog and html need Node.js 20 or newer with npm (https://nodejs.org);"
-                " ply and splat need nothing"
+                " ply, splat and glb need nothing"
             )
         program = _run([npx, "--yes", f"--package={PACKAGE}", "-c", f"command -v {PROGRAM}"]).strip()
     _run([program, "--version"])

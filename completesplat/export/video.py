@@ -52,9 +52,14 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
     """Write an H.264 `.mp4` (yuv420p) of images (sRGB, 0 to 1).
 
     Small images are enlarged by a whole factor until their shorter side has at least 256 px. H.264 needs even sizes: an
-    odd side gets its last row or column once more. `ValueError`: no or broken frames, or a path without `.mp4`.
+    odd side gets its last row or column once more.
+
+    Raises:
+        ValueError: no or broken frames, or a path without `.mp4`.
+        DiskError: the disk is full.
     """
     import imageio.v2 as imageio
+    from imageio_ffmpeg import count_frames_and_secs
 
     if len(frames) == 0 or Path(path).suffix != ".mp4":
         raise ValueError(f"{path}: a video needs at least one frame and a name that ends in .mp4")
@@ -68,3 +73,6 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
                 large = enlarge(frame, factor)
                 padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
                 writer.append_data(to_bytes(padded))  # type: ignore[attr-defined]
+        # ffmpeg is another process, whose errors imageio does not pass on.
+        if (written := count_frames_and_secs(temporary)[0]) != len(frames):
+            raise RuntimeError(f"{path}: {written} frames were written of {len(frames)}")

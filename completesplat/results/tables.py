@@ -172,11 +172,20 @@ def by_name(entry: dict[str, Any]) -> dict[str, float]:
     return {f"{name}_{metric}": x for name, found in named for metric, x in found.items() if x is not None}
 
 
+def _record(predictor: str, entry: dict[str, Any]) -> dict[str, Any]:
+    label = f"{predictor} (upper bound)" if entry.get("upper_bound") else predictor
+    return {"predictor": label} | by_name(entry)
+
+
 def evaluation_table(results: dict[str, Any]) -> Table:
-    """One row for each predictor of `Evaluation.results`, PSNR in dB."""
-    records = [{"predictor": predictor} | by_name(entry) for predictor, entry in results.items()]
+    """One row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only where there are masks."""
+    records = [_record(predictor, entry) for predictor, entry in results.items()]
+    names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
+    pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
+    if all(record.get(name) == record.get(whole) for record in records for name, whole in pairs):
+        names = [name for name in names if not name.startswith("object")]  # every pixel is the object's
     columns = [("predictor", "predictor", "")]
-    for name in [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]:
+    for name in names:
         region, view, kind = name.split("_")
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
     first = next(iter(results.values()))

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from completesplat.atomic import atomic_path
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.errors import DataError
-from completesplat.export.pictures import GAP, INK, LINE, MARGIN, PAPER
+from completesplat.export.pictures import GAP, INK, LINE, MARGIN, PAPER, write_png
 from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
 
 CELL, TEXT, NAME, TITLE = 216, 13, 15, 18
@@ -42,8 +41,7 @@ def show(sequences: Sequence[PosedSequence], path: Path, pictures: int, title: s
         _text(sheet, (MARGIN, top + index * LINE), line, width - 2 * MARGIN)
     for index, sequence in enumerate(sequences):
         _draw_row(sheet, header + index * row_height, sequence, pictures)
-    with atomic_path(path) as temporary:
-        sheet.save(temporary, format="PNG")
+    write_png(path, sheet)
 
 
 def _draw_row(sheet: Image.Image, top: int, sequence: PosedSequence, pictures: int) -> None:

@@ -1,9 +1,8 @@
-"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar, exported weights."""
+"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar."""
 
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,13 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
 from rich import get_console
+from rich.progress import TaskID
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
-from completesplat.training.latent_diffusion import LatentDiffusion
 
 BAD_STEPS = "train/bad_steps"
 
@@ -139,7 +138,33 @@ class ExponentialMovingAverage(WeightAveraging):
 
 
 class Progress(RichProgressBar):
-    """Lightning's bar, with optimizer steps; where nobody watches (no terminal), a line after every validation."""
+    """Lightning's bar, over the optimizer steps of the whole run, whose end its time left tells.
+
+    Where nobody watches (no terminal), a line after every validation. A line at the start says when that is.
+    """
+
+    @property
+    def total_train_batches(self) -> int | float:
+        """Steps of the run; batches of an epoch where the run has no number of steps."""
+        steps = self.trainer.max_steps
+        return steps if steps > 0 else super().total_train_batches
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        super().on_train_start(trainer, pl_module)
+        interval = trainer.val_check_batch
+        if trainer.enable_validation and interval is not None and interval != float("inf"):
+            steps = interval // trainer.accumulate_grad_batches
+            logger.info("step %s; validation every %d (trainer.val_check_interval)", _steps(trainer), steps)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.max_steps <= 0 or self.train_progress_bar_id is None:
+            super().on_train_epoch_start(trainer, pl_module)
+
+    def _update(self, progress_bar_id: TaskID | None, current: int, visible: bool = True, hard: bool = False) -> None:
+        whole_run = progress_bar_id is not None and progress_bar_id == self.train_progress_bar_id
+        if whole_run and self.trainer.max_steps > 0:
+            current = self.trainer.global_step
+        super()._update(progress_bar_id, current, visible, hard)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """The figures behind the bar."""
@@ -157,20 +182,8 @@ class Progress(RichProgressBar):
         logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
 
     def _get_train_description(self, current_epoch: int) -> str:
-        return f"Epoch {current_epoch}"  # Lightning's speaks of -2 epochs where there is no limit to them
+        return "Training" if self.trainer.max_steps > 0 else f"Epoch {current_epoch}"
 
 
 def _steps(trainer: Trainer) -> str:
     return f"{trainer.global_step}" + (f"/{trainer.max_steps}" if trainer.max_steps > 0 else "")
-
-
-class ExportWeights(Callback):
-    """At the end of stage 2, write the generator as safetensors, for `predict` and `from_pretrained`."""
-
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
-
-    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        assert isinstance(pl_module, LatentDiffusion)
-        if trainer.is_global_zero:
-            pl_module.completesplat.save_pretrained(self.folder)

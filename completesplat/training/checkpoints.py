@@ -15,17 +15,17 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from torch import Tensor, nn
+from torch import Tensor
 
 from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
+from completesplat.training.stopping import agreed, end_training
+from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
 FIGURES = "figures"
-END, END_BYTES = b"PK\5\6", 22
-"""How the last record of a zip archive begins, and its length without the comment behind it."""
-CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 
 logger = logging.getLogger(__name__)
 
@@ -40,8 +40,8 @@ class CheckpointFiles(TorchCheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
-        """Replace what is at this path."""
-        with _replaced(Path(path)) as unfinished:
+        """Replace what is at this path; `DiskError` if the disk refuses, and the old file stays."""
+        with _replaced(Path(path), bytes_of(checkpoint)) as unfinished:
             torch.save(checkpoint, unfinished)
             _add_checksum(unfinished)
 
@@ -61,6 +61,9 @@ class Checkpoints(Checkpoint):
     before the next batch, with the loops' state as it was at the end of the step (also at the end of training, which
     Lightning takes for the end of an epoch): where a run goes on, nothing that the step had to log is missing. It holds
     the figures that were logged so far, too, which the end of a run reports.
+
+    While training lasts, signals are kept: after the step in which one came to any of the processes, all save, and end
+    with `Interrupted`.
 
     Args:
         every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
@@ -82,6 +85,7 @@ class Checkpoints(Checkpoint):
         self.every_minutes = every_minutes
         self.keep_every = keep_every
         self.due = False
+        self.asked: int | None = None
         self.end_of_step: dict[str, Any] | None = None
         self.figures: dict[str, Tensor] = {}
 
@@ -96,8 +100,11 @@ class Checkpoints(Checkpoint):
                 one.experiment.goes_on_from = trainer.global_step
         begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
         last = self.folder / LAST
+        if trainer.is_global_zero:
+            self.folder.mkdir(parents=True, exist_ok=True)  # once: a run whose folder is removed is not to go on
         if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
             link(begun, last)  # in the place of a damaged one, which is not to become the one before
+        keep_signals(True)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -106,17 +113,26 @@ class Checkpoints(Checkpoint):
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped:
             self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
-            self.due = self._is_milestone() or self._is_due(trainer)
+            self.asked = agreed(trainer)
+            self.due = self._is_milestone() or self._is_due(trainer) or self.asked is not None
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         if self.due:
             self._save(trainer, pl_module)
+        if self.asked is not None:
+            end_training(trainer, self.asked)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step != self.saved_step:
             self._save(trainer, pl_module)
         if trainer.is_global_zero:
             (self.folder / PREVIOUS).unlink(missing_ok=True)
+        keep_signals(False)
+        if (asked := agreed(trainer)) is not None:
+            end_training(trainer, asked)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        keep_signals(False)
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if self.end_of_step is not None:
@@ -167,9 +183,18 @@ def link(source: Path, target: Path) -> None:
             shutil.copyfile(source, unfinished)
 
 
-def _replaced(path: Path) -> AbstractContextManager[Path]:
+def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
     """A file that is unfinished always has the same name: a run that is killed again and again leaves one of them."""
-    return atomic_path(path, f".{path.name}.unfinished")
+    return atomic_path(path, f".{path.name}.unfinished", size)
+
+
+def bytes_of(contents: Any) -> int:
+    """Of the tensors in nested containers: a file that holds them is at least so large."""
+    if isinstance(contents, Tensor):
+        return contents.nbytes
+    if isinstance(contents, Mapping):
+        return sum(map(bytes_of, contents.values()))
+    return sum(map(bytes_of, contents)) if isinstance(contents, list | tuple) else 0
 
 
 def _add_checksum(path: Path) -> None:
@@ -181,26 +206,6 @@ def _add_checksum(path: Path) -> None:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
         file.seek(0, os.SEEK_END)
         file.write(digest.encode())
-
-
-def check_whole(path: Path) -> None:
-    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end."""
-    bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
-    with path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - bytes_of_end))
-        end = file.read()
-        if not end.startswith(END):
-            if end[-END_BYTES:].startswith(END) and end.endswith(b"\0\0"):
-                return
-            raise WeightsError(f"{path}: not a readable checkpoint (damaged at its end, or cut off)")
-        digest, left = hashlib.sha256(), size - DIGEST_BYTES
-        file.seek(0)
-        while left and (part := file.read(min(left, 2**20))):
-            digest.update(part)
-            left -= len(part)
-    if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
-        raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
 
 
 def newest_whole(last: Path) -> Path | None:
@@ -229,37 +234,3 @@ def _newest_first(last: Path) -> Iterator[Path]:
         yield previous
     steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
     yield from sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
-
-
-def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents.
-
-    `WeightsError`: the file is missing, damaged, no checkpoint of plain tensors, or its weights are not finite.
-    """
-    if not Path(path).is_file():
-        raise WeightsError(f"{path}: no such checkpoint")
-    check_whole(Path(path))
-    try:
-        contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-        name = not_finite(contents["state_dict"])
-    except Exception as error:
-        raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
-    if name is not None:
-        raise WeightsError(f"{path}: {name} is not finite")
-    return contents
-
-
-def not_finite(weights: Mapping[str, Any]) -> str | None:
-    """The name of the first tensor that holds NaN or infinities, if there is one."""
-    return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
-
-
-def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
-    """Load the weights below `prefix` of a checkpoint into a module; `WeightsError` unless all are there and fit."""
-    weights = read_checkpoint(path)["state_dict"]
-    part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
-    try:
-        module.load_state_dict(part)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
-        raise WeightsError(f"{path}: weights of another architecture: {first}") from error

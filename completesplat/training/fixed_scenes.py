@@ -16,7 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.export.pictures import SheetCell, color_depth, picture_sheet
+from completesplat.export.pictures import SheetCell, color_depth, picture_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
@@ -53,6 +53,8 @@ class DrawsFixedScenes(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.scenes: list[SceneBatch] = []
         self.drawn = trainer.global_step
+        if trainer.is_global_zero:
+            self.folder.mkdir(parents=True, exist_ok=True)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -71,7 +73,6 @@ class DrawsFixedScenes(Callback):
         with untouched(trainer, module):
             if not self.scenes:
                 self.scenes = fixed_scenes(trainer.datamodule, self.count, self.views)  # type: ignore[attr-defined]
-            self.folder.mkdir(parents=True, exist_ok=True)
             self.draw(trainer, module, self.scenes)
 
 
@@ -127,7 +128,7 @@ class Pictures(DrawsFixedScenes):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
         pictures = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
         for kind, picture in pictures.items():
-            picture.save(self.folder / f"{kind}_{trainer.global_step:06}.png")
+            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
 
         values = distributions(gaussians)
         scalars = {f"gaussians/{name}": value for name, value in percentiles(values).items()}

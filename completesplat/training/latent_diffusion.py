@@ -10,15 +10,16 @@ from torch import Tensor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.latent_cache import LatentCache
+from completesplat.data.loading.distributed import gathered
 from completesplat.diffusion.guidance import check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
-from completesplat.training.checkpoints import load_part
 from completesplat.training.encoding import check_cache
 from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.weights.checkpoint_reading import load_part
 
 LOSS_BUCKETS = 4
 """Equal ranges of timesteps, for each of which the loss is logged."""
@@ -178,9 +179,11 @@ class LatentDiffusion(SceneModule):
 
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
-        self.log("train/loss", errors.mean(), batch_size=len(errors))
+        self.log_step({"train/loss": errors.mean()}, batch_size=len(errors))
         trainer: Any = self.trainer
         if (self.global_step + 1) % trainer.log_every_n_steps == 0:
+            found = zip(*gathered((errors.cpu(), timestep.cpu())), strict=True)
+            errors, timestep = (torch.cat(parts) for parts in found)
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)
             # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.
             for logger in self.loggers:

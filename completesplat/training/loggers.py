@@ -1,6 +1,7 @@
 """Two loggers: `metrics.csv`, which a continued run goes on with, and one run of Weights & Biases for a directory."""
 
 import csv
+import io
 import logging
 import os
 import secrets
@@ -18,7 +19,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from lightning.pytorch.utilities import rank_zero_only
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import write_text, writing
 from completesplat.errors import CompleteSplatError
 
 MODES = ("online", "offline", "disabled")
@@ -61,21 +62,27 @@ class MetricsFile(ExperimentWriter):
         """Keep the old file until there is something to put in its place; Lightning would delete it here."""
 
     def save(self) -> None:
-        """Write the rows that are not written yet."""
+        """Write the rows that are not written yet; `DiskError` if the disk refuses."""
         if not self.metrics:
             return
         new = set().union(*self.metrics) - set(self.metrics_keys)
         if new or not self.begun:
             old = self._rows_to_keep()
             self.metrics_keys = sorted(new.union(self.metrics_keys, *old))
-            with atomic_path(self.path) as temporary, temporary.open("w", newline="") as file:
-                writer = csv.DictWriter(file, self.metrics_keys)
-                writer.writeheader()
-                writer.writerows([*old, *self.metrics])
+            write_text(self.path, self._lines([*old, *self.metrics], header=True))
         else:
-            with self.path.open("a", newline="") as file:
-                csv.DictWriter(file, self.metrics_keys).writerows(self.metrics)
+            lines = self._lines(self.metrics, header=False)
+            with writing(self.path, len(lines)), self.path.open("a", newline="") as file:
+                file.write(lines)
         self.metrics, self.begun = [], True
+
+    def _lines(self, rows: Iterable[Mapping[str, Any]], header: bool) -> str:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self.metrics_keys)
+        if header:
+            writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
 
     def _rows_to_keep(self) -> list[dict[str, str]]:
         if not self.path.is_file():

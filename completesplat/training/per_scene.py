@@ -1,5 +1,7 @@
 """Gaussians fitted to every scene by itself, as they are and as Splatter Images."""
 
+import logging
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -7,25 +9,53 @@ import torch
 from completesplat.baselines.fitting import FittingSettings, fit_gaussians
 from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.data.loading.distributed import gathered
+from completesplat.errors import CompleteSplatError
+from completesplat.export.prediction import write_fitted_scene
 from completesplat.gaussians import Gaussians
 from completesplat.losses import WeightedSum
+from completesplat.names import safe_name
 from completesplat.scene import SceneBatch
 from completesplat.splatter_image import Parameterization, SplatterImage
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.scene_module import SceneModule, ScoredScene
+
+logger = logging.getLogger(__name__)
 
 
 class PerScene(SceneModule):
     """An upper bound, not a competitor: it is fitted to all views, so it has seen those that it is scored on.
 
     It has nothing to train; all its work is done in evaluation. `loss` is that of the fit.
+
+    Args:
+        scenes_folder: a folder for each scene of a test is written there (`write_fitted_scene`); None: none are.
     """
 
     upper_bound = True
 
-    def __init__(self, loss: WeightedSum, fitting: FittingSettings, **rendering_and_optimization: Any) -> None:
+    def __init__(
+        self,
+        loss: WeightedSum,
+        fitting: FittingSettings,
+        scenes_folder: str | None = None,
+        **rendering_and_optimization: Any,
+    ) -> None:
         super().__init__(**rendering_and_optimization)
         self.loss = loss
         self.fitting = fitting
+        self.scenes_folder = None if scenes_folder is None else Path(scenes_folder)
+
+    def scene_scored(self, scene: ScoredScene) -> None:
+        """Write it, too; of one that has nothing that could be written, a warning."""
+        super().scene_scored(scene)
+        if self.scenes_folder is None:
+            return
+        folder, seed = self.scenes_folder / safe_name(scene.name), self.evaluation.scene_seed(scene.name)
+        try:
+            write_fitted_scene(
+                folder, scene.name, scene.gaussians[0], scene.cameras, scene.images[0], scene.truth.images, seed
+            )
+        except CompleteSplatError as error:
+            logger.warning("%s: %s", folder, error)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene to its reference and all its targets."""

@@ -45,6 +45,7 @@ class FittedScenes:
     def __init__(
         self, folder: Path, stores: Sequence[SceneStore], fit: Callable[[SceneBatch], Gaussians], settings: str
     ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
         self.stores = {name: store for store in stores for name in store.names}
         self.fit = fit
@@ -155,7 +156,7 @@ class PreoptimizedVAE(Preoptimized):
             values = torch.stack(list(errors.values())).mean()
             total: Tensor = values + self.opacity_weight * opacity + self.kl_weight * kl
         logged = {f"train/{name}": value.detach() for name, value in (errors | {"opacity": opacity, "kl": kl}).items()}
-        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        self.log_step({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
         return total
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:

@@ -11,9 +11,11 @@ from completesplat.autoreconstructor.model import Reconstruction
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
+from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
-from completesplat.training.checkpoints import load_part
 from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.weights import CAMERA
+from completesplat.weights.checkpoint_reading import load_part
 
 
 class ReconstructionModule(SceneModule):
@@ -49,7 +51,10 @@ class ReconstructionModule(SceneModule):
         prepare_network(model, channels_last, compile)
 
     def on_fit_start(self) -> None:
-        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior."""
+        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior.
+
+        The camera of a typical photograph is measured for those whose camera is not known (`OneAnswer`).
+        """
         data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
         if self.sees_views and data.targets < 2:
             raise CompleteSplatError(
@@ -59,6 +64,11 @@ class ReconstructionModule(SceneModule):
             raise CompleteSplatError(
                 "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
             )
+        self.camera = {name: torch.tensor(value).tolist() for name, value in data.typical_camera()._asdict().items()}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """With the training set's typical camera."""
+        checkpoint[CAMERA] = self.camera
 
     @property
     def method(self) -> str:
@@ -91,8 +101,10 @@ class ReconstructionModule(SceneModule):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, scenes.all_views(), self.global_step)
+            shown, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
+            quality = psnr(shown.flatten(0, 1), truth.flatten(0, 1)).mean()
         logged = {f"train/{name}": value for name, value in values.items()}
-        self.log_dict({"train/loss": total.detach(), **logged}, batch_size=len(scenes.names))
+        self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:

@@ -9,7 +9,7 @@ from lightning import Trainer
 from PIL import Image
 from torch import Tensor
 
-from completesplat.export.pictures import SheetCell, color_depth, picture_sheet
+from completesplat.export.pictures import SheetCell, color_depth, picture_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
@@ -46,7 +46,7 @@ class Samples(DrawsFixedScenes):
         drawn = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
         pictures = {"step": samples_sheet(drawn), "strip": strip_sheet(drawn)}
         for kind, picture in pictures.items():
-            picture.save(self.folder / f"{kind}_{trainer.global_step:06}.png")
+            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
         each = [one.scores() for one in drawn]
         scalars = {f"samples/{name}": sum(scores[name] for scores in each) / len(each) for name in each[0]}
         log_drawings(trainer, scalars, {"samples": pictures["step"], "denoising": pictures["strip"]})

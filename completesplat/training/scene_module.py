@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.distributed import gathered, mean_of_processes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import psnr
@@ -26,6 +26,8 @@ from completesplat.scene import SceneBatch, Views
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
+
+IN_THE_BAR = ("train/loss", "train/psnr")  # of training; with the figures of validation
 
 
 def copy_reference(scenes: SceneBatch) -> Renders:
@@ -150,6 +152,14 @@ class SceneModule(LightningModule):
         with torch.autocast(self.device.type, enabled=False):
             return self.rasterizer(gaussians, scenes.all_views().cameras).over(self.background)
 
+    def log_step(self, values: dict[str, Tensor], batch_size: int) -> None:
+        """Log figures of a training step: their means over all processes, as the step takes that of gradients.
+
+        One message has them all; Lightning's `sync_dist` would make processes wait for each other for each of them.
+        """
+        for name, value in mean_of_processes(values).items():
+            self.log(name, value, prog_bar=name in IN_THE_BAR, batch_size=batch_size)
+
     def novel_psnr(self, gaussians: Gaussians, scenes: SceneBatch) -> Float[Tensor, "batch target"]:
         """Of the targets' views, in dB."""
         images, truth = self.render(gaussians, scenes).clamp(0, 1)[:, 1:], scenes.targets.images
@@ -178,11 +188,15 @@ class SceneModule(LightningModule):
             depths = truth.depths
             if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
-            if self.on_scene_scored is not None:
-                shown = seen.reference.images[b] * seen.visible[b]
-                self.on_scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
+            shown = seen.reference.images[b] * seen.visible[b]
+            self.scene_scored(ScoredScene(name, shown, own, cameras[b], images, truth[b]))
         evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
+
+    def scene_scored(self, scene: ScoredScene) -> None:
+        """Pass on what a test made of a scene."""
+        if self.on_scene_scored is not None:
+            self.on_scene_scored(scene)
 
     def on_test_end(self) -> None:
         loader: Any = self.trainer.test_dataloaders

@@ -8,6 +8,7 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
+from completesplat.data.loading.distributed import mean_of_processes
 from completesplat.training.scene_module import now
 
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
@@ -19,9 +20,9 @@ class Throughput(Callback):
     """Logs speed and memory with the trainer's interval.
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
-    for data, are of the steps since the last row; for memory see `memory`. The clock stands still during validation,
-    while checkpoints are written, and from a row to the next batch: while pictures are drawn, if their interval is a
-    multiple of the trainer's, and this callback stands before those.
+    for data, are of the steps since the last row; for memory see `memory`. All are means over the processes. The clock
+    stands still during validation, while checkpoints are written, and from a row to the next batch: while pictures are
+    drawn, if their interval is a multiple of the trainer's, and this callback stands before those.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -60,7 +61,8 @@ class Throughput(Callback):
             "speed/data_wait": self.clock.waited / seconds,
             **memory(pl_module.device),
         }
-        pl_module.log_dict(values, batch_size=len(batch.names))
+        tensors = {name: torch.tensor(value, device=pl_module.device) for name, value in values.items()}
+        pl_module.log_dict(mean_of_processes(tensors), batch_size=len(batch.names))
         self._forget()
 
 

@@ -14,7 +14,7 @@ from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.pictures import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
-from completesplat.published import PublishedGenerator
+from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import told
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
@@ -26,14 +26,13 @@ PAUSE = 0.2  # seconds between two pictures of a scene that forms
 class Completion:
     """The controls that complete a photograph, added to a page; the model works in the page's worker only."""
 
-    def __init__(self, page: Page, model: CompleteSplat | PublishedGenerator, start: dict[str, Any]) -> None:
+    def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
         self.page, self.model = page, model
-        self.sliders = SLIDERS if model.draws_samples else ()
         self.photograph: tuple[str, Photograph] | None = None
         self.controls = add_drawing(page.server.gui, model, start)
         self.controls.upload.on_upload(self._upload)
         self.controls.draw.on_click(lambda event: self.request(event.client))
-        for name in self.sliders:
+        for name in SLIDERS:
             getattr(self.controls, name).on_update(self._moved)
 
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
@@ -48,7 +47,7 @@ class Completion:
         """Draw with the present settings, after the jobs that wait."""
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load a picture first"), client)
-        settings = {name: getattr(self.controls, name).value for name in self.sliders}
+        settings = {name: getattr(self.controls, name).value for name in SLIDERS}
         job = partial(self._draw, *self.photograph, settings, client)
         self.page.worker.submit("draw", job)
 
@@ -60,8 +59,9 @@ class Completion:
             self.page.tell(error, event.client)
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
+        if not isinstance(self.model, CompleteSplat):
+            return  # nothing is drawn, and no slider shown
         steps = self.controls.steps
-        assert isinstance(self.model, CompleteSplat)
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
             steps.value = nearest  # calls this again
@@ -73,14 +73,15 @@ class Completion:
     ) -> None:
         """In the worker's thread: the samples, and before them what they look like on the way."""
         began = time.monotonic()
-        progress, forming = self.controls.progress, self.model.draws_samples and self.controls.forming.value
+        progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
+        layers = self.model.parameterization.layers
         reference, last_shown = self.model.camera(photograph), 0.0
 
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
             """The new samples behind the earlier ones, as many as there is room for."""
-            told = [({**settings, "image": name, "sample": i}, finished, True) for i in range(len(scenes))]
-            new = [Sample(x, self.model.layers, reference, *one) for x, one in zip(scenes, told, strict=True)]
+            told = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
+            new = [Sample(x, layers, reference, said, finished, True) for x, said in zip(scenes, told, strict=True)]
             return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:
@@ -101,7 +102,7 @@ class Completion:
             progress.visible = False
 
 
-def read_upload(model: CompleteSplat | PublishedGenerator, name: str, content: bytes) -> Photograph:
+def read_upload(model: SceneModel, name: str, content: bytes) -> Photograph:
     """The picture at the model's size; `ImageError` if it is none. Its name is for refusals only, never a path."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "upload"

@@ -1,5 +1,6 @@
 """The controls of the page: what completes a photograph, what is shown of the samples, what is saved."""
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,49 +10,46 @@ from diffusers import DDIMScheduler
 
 from completesplat.diffusion.sampling import Sampler
 from completesplat.generation import CompleteSplat
-from completesplat.published import PublishedGenerator
+from completesplat.scene_model import SceneModel
 
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
+ONE_ANSWER = "One answer for each picture: these weights draw no samples."
 KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
 
 
-def add_drawing(gui: viser.GuiApi, model: CompleteSplat | PublishedGenerator, start: dict[str, Any]) -> SimpleNamespace:
+def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
     """The folders `Photograph` and `Completion`: viser's handles; `start` says where the `SLIDERS` stand at first.
 
-    There are no sliders, nor what belongs to them, for a model that draws no samples.
+    Of a model that draws no samples, what is about drawing is not shown.
     """
     blank = np.full((model.image_size, model.image_size, 3), 230, np.uint8)
+    draws, most_steps, first_steps = model.draws_samples, 2, 1
+    if isinstance(model, CompleteSplat):
+        most_steps, first_steps = possible_steps(model.sampler)[-1], nearest_steps(model.sampler, start["steps"])
     with gui.add_folder("Photograph", order=1):
         upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_image(blank, label="none yet", format="png")
     with gui.add_folder("Completion", order=2):
-        sliders = add_sliders(gui, model, start) if isinstance(model, CompleteSplat) else {}
-        kept, label = "to compare, up to 8 samples", "Draw samples" if sliders else "Reconstruct"
+        if not draws:
+            gui.add_markdown(ONE_ANSWER)
+        free, diverse = "1: most faithful, 0: most free", "more: more diverse"
+        slider: Any = partial(gui.add_slider, visible=draws)
         return SimpleNamespace(
             upload=upload,
             preview=preview,
-            **sliders,
-            keep=gui.add_checkbox("Keep earlier samples", False, hint=kept),
-            draw=gui.add_button(label, color="blue"),
+            samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
+            skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
+            guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
+            steps=slider("Steps", 1, most_steps, 1, first_steps, hint="denoising steps"),
+            seed=slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
+            live=gui.add_checkbox("Draw when a slider moves", True, visible=draws),
+            forming=gui.add_checkbox("Show it forming", draws, hint="costs a little time at each step", visible=draws),
+            keep=gui.add_checkbox("Keep earlier samples", False, hint="to compare settings, up to 8 samples"),
+            draw=gui.add_button("Draw samples", color="blue"),
             progress=gui.add_progress_bar(0.0, visible=False),
         )
-
-
-def add_sliders(gui: viser.GuiApi, model: CompleteSplat, start: dict[str, Any]) -> dict[str, Any]:
-    """The `SLIDERS` of a model that draws samples, and whether to draw at once and to show it `forming`."""
-    free, diverse = "1: most faithful, 0: most free", "more: more diverse"
-    steps, first_steps = possible_steps(model.sampler), nearest_steps(model.sampler, start["steps"])
-    return {
-        "samples": gui.add_slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
-        "skip_weight": gui.add_slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
-        "guidance_weight": gui.add_slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
-        "steps": gui.add_slider("Steps", 1, steps[-1], 1, first_steps, hint="denoising steps"),
-        "seed": gui.add_slider("Seed", 0, max(MOST_SEED, start["seed"]), 1, start["seed"]),
-        "live": gui.add_checkbox("Draw when a slider moves", True),
-        "forming": gui.add_checkbox("Show it forming", True, hint="costs a little time at each step"),
-    }
 
 
 def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNamespace:

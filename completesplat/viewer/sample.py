@@ -60,17 +60,17 @@ class Sample:
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """A `.ply`, or the folder of a prediction with all its samples; and where up is.
+    """A `.ply`, or the folder of a prediction with all its samples, or of a fitted scene; and where up is.
 
     Without the prediction's `scene.json` beside it, a file is looked at by its `framing_camera`. `CompleteSplatError`:
     nothing there that can be shown.
     """
-    files = [path] if path.is_file() else sorted(path.glob("sample_*.ply"))
+    files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
     if not files:
-        raise CompleteSplatError(f"{path}: no sample_*.ply in this folder")
+        raise CompleteSplatError(f"{path}: no sample_*.ply or scene.ply in this folder")
     scenes = [read_ply(file) for file in files]
     description = (path.parent if path.is_file() else path) / "scene.json"
-    if not description.is_file() or not all(file.name.startswith("sample_") for file in files):
+    if not description.is_file() or not all(file.name.startswith(("sample_", "scene.")) for file in files):
         return [Sample(scene, 1, framing_camera(scene)) for scene in scenes], UP
     reference, settings = _read_description(description)
     return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], _up(settings)

@@ -11,12 +11,31 @@ from urllib.parse import urlparse
 
 import torch
 
+from completesplat.atomic import write_text
 from completesplat.errors import WeightsError
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
+# Of a training run: its weights, which are written in the end, its settings, its newest checkpoint, fitted scenes.
+RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml", "checkpoints/last.ckpt", "scenes"
+CAMERA = "camera"  # in stage 1's checkpoints, what was measured of the training set
 LARGEST_TEXT = 1_000_000
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+def checkpoint_of(weights: Path | str) -> Path | None:
+    """The checkpoint that is meant: a file, or the newest of the folder of a run which has no weights yet; else None.
+
+    Of a run without checkpoints, because it has nothing to train, the place where it would be.
+    """
+    path = Path(str(weights)).expanduser()
+    if str(weights) in in_the_box() or not path.exists():
+        return None
+    if path.is_file():
+        return path
+    if any((folder / CONFIG_FILE).is_file() for folder in (path, path / RUN_WEIGHTS)):
+        return None
+    return path / RUN_CHECKPOINT if (path / RUN_CONFIG_FILE).is_file() else None
 
 
 def in_the_box() -> list[str]:
@@ -25,7 +44,7 @@ def in_the_box() -> list[str]:
 
 
 def weights_folder(weights: Path | str) -> Path:
-    """The folder that is meant: a name of `in_the_box`, else a folder, else an id of the Hugging Face hub.
+    """The folder that is meant: a name of `in_the_box`, else a folder or a run's, else an id of the Hugging Face hub.
 
     Of the hub, files are downloaded once (a token, a mirror, work without a network: by its environment variables).
     `WeightsError`: there are none, files are missing, or one has another checksum.
@@ -57,7 +76,7 @@ def read_small(path: Path) -> str:
 def write_sums(folder: Path) -> None:
     """Write the checksums of the two files that a model is read from."""
     lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
-    (folder / SUMS_FILE).write_text("".join(lines))
+    write_text(folder / SUMS_FILE, "".join(lines))
 
 
 def _locate(weights: str) -> Path:
@@ -65,7 +84,8 @@ def _locate(weights: str) -> Path:
         return BOX / weights
     local = Path(weights).expanduser()
     if local.exists():
-        return local
+        of_run = not (local / CONFIG_FILE).is_file() and (local / RUN_WEIGHTS / CONFIG_FILE).is_file()
+        return local / RUN_WEIGHTS if of_run else local
     if HUB_ID.fullmatch(weights):
         return _download(weights)
     raise WeightsError(f"{weights}: no such folder; with the package come {', '.join(in_the_box()) or 'no weights'}")

@@ -64,12 +64,10 @@ class Published(NamedTuple):
     model: Network
 
 
-def is_published(weights: str | None) -> bool:
+def is_published(weights: Path | str) -> bool:
     """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or a folder that has one."""
-    if weights is None:
-        return False
-    path = Path(weights).expanduser()
-    return weights.startswith(PREFIX) or path.suffix == ".pth" or (path.is_dir() and bool(_models_in(path)))
+    path = Path(str(weights)).expanduser()
+    return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (path.is_dir() and bool(_models_in(path)))
 
 
 def find(weights: str) -> Published:

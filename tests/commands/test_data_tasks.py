@@ -29,7 +29,8 @@ def test_toy_objects_are_written_where_asked(command, tmp_path):
     finished = command("data", "toy", f"out={tmp_path / 'toy'}", *settings)
     assert (finished.status, finished.out.splitlines()[-1]) == (0, str(tmp_path / "toy"))
     assert len(list((tmp_path / "toy").glob("*/*/images/*.jpg"))) == 9
-    assert (tmp_path / "toy/run.json").is_file()
+    typed = ["completesplat data", "toy", f"out={tmp_path / 'toy'}", *settings]
+    assert strict_json(tmp_path / "toy/run.json")["command"] == typed
 
 
 COUNTS = {

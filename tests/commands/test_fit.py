@@ -1,4 +1,5 @@
 import csv
+import shlex
 from pathlib import Path
 
 import pytest
@@ -65,8 +66,18 @@ def test_a_fit_scores_what_a_test_of_its_checkpoint_scores(command, pipeline, tm
     tested = command("test", f"ckpt={checkpoint}", *SCORED, "trainer.accelerator=cpu", f"out={tmp_path / 'scores'}")
     assert tested.status == 0, tested.err
     ours, theirs = strict_json(run / "metrics.json")["test"], strict_json(tmp_path / "scores/metrics.json")
+    assert shlex.split(ours["protocol"]["command"])[:2] == ["completesplat", "fit"]
+    typed = [
+        "completesplat",
+        "test",
+        f"ckpt={checkpoint}",
+        *SCORED,
+        "trainer.accelerator=cpu",
+        f"out={tmp_path / 'scores'}",
+    ]
+    assert shlex.split(theirs["protocol"]["command"]) == typed
     for scores in (ours, theirs):
-        assert scores["protocol"].pop("command").startswith("completesplat ")
+        del scores["protocol"]["command"]
         scores["protocol"]["machine"].pop("date", None)
         assert scores["model"].pop("seconds").keys() == {"inference", "rendering"}
     assert ours == theirs

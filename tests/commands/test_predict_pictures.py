@@ -1,7 +1,9 @@
 """Several pictures at once, file formats, videos, and what is said about them."""
 
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,7 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.generation import CompleteSplat
 from completesplat.names import folder_names
-from completesplat.weights import SUMS_FILE, WEIGHTS_FILE
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
@@ -172,6 +174,65 @@ def test_weights_that_are_not_finite_are_refused_as_such(predict, tiny_weights, 
         finished = predict(picture(tmp_path / "a.png"), f"weights={folder}")
         said = f"error: {folder}: weights that are not finite in 1 tensors, such as latent_std\n"
         assert (finished.status, finished.err) == (2, said)
+
+
+def trained(tiny_weights: Path, folder: Path, **facts: object) -> Path:
+    """The weights with what they say of their training."""
+    shutil.copytree(tiny_weights, folder)
+    (folder / SUMS_FILE).unlink()
+    architecture = json.loads((folder / CONFIG_FILE).read_text())
+    (folder / CONFIG_FILE).write_text(json.dumps(architecture | {"training": facts}))
+    return folder
+
+
+def test_what_is_hidden_from_weights_that_were_not_trained_for_it_is_said_once(predict, tiny_weights, tmp_path):
+    picture(tmp_path / "photos/a.png")
+    picture(tmp_path / "photos/b.png")
+    said, box = "box: these weights were not trained with parts of the picture hidden", "box=[0,0,0.5,0.5]"
+    without, masked = (
+        trained(tiny_weights, tmp_path / "0", box_masks=0.0),
+        trained(tiny_weights, tmp_path / "1", box_masks=0.5),
+    )
+    for weights, times in ((tiny_weights, 1), (without, 1), (masked, 0)):
+        finished = predict(tmp_path / "photos", box, f"weights={weights}")
+        assert (finished.status, finished.out.count(said)) == (0, times)
+    assert said not in predict(tmp_path / "photos").out
+
+
+def test_a_photograph_unlike_the_training_pictures_gets_one_line(predict, tiny_weights, tmp_path):
+    red = [1.0, 0, 0, 0, 0, 0, 0, 0]
+    weights = trained(tiny_weights, tmp_path / "w", picture_mean=red, picture_std=[0.1] * 8)
+    picture(tmp_path / "photos/blue.png", "blue")
+    picture(tmp_path / "photos/red.png")
+    finished = predict(tmp_path / "photos", f"weights={weights}")
+    remarks = [line for line in finished.out.splitlines() if "standard deviations from the training" in line]
+    assert len(remarks) == 1
+    assert remarks[0].startswith("blue.png: colours, contrast or detail lie 5.0 standard deviations")
+    distances = [
+        strict_json(tmp_path / f"out/{name}/scene.json")["settings"]["distance_from_training"]
+        for name in ("blue", "red")
+    ]
+    assert distances == pytest.approx([5, 0])
+    both = predict(tmp_path / "photos/blue.png", f"weights={weights}", "fov=15").out.splitlines()
+    assert len([line for line in both if "field of view is 15" in line and "standard deviations" in line]) == 1
+    assert "standard deviations" not in predict(tmp_path / "photos/blue.png").out  # of which its weights say nothing
+
+
+def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
+    given = {}
+
+    def read(path, size, fov, default, remove_background):
+        given["removed"] = remove_background
+        return Photograph(torch.full((3, size, size), 0.5), default, "default")
+
+    monkeypatch.setattr("completesplat.scene_model.read_photograph", read)
+    for setting, removed in (("background=remove", True), ("background=1", False)):
+        assert predict(picture(tmp_path / "a.png"), setting).status == 0
+        settings = strict_json(tmp_path / "out/a/scene.json")["settings"]
+        assert (given["removed"], settings.get("background")) == (removed, "remove" if removed else None)
+    assert "background=gone: must be a number" in refused(
+        "predict", "image=a.png", "weights=nowhere", "background=gone"
+    )
 
 
 def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp_path):

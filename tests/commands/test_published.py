@@ -1,5 +1,7 @@
 """`predict`, `test` and `view` with Splatter Image's published weights: files of their format with random values."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hydra.utils import instantiate
@@ -9,8 +11,10 @@ from published_weights import write_published
 from support import compose_config, strict_json
 
 from completesplat.commands.trained import Trained
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import Gaussians
+from completesplat.generation import CompleteSplat
 from completesplat.published import PublishedGenerator
 from completesplat.rasterizers.directional import DirectionalRasterizer
 
@@ -51,24 +55,60 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     given = [f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", "frames=2", "samples=4"]
     finished = command("predict", *given)
     assert finished.status == 0, finished.err
-    assert "one answer, no samples" in finished.out
+    assert "one answer for each picture and draws no samples" in finished.out
+    assert "give pictures that are transparent or white around one, or background=remove" in finished.out
     folder = tmp_path / "out/a"
     assert {path.name for path in folder.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
     settings = strict_json(folder / "scene.json")["settings"]
     assert settings["depth_range"] == pytest.approx([0.8, 3.2])
-    assert not {"sampler", "steps", "samples"} & settings.keys()
-    model = PublishedGenerator(str(weights))
+    assert not {"sampler", "steps"} & settings.keys()
+    assert settings["samples"] == 1
+    model = CompleteSplat.from_pretrained(weights)
+    assert isinstance(model, PublishedGenerator)
     scene = model(image)[0]
     assert type(scene) is Gaussians  # which every rasterizer takes
     torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
     for settings, said in (
-        (["box=[0,0,0.5,0.5]"], "these weights complete nothing"),
         (["fov=40"], "as of 49 degrees"),
-        (["sampler=dpm20"], "nothing is drawn with these weights"),
+        (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),
     ):
         refused = command("predict", *given, *settings)
         assert (refused.status, len(refused.err.splitlines())) == (2, 1)
         assert said in refused.err
+    with pytest.raises(CompleteSplatError, match="samples=2: this model draws none"):
+        model(image, samples=2)
+    with pytest.raises(WeightsError, match="copy these"):
+        model.save_pretrained(tmp_path / "copy")
+
+
+def test_a_photograph_of_an_object_becomes_a_scene_without_its_background(rembg, command, tmp_path):
+    weights = write_published(tmp_path / "objects", "objaverse", size=40)
+    Image.new("RGB", (120, 80), "red").save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as picture:
+        picture.paste((0, 128, 255), (5, 8, 25, 18))
+        picture.save(tmp_path / "a.png")
+    given = [f"image={tmp_path / 'a.png'}", f"weights={weights}", f"out={tmp_path / 'out'}", "video=[]"]
+    finished = command("predict", *given, "background=remove")
+    assert finished.status == 0, finished.err
+    model = CompleteSplat.from_pretrained(weights)
+    with Image.open(tmp_path / "a.png") as picture:
+        seen = model.read(picture, remove_background=True)
+    blue = seen.image[0] < 0.5
+    assert blue.sum() == pytest.approx(26 * 13, rel=0.1)
+    assert (seen.image[:, ~blue] > 0.5).all()  # no red is left
+    torch.testing.assert_close(read_ply(tmp_path / "out/a/sample_00.ply").means, model(seen)[0].means)
+    assert strict_json(tmp_path / "out/a/scene.json")["settings"]["background"] == "remove"
+
+
+def test_what_is_hidden_counts_as_background(tmp_path):
+    model = CompleteSplat.from_pretrained(write_published(tmp_path, "objaverse"))
+    photograph = model.read(cut_out(tmp_path / "a.png"))
+    visible = torch.ones(1, 16, 16)
+    visible[..., 8:] = 0
+    changed = replace(photograph, image=photograph.image.clone())
+    changed.image[..., 8:] = 1
+    assert torch.equal(model(photograph, visible)[0].means, model(changed)[0].means)
+    assert not model.knows_hidden
 
 
 def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(command, pipeline, tmp_path):
@@ -117,9 +157,10 @@ def test_the_page_has_no_sliders_for_one_answer(tmp_path):
     try:
         assert page.worker.wait(60)
         assert [sample.gaussians.count for sample in page.stage.samples] == [16 * 16]
-        labels = [getattr(handle, "label", "") for handle in page.server.gui._gui_input_handle_from_uuid.values()]
-        assert "Samples" not in labels
-        assert "Keep earlier samples" in labels
+        handles = page.server.gui._gui_input_handle_from_uuid.values()
+        shown = [getattr(handle, "label", "") for handle in handles if handle.visible]
+        assert "Samples" not in shown
+        assert "Keep earlier samples" in shown
     finally:
         page.close()
         stop_server(page.server)

@@ -26,6 +26,6 @@ def test_two_processes_find_what_one_finds(pipeline, tmp_path):
     settings = ["trainer.accelerator=cpu", "overrides=[" + ",".join(f"'{change}'" for change in changes) + "]"]
     settings += ["sampler=dpm10", "evaluation.scoring.samples=2"]
     one = scores(checkpoint, tmp_path / "one", tmp_path, *settings)
-    two = scores(checkpoint, tmp_path / "two", tmp_path, *settings, "trainer.devices=2", "+trainer.strategy=ddp")
+    two = scores(checkpoint, tmp_path / "two", tmp_path, *settings, "trainer.devices=2", "trainer.strategy=ddp")
     assert one["model"]["scenes"] == 3
     assert two == one

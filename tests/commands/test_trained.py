@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from support import compose_config
 
 from completesplat.commands import conf_folder
+from completesplat.commands.jobs import use_working_folder
 from completesplat.commands.trained import GROUPS, config_of_run
 from completesplat.errors import WeightsError
 
@@ -85,7 +86,7 @@ FOREIGN = [
     {"_target_": "completesplat.cli.main"},
     {"_target_": "completesplat.data.toy.write", "out": "SPRUNG"},
     {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
-    {"_target_": "completesplat.training.callbacks.ExportWeights"},
+    {"_target_": "completesplat.training.callbacks.Progress"},
     {"_target_": "__main__.open", "file": "SPRUNG", "mode": "w"},
     {"_target_": "missing_module.Thing"},
     {"_target_": ""},
@@ -139,6 +140,37 @@ def test_a_module_of_a_foreign_folder_is_not_found(run, tmp_path, monkeypatch):
     with pytest.raises(WeightsError, match=r"names evil\.Evil"):
         configuration(run, trust=True)
     assert not (tmp_path / "sprung").exists()
+
+
+def test_modules_of_the_working_folder_are_the_users_own_and_a_strangers_run_is_not_trusted_for_them(
+    run, elsewhere, tmp_path, monkeypatch
+):
+    """Neither where it lies elsewhere, nor where somebody works in its folder, beside modules that came with it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    name(run, {"_target_": "owned.Owned"})
+    for folder in (elsewhere, run, tmp_path):
+        (folder / "owned.py").write_text("class Owned: pass\nopen('sprung', 'w')\n")
+    for folder in (elsewhere, run):
+        monkeypatch.chdir(folder)
+        use_working_folder()
+        with pytest.raises(WeightsError, match=r"names owned\.Owned, .* trust=true"):
+            configuration(run)
+        assert not (folder / "sprung").exists()
+        sys.path.remove(str(folder))
+    monkeypatch.chdir(tmp_path)
+    use_working_folder()
+    assert configuration(run).model.rasterizer._target_ == "owned.Owned"
+    assert (tmp_path / "sprung").exists()
+    sys.modules.pop("owned")
+
+
+def test_settings_of_the_working_folder_do_not_widen_what_a_run_may_name(run, tmp_path, monkeypatch):
+    (tmp_path / "conf/rasterizer").mkdir(parents=True)
+    (tmp_path / "conf/rasterizer/mine.yaml").write_text("_target_: os.system\n")
+    monkeypatch.chdir(tmp_path)
+    name(run, {"_target_": "os.system", "command": "true"})
+    with pytest.raises(WeightsError, match="not defined in a module of your own"):
+        configuration(run)
 
 
 def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_needs_no_trust(run, elsewhere):

@@ -51,6 +51,12 @@ def test_workers_do_not_change_the_batches_nor_what_is_skipped(root, epochs):
         assert one.refused
 
 
+@pytest.mark.parametrize(("cores", "expected"), [(2, 2), (64, 4), (None, 1)])
+def test_by_default_there_are_no_more_workers_than_cores(tmp_path, monkeypatch, cores, expected):
+    monkeypatch.setattr("os.cpu_count", lambda: cores)
+    assert module(tmp_path, workers=None).workers == expected
+
+
 def test_an_item_is_drawn_from_seed_epoch_and_index_alone(root):
     items = loader(root).dataset
     later = [items[1, 5].scenes, items[0, 2].scenes]

@@ -1,5 +1,6 @@
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import pytest
@@ -96,11 +97,25 @@ def test_only_settings_that_change_nothing_of_what_was_prepared_are_free(packed_
     assert set(targets.masks.unique().tolist()) == {0.0, 1.0}
 
 
-def test_resuming_on_other_data_is_told_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):
+def test_resuming_on_other_data_is_refused_and_prepared_data_are_no_other(toy_root, packed_objects, tours, caplog):
     state = objects(toy_root).state_dict()
     with caplog.at_level(logging.WARNING):
         objects(packed_objects).load_state_dict(state)
+        objects(packed_objects).load_state_dict({"fingerprint": state["fingerprint"]})
         assert caplog.messages == []
-        clips(tours).load_state_dict(state)
+        with pytest.raises(DataError, match=r"tours.*: not the training data that this run had before \(2 seq"):
+            clips(tours).load_state_dict(state)
+        clips(tours, allow_changed=True).load_state_dict(state)
     assert len(caplog.messages) == 1
-    assert "not those that the resumed run" in caplog.messages[0]
+    assert "not the training data that this run had before (2 sequences then" in caplog.messages[0]
+
+
+def test_the_data_of_a_run_are_those_of_its_begin(toy_root, tmp_path):
+    root = shutil.copytree(toy_root, tmp_path / "toys")
+    state = objects(root).state_dict()
+    data = objects(root)
+    data.setup("fit")
+    for path in root.glob("*/frame_annotations.jgz"):
+        path.write_bytes(path.read_bytes() + b"more")
+    assert data.state_dict() == state
+    assert objects(toy_root).state_dict() == state

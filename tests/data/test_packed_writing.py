@@ -38,9 +38,10 @@ def test_an_interrupted_run_continues_with_the_shards_that_are_missing(tmp_path:
     with pytest.raises(KeyboardInterrupt):
         make(ListedSource(NAMES, stop_after=8), out)
     assert not (out / "manifest.json").exists()
-    assert any(path.name.endswith(".unfinished") for path in out.iterdir())
+    assert not any(path.name.endswith(".unfinished") for path in out.iterdir())
     before = {path.name: path.stat().st_mtime_ns for path in out.glob("*.arrow")}
     assert len(before) == 2
+    (out / "train-00002-of-00003.arrow.unfinished").write_bytes(b"left by a process that was killed")
 
     again = ListedSource(NAMES)
     make(again, out)

@@ -259,3 +259,33 @@ def test_random_damage_never_raises_anything_else(tmp_path):
                 continue
             assert image.shape == (3, SIDE, SIDE)
             assert 0 <= image.min() <= image.max() <= 1
+
+
+def test_pictures_in_memory_are_read_as_files_are(tmp_path):
+    wide = np.random.default_rng(1).integers(0, 256, (40, 56, 3), dtype=np.uint8)
+    file = read_back(tmp_path, Image.fromarray(wide))
+    for of_bytes in (Image.fromarray(wide), wide, torch.from_numpy(wide).permute(2, 0, 1)):
+        np.testing.assert_array_equal(pixels(of_bytes), file)
+    share = np.linspace(0.1, 0.9, 40 * 56 * 3, dtype=np.float32).reshape(40, 56, 3)
+    bright = pixels((share * 255).round().astype(np.uint8))
+    for of_floats in (share, share.astype(np.float64), torch.from_numpy(share).permute(2, 0, 1)):
+        np.testing.assert_allclose(pixels(of_floats), bright, atol=1 / 255)
+    np.testing.assert_array_equal(pixels(share, 40), share[:, 8:48])  # not resized: not rounded either
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (np.zeros((3, 16, 16), dtype=np.uint8), "arrays are"),
+        (torch.zeros(16, 16, 3), "tensors"),
+        (np.zeros((16, 16), dtype=np.uint8), "in shape"),
+        (np.full((16, 16, 3), 255.0), "outside of"),
+        (np.full((16, 16, 3), np.nan), "outside of"),
+        (np.zeros((16, 16, 3), dtype=np.int64), "int64"),
+        (np.zeros((4, 16, 3), dtype=np.uint8), "at least 8"),
+        (Image.new("RGB", (4, 16)), "at least 8"),
+    ],
+)
+def test_pictures_in_memory_without_one_plain_meaning_are_refused(wrong, reason):
+    with pytest.raises(ImageError, match=reason):
+        read_photograph(wrong, SIZE)

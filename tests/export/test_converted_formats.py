@@ -2,7 +2,9 @@
 
 import dataclasses
 import gzip
+import json
 import shutil
+import subprocess
 
 import numpy as np
 import pytest
@@ -87,3 +89,47 @@ def test_spz_has_y_up_and_z_to_the_viewer_as_its_format_says(written, converter)
     means = np.where(fixed >= 1 << 23, fixed - (1 << 24), fixed) / 4096
     expected = read_ply(written / "a.ply").means.numpy() * [1, -1, -1]
     assert np.abs(means - expected).max() <= 1 / 4096
+
+
+def test_no_opacity_comes_back_from_spz_as_minus_infinity(tmp_path, converter):
+    opacities = torch.linspace(0, 1.2 / 255, 400)
+    write_formats(tmp_path, "a", dataclasses.replace(some(), opacities=opacities), ["spz"], VIEW, converter)
+    converter.convert(tmp_path / "a.spz", tmp_path / "back.ply")
+    back = read_ply(tmp_path / "back.ply")  # which refuses infinity
+    assert 200 < back.count < 250
+    torch.testing.assert_close(back.opacities, torch.full((back.count,), 1 / 255))
+
+
+# three.js's own reader of the extension; its largest differences of positions, covariances and colours.
+READER = """
+import fs from 'fs'; globalThis.self = globalThis;
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js';
+const data = fs.readFileSync('a.glb'), loader = new GLTFLoader();
+loader.register( parser => new GLTFGaussianSplatLoaderExtension( parser ) );
+loader.parse( data.buffer.slice( data.byteOffset, data.byteOffset + data.length ), '', read => {
+  read.scene.traverse( part => {
+    if ( part.isGaussianSplat ) {
+      const { position, covariance, color } = part.splatGeometry.attributes;
+      console.log( JSON.stringify( [ position, covariance, color ].map( values => Array.from( values.array ) ) ) );
+    }
+  } );
+} );
+"""
+
+
+def test_three_js_reads_the_same_gaussians_from_glb(tmp_path):
+    npm = ["npm", "install", "--silent", "--prefix", str(tmp_path), "three@0.187.0"]
+    if subprocess.run(npm, capture_output=True).returncode:
+        pytest.skip("three.js cannot be had from npm")
+    (tmp_path / "read.mjs").write_text(READER)
+    own = some()
+    write_formats(tmp_path, "a", own, ["glb"], VIEW, None)
+    done = subprocess.run(["node", "read.mjs"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    means, covariances, colors = (torch.tensor(values).view(400, -1) for values in json.loads(done.stdout))
+    turn = torch.diag(torch.tensor([1.0, -1, -1]))
+    torch.testing.assert_close(means, own.means @ turn)
+    i, j = torch.triu_indices(3, 3)
+    torch.testing.assert_close(covariances, (turn @ own.covariances() @ turn)[:, i, j], rtol=1e-4, atol=1e-7)
+    expected = torch.cat([own.colors, own.opacities[:, None]], dim=1)
+    torch.testing.assert_close(colors / 255, expected, rtol=0, atol=0.51 / 255)

@@ -3,6 +3,7 @@
 import json
 import struct
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import FORMATS, write_formats, write_splat
-from completesplat.export.ply import write_ply
+from completesplat.export.gltf import write_glb
+from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, upright, viewer_settings
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
@@ -41,7 +43,7 @@ def test_the_formats_that_are_wanted_are_written_and_no_others(tmp_path, program
     files = write_formats(out, "sample_00", scene, formats, VIEW, converter)
     assert sorted(files.values()) == sorted(path.name for path in out.iterdir())
     assert set(files) == {"sample_00" if kind == "ply" else f"sample_00_{kind}" for kind in formats}
-    needed = set(formats) - {"ply", "splat"}
+    needed = set(formats) - {"ply", "splat", "glb"}
     assert len(calls(program)) == len(needed)
     with pytest.raises(CompleteSplatError, match="a converter is needed for") if needed else nullcontext():
         write_formats(out, "other", scene, formats, VIEW, None)
@@ -56,6 +58,30 @@ def test_all_formats_but_the_page_are_made_of_the_ply_itself(tmp_path, converter
     ply, spz, sog, html, turned = ((tmp_path / name).read_bytes() for name in names)
     assert spz == sog == ply
     assert html == turned != ply
+
+
+def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
+    scene = replace(some(), opacities=torch.full((20,), 0.5))
+    write_formats(tmp_path, "a", scene, list(FORMATS), VIEW, converter)
+    clipped = scene.colors.clamp(0, 1)
+    assert not torch.equal(clipped, scene.colors)
+    torch.testing.assert_close(read_ply(tmp_path / "a.ply").colors, scene.colors, rtol=0, atol=1e-6)
+    for kind in ("spz", "sog"):  # the converter's stand-in copies what it is given
+        torch.testing.assert_close(read_ply(tmp_path / f"a.{kind}").colors, clipped, rtol=0, atol=1e-6)
+    write_glb(tmp_path / "other.glb", replace(scene, colors=clipped))
+    assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "other.glb").read_bytes()
+    write_splat(tmp_path / "other.splat", scene)
+    assert (tmp_path / "a.splat").read_bytes() == (tmp_path / "other.splat").read_bytes()
+
+
+def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, converter):
+    """Of 8 bits, 0 is read back as a logit of minus infinity."""
+    opacities = torch.tensor([0.5 / 255 - 1e-6, 0.0, 1.0, 0.6 / 255] * 5)
+    write_formats(tmp_path, "a", replace(some(), opacities=opacities), ["ply", "spz"], VIEW, converter)
+    assert read_ply(tmp_path / "a.ply").count == 20
+    torch.testing.assert_close(read_ply(tmp_path / "a.spz").opacities, torch.tensor([1.0, 0.6 / 255] * 5))
+    with pytest.raises(CompleteSplatError, match=r"b.spz: all 20 Gaussians are transparent"):
+        write_formats(tmp_path, "b", replace(some(), opacities=opacities / 1000), ["spz"], VIEW, converter)
 
 
 @pytest.mark.parametrize("up", [[0.1, -0.9, -0.4], [0.0, 0.0, -1.0], [0.0, 0.0, 3.0], [1.0, 0.0, 0.0]])

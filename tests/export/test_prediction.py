@@ -5,12 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from fake_converter import install
 from picture_sheets import cells
 from PIL import Image
 from support import some_gaussians, strict_json
 
 from completesplat.export.pictures import color_depth, surface_depth
-from completesplat.export.prediction import SampleViews, contact_sheet, write_maps, write_scene_json
+from completesplat.export.ply import read_ply
+from completesplat.export.prediction import (
+    SampleViews,
+    Wanted,
+    contact_sheet,
+    write_maps,
+    write_prediction,
+    write_scene_json,
+)
+from completesplat.export.splat_transform import SplatTransform
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -78,3 +88,15 @@ def test_the_camera_comes_back_exactly_and_numbers_that_are_not_finite_leave_the
     assert (scene["settings"], scene["seed"], scene["files"]) == (settings, 7, {"splat": "größe.ply"})
     assert {"axes", "units", "quaternions", "colors"} <= set(scene["conventions"])
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_colours_that_are_clipped_and_what_spz_leaves_out_are_counted(tmp_path):
+    bright = dataclasses.replace(scene_at(2, 0.9), colors=torch.tensor([[0.2, 0.4, 1.5], [0.0, 0.5, 1.0]]))
+    faint = dataclasses.replace(scene_at(2, 0.9), opacities=torch.tensor([0.9, 1e-4]))
+    wanted = Wanted(formats=("ply", "spz"), videos=(), converter=SplatTransform(str(install(tmp_path, "converter"))))
+    up, image, settings = torch.tensor([0.0, -1, 0]), torch.zeros(3, 16, 16), {"seed": 0, "image": "a.png"}
+    write_prediction(tmp_path / "a", image, [bright, faint], CAMERA, ReferenceRasterizer(), up, wanted, settings)
+    recorded = strict_json(tmp_path / "a/scene.json")["settings"]
+    counted = [recorded[name] for name in ("gaussians", "colors_clipped", "left_out_of_spz")]
+    assert counted == [[2, 2], [1, 0], [0, 1]]
+    assert [read_ply(tmp_path / f"a/sample_{i:02}.spz").count for i in (0, 1)] == [2, 1]

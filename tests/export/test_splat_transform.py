@@ -20,7 +20,7 @@ def bin_folder(tmp_path, monkeypatch):
 
 
 def test_without_node_it_is_said_what_to_install_and_what_needs_nothing(bin_folder):
-    with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply and splat need nothing"):
+    with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply, splat and glb need nothing"):
         find_splat_transform()
 
 

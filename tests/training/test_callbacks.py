@@ -1,18 +1,19 @@
 """What training does around its steps: random numbers, speed and memory."""
 
 import itertools
+import logging
 import time
 from unittest.mock import MagicMock
 
 import pytest
 import torch
-from lightning import Trainer
+from lightning import Callback, Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
 from lightning.pytorch.loggers.logger import Logger
 from scenes_for_training import scene_batch
 from torch.utils.data import DataLoader
 
-from completesplat.training.callbacks import StepSeeds, step_seed
+from completesplat.training.callbacks import Progress, StepSeeds, step_seed
 from completesplat.training.throughput import Throughput
 
 NAP = 0.03
@@ -113,3 +114,34 @@ def test_every_batch_draws_its_own_numbers_whatever_else_is_drawn():
     seeds = {step_seed(*place) for place in itertools.product(range(3), repeat=4)}
     assert len(seeds) == 3**4
     assert all(0 <= seed < 2**64 for seed in seeds)
+
+
+class Watched(Callback):
+    """Notes what the bar shows after each batch."""
+
+    def __init__(self, bar: Progress) -> None:
+        self.bar, self.shown = bar, []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module, *_) -> None:
+        task = self.bar.train_progress_bar
+        figures = self.bar.get_metrics(trainer, pl_module)
+        self.shown.append((task.description, task.completed, task.total, figures["step"], round(figures["loss"], 4)))
+
+
+class Telling(BoringModel):
+    def training_step(self, batch, index):
+        self.log("loss", 0.5 * index, prog_bar=True)
+        return super().training_step(batch, index)
+
+
+def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss(caplog):
+    caplog.set_level(logging.INFO)
+    bar = Progress()
+    watched, quiet = Watched(bar), {**QUIET, "enable_progress_bar": True}
+    settings = {"max_steps": 5, "max_epochs": -1, "val_check_interval": 4, "check_val_every_n_epoch": None}
+    settings |= {"accumulate_grad_batches": 2, "limit_val_batches": 1, "num_sanity_val_steps": 0}
+    trainer = Trainer(**settings, logger=False, callbacks=[bar, watched], **quiet)
+    trainer.fit(Telling(), DataLoader(torch.zeros(4, 32)), DataLoader(torch.zeros(4, 32)))
+    steps = [0, 1, 1, 2, 2, 3, 3, 4, 4, 5]  # of two batches each, two in an epoch
+    assert watched.shown == [("Training", s, 5, f"{s}/5", 0.5 * (i % 4)) for i, s in enumerate(steps)]
+    assert "step 0/5; validation every 2 (trainer.val_check_interval)" in caplog.text

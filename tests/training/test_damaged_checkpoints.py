@@ -8,8 +8,9 @@ import torch
 from support import SMALL, refused, strict_json
 
 from completesplat.errors import WeightsError
-from completesplat.training.checkpoints import CheckpointFiles, check_whole, load_part, read_checkpoint
+from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.weights.checkpoint_reading import check_whole, load_part, read_checkpoint
 
 
 @pytest.fixture
@@ -87,7 +88,7 @@ def test_a_run_goes_on_from_the_newest_whole_checkpoint(command, toy_root, tmp_p
 
     with monkeypatch.context() as patch:
         patch.setattr(ReconstructionModule, "training_step", interrupted_step)
-        assert fit(command, toy_root, run, "callbacks.checkpoint.keep_every=2").status == 130
+        assert fit(command, toy_root, run, "callbacks.checkpoint.keep_every=2").status == 1
     whole = {path: path.read_bytes() for path in (run / "checkpoints").iterdir()}
     assert whole.keys() == {last, previous, milestone, run / "checkpoints/step=4.ckpt"}
 

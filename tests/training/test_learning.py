@@ -8,7 +8,7 @@ from support import strict_json
 
 from completesplat.metrics.images import psnr
 from completesplat.tensors import stack
-from completesplat.training.checkpoints import load_part
+from completesplat.weights.checkpoint_reading import load_part
 
 pytestmark = pytest.mark.slow
 SCENES = ["data.scenes=24", "data.frames=12", "data.image_size=32", "data.depth_before=1.0"]

@@ -1,6 +1,5 @@
 """A run that is killed at any moment and continued leaves the rows and figures of one that was not."""
 
-import csv
 import itertools
 import os
 import random
@@ -14,54 +13,14 @@ from pathlib import Path
 import pandas
 import pytest
 import torch
-from lightning import Trainer
-from lightning.pytorch.demos.boring_classes import BoringModel
-from small_runs import Batches
-from support import SMALL, script, strict_json
+from reliability import comparable
+from small_runs import STEPS, fit, rows
+from support import SMALL, script
 
-from completesplat.training.checkpoints import LAST, CheckpointFiles, Checkpoints
-from completesplat.training.loggers import ContinuedCSVLogger, MetricsFile
-
-STEPS = 15  # an epoch has twelve
+from completesplat.training.loggers import MetricsFile
 
 
 class Killed(BaseException): ...
-
-
-class Logging(BoringModel):
-    """Rows of every second step, of validation at every third, and of some steps by itself."""
-
-    def training_step(self, batch, index):
-        loss = self.layer(batch).square().mean()
-        self.log("train/loss", loss.detach())
-        if self.global_step % 4 == 1:
-            self.logger.log_metrics({"own": loss.item()}, step=self.global_step)
-        return loss
-
-    def validation_step(self, batch, index):
-        self.log("val/loss", self.layer(batch).square().mean())
-
-
-def fit(folder: Path, steps: int = STEPS) -> None:
-    """Go on in a folder, as `completesplat fit ckpt_path=last` does, and write the final row."""
-    torch.manual_seed(0)
-    module, logger = Logging(), ContinuedCSVLogger(str(folder))
-    checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=1, keep_every=5)
-    trainer = Trainer(
-        max_steps=steps, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
-        log_every_n_steps=2, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0,
-        enable_progress_bar=False, enable_model_summary=False,
-    )  # fmt: skip
-    last = folder / "checkpoints" / LAST
-    validation = torch.utils.data.DataLoader(torch.ones(1, 32))
-    trainer.fit(module, Batches(), validation, ckpt_path=last if last.is_file() else None, weights_only=True)
-    figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
-    logger.log_metrics(figures, step=trainer.global_step)
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    with (folder / "metrics.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_run_killed_before_every_change_of_a_file_leaves_all_rows(tmp_path, monkeypatch):
@@ -108,18 +67,6 @@ def start(folder: Path, root: Path, out: Path) -> subprocess.Popen:
     given += ["trainer.val_check_interval=4", "trainer.log_every_n_steps=2", "data.references_per_sequence=4"]
     program = [sys.executable, script(folder), *given]
     return subprocess.Popen(program, start_new_session=True, stdout=subprocess.DEVNULL)
-
-
-def comparable(out: Path) -> tuple[pandas.DataFrame, dict]:
-    """Without times, speeds, and what names the run."""
-    times = ("speed/", "memory/")
-    table = pandas.read_csv(out / "metrics.csv")
-    table = table[[column for column in table if not column.startswith(times) and "seconds" not in column]]
-    found = {key: value for key, value in strict_json(out / "metrics.json").items() if not key.startswith(times)}
-    for key in ("machine", "command", "checkpoint"):
-        found["test"]["protocol"].pop(key)
-    found["test"]["model"].pop("seconds")
-    return table, found
 
 
 @pytest.mark.slow

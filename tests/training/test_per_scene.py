@@ -10,6 +10,7 @@ FEW = ["model.fitting.count=300", "model.fitting.steps=60", "data.evaluation_tar
 
 def scored(model: str, root, *settings: str):
     config = compose_config("fit", "experiment=toy_var", f"model={model}", f"data.root={root}", *SMALL, *FEW, *settings)
+    config.model.scenes_folder = None
     module, data = (instantiate(part, _convert_="all") for part in (config.model, config.data))
     trainer = lightning.Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False)
     trainer.test(module, datamodule=data, verbose=False)

@@ -12,8 +12,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.scene import SceneBatch
-from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.preoptimized_vae import FittedScenes
+from completesplat.weights.checkpoint_reading import read_checkpoint
 
 MODEL = ["model=preoptimized_vae", "model.fitting.count=300", "model.fitting.steps=3"]
 SETTINGS = ["experiment=toy_var", *MODEL, *SMALL]

@@ -4,8 +4,8 @@ from hydra.utils import instantiate
 from scenes_for_training import scene_batch
 from support import NETWORKS, compose_config
 
-from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.scene_module import copy_reference, repeat_image
+from completesplat.weights.checkpoint_reading import read_checkpoint
 
 
 def module(*settings: str):

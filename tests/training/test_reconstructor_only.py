@@ -4,7 +4,7 @@ import torch
 from hydra.utils import instantiate
 from support import SMALL, compose_config, strict_json
 
-from completesplat.training.checkpoints import read_checkpoint
+from completesplat.weights.checkpoint_reading import read_checkpoint
 
 SETTINGS = ["experiment=toy_var", "model=reconstructor_only", *SMALL, "model.code_steps=4"]
 

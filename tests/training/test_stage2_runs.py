@@ -12,8 +12,8 @@ from safetensors.torch import load_file
 from support import NETWORKS, SMALL, call, compose_config, refused
 
 from completesplat.generation import CompleteSplat
-from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.weights.checkpoint_reading import read_checkpoint
 
 VAE = ["conditioning=stable_diffusion", "conditioning.channels=[8,8,16,16]"]
 VAE += ["conditioning.layers_per_block=1", "conditioning.norm_groups=4"]
@@ -74,6 +74,12 @@ def test_the_weights_need_no_vae_any_more(run, pipeline):
     model = CompleteSplat.from_pretrained(run.folder / "weights")
     assert model.conditioning.frozen
     assert len(model(pipeline.photograph(), samples=1)) == 1
+
+
+def test_the_weights_say_what_they_were_trained_on(run):
+    said = CompleteSplat.from_pretrained(run.folder / "weights").architecture["training"]
+    assert said["box_masks"] == 0
+    assert [len(said[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
 
 
 def test_the_latents_and_the_losses_by_timestep_are_logged(run):

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from completesplat.data.pictures.files import MOST_PIXELS
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -125,8 +126,9 @@ def _read_list(path: Path) -> list[Any]:
 def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
     image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), entry.get("depth")
     size = field(image, "size", list)
-    if [type(side) for side in size] != [int, int] or min(size) <= 0:
-        raise BadAnnotation(f"the image's size must be two positive integers, not {size}")
+    if [type(side) for side in size] != [int, int] or not 0 < min(size) <= max(size) <= MOST_PIXELS:
+        said = f"two positive integers of at most {MOST_PIXELS:,}"
+        raise BadAnnotation(f"the image's size must be {said}, not {str(size)[:80]}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
     image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
     if depth is not None:

@@ -1,6 +1,7 @@
 """Captures as a COLMAP model (sparse reconstruction) with its pictures."""
 
 import struct
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,10 @@ def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | No
 
 def _find_mask(masks: Path, name: str) -> Path:
     appended, replaced = (inside(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
-    if not (appended.is_file() or replaced.is_file()):
+    # `Path.is_file` raises where a name is too long.
+    if not (isfile(appended) or isfile(replaced)):
         raise MissingFile(f"no such file, nor {replaced.name}", str(appended))
-    return appended if appended.is_file() else replaced
+    return appended if isfile(appended) else replaced
 
 
 def _lens_of(camera: Any) -> Lens:
@@ -85,7 +87,7 @@ def _lens_of(camera: Any) -> Lens:
 
 def _check_complete(model: Path) -> None:
     """Walk through the binary files: of cut ones pycolmap takes what is not there for numbers, or reads forever."""
-    for name, skip in (("cameras", _after_camera), ("images", _after_image), ("points3D", _after_point)):
+    for name, skip in RECORDS.items():
         path = model / f"{name}.bin"
         if not path.is_file():
             continue
@@ -94,7 +96,7 @@ def _check_complete(model: Path) -> None:
             (count,), offset = struct.unpack_from("<Q", content), 8
             for _ in range(count):
                 offset = skip(content, offset)
-        except (struct.error, ValueError):
+        except (struct.error, ValueError, OverflowError):  # the last: a number of bytes that no file has
             offset = -1
         if offset != len(content):
             raise UnreadableFile("cut off, or not COLMAP's", str(path))
@@ -114,3 +116,25 @@ def _after_image(content: bytes, offset: int) -> int:
 
 def _after_point(content: bytes, offset: int) -> int:
     return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, place, colour, error
+
+
+def _after_rig(content: bytes, offset: int) -> int:
+    (sensors,), offset = struct.unpack_from("<I", content, offset + 4), offset + 8  # after id
+    for number in range(sensors):  # its kind and id, and of others than the first whether there is a pose, and that
+        has_pose = bool(number) and struct.unpack_from("<B", content, offset + 8)[0]
+        offset += 8 + bool(number) + (56 if has_pose else 0)
+    return offset
+
+
+def _after_frame(content: bytes, offset: int) -> int:
+    return offset + 68 + 16 * int(struct.unpack_from("<I", content, offset + 64)[0])  # after ids, pose
+
+
+RECORDS = {
+    "cameras": _after_camera,
+    "images": _after_image,
+    "points3D": _after_point,
+    "rigs": _after_rig,
+    "frames": _after_frame,
+}
+"""What each binary file has records of, after their number."""

@@ -1,6 +1,7 @@
 """What the data modules of all data sets share: loaders and settings."""
 
 import logging
+import os
 from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property, partial
@@ -17,13 +18,14 @@ from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augme
 from completesplat.data.loading.distributed import batch_per_process, processes
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
-from completesplat.data.loading.training_statistics import TypicalCamera, mean_camera, mean_image
+from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import CompleteSplatError, DataError
 
+MOST_WORKERS = 4  # by default
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
 logger = logging.getLogger(__name__)
@@ -68,12 +70,13 @@ class SceneDataModule(LightningDataModule):
         background: grey value that pictures have where they are masked out ("Objects only"); None: they stay.
         color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: none.
         horizontal_flip: mirror half of the training scenes horizontally.
-        workers: processes that load data; 0: none.
+        workers: processes that load data; 0: none; None: one for each core, at most four.
         cache: keep decoded pictures in memory.
         latent_cache: train stage 2 from the latents in this folder (`CachedTrainingScenes`), without augmentation of
             pictures; validation and test read pictures. An empty name is one that is still to be given.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
+        allow_changed: a run that is continued may go on with other training data than it had.
     """
 
     def __init__(
@@ -89,11 +92,12 @@ class SceneDataModule(LightningDataModule):
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
-        workers: int = 0,
+        workers: int | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
         on_bad: str = "skip",
         max_bad_fraction: float = 0.1,
+        allow_changed: bool = False,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -110,9 +114,11 @@ class SceneDataModule(LightningDataModule):
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, horizontal_flip=horizontal_flip)
-        self.workers, self.cache = workers, cache
+        self.workers = min(MOST_WORKERS, os.cpu_count() or 1) if workers is None else workers
+        self.cache = cache
         self.latent_cache = None if latent_cache is None else Path(latent_cache)
         self.policy = on_bad, max_bad_fraction
+        self.allow_changed = allow_changed
         self.seed = seed
         # The same data in the smaller pictures that a tested model sees.
         self.at_model_size: SceneDataModule | None = None
@@ -159,6 +165,8 @@ class SceneDataModule(LightningDataModule):
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
+        if stage == "fit":
+            _ = self.trained_on  # as they are now, whatever becomes of the files while the run lasts
         if stage == "fit" and self.latent_cache is not None:
             self._training_scenes()  # what is wrong with the cache is an error before training starts
 
@@ -229,19 +237,37 @@ class SceneDataModule(LightningDataModule):
         own = scenes.share(batch_size) if split == "test" else scenes
         return SceneLoader(own, batch_size, None, self.workers, *self.policy)
 
+    @cached_property
+    def trained_on(self) -> dict[str, Any]:
+        """Fingerprint and number of sequences of the training data, when first asked for."""
+        source = self.source("train")
+        return {"fingerprint": source.fingerprint(), "sequences": len(source.names)}
+
     def state_dict(self) -> dict[str, Any]:
-        """The data's fingerprint, for checkpoints."""
-        return {"fingerprint": self.source("train").fingerprint()}
+        """What the training data were, for checkpoints."""
+        return dict(self.trained_on)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Warn if the run that is resumed was trained on other data."""
-        if state_dict["fingerprint"] != self.source("train").fingerprint():
-            logger.warning("the data in %s are not those that the resumed run was trained on", self.root)
+        """Of the run that is continued: `DataError` if it had other training data, with `allow_changed` a warning."""
+        now = self.trained_on
+        before = now | state_dict  # checkpoints of version 0.1 have no number of sequences
+        if before == now:
+            return
+        counts = f"{before['sequences']} sequences then, {now['sequences']} now"
+        said = f"not the training data that this run had before ({counts})"
+        if not self.allow_changed:
+            raise DataError(f"{said}; data.allow_changed=true goes on with these", str(self.root))
+        logger.warning("%s: %s", self.root, said)
 
     def typical_camera(self) -> TypicalCamera:
         """See `mean_camera`."""
         with at(file=self.root):
             return mean_camera(self.store("train"))
+
+    def training_facts(self) -> dict[str, Any]:
+        """What weights say about the pictures that they were trained on, see `completesplat.parts.TrainingPictures`."""
+        hidden = 0.0 if self.box_masks is None else self.box_masks.probability
+        return {"box_masks": hidden, **feature_moments(self.store("train"))}
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
         """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""

@@ -3,6 +3,7 @@
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
 
@@ -23,6 +24,16 @@ def gathered(value: Any) -> list[Any]:
     values: list[Any] = [None] * count
     torch.distributed.all_gather_object(values, value)
     return values
+
+
+def mean_of_processes(values: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Scalars on one device, averaged over all processes, each of which must call it with the same names."""
+    count = processes()[1]
+    if count == 1:
+        return values
+    totals = torch.stack(list(values.values()))
+    torch.distributed.all_reduce(totals)
+    return dict(zip(values, totals / count, strict=True))
 
 
 def batch_per_process(batch_size: int, count: int, accumulated: int) -> int:

@@ -12,6 +12,7 @@ from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
 from completesplat.data.loading.view_selection import draws
 from completesplat.errors import DataError
+from completesplat.signals import leave_to_parent
 
 logger = logging.getLogger(__name__)
 
@@ -82,6 +83,7 @@ class SceneLoader:
             persistent_workers=workers > 0,  # They hold what is cached, so they live on from one epoch to the next.
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
+            worker_init_fn=leave_to_parent,
             # Its own, so that the numbers which training draws do not depend on the number of workers.
             generator=torch.Generator(),
         )

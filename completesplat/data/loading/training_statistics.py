@@ -9,12 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.data.loading.scenes import SceneStore
+from completesplat.data.pictures.photograph import picture_features
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
 # A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
 SEQUENCES, PICTURES = 400, 8192
+# Deviations of eight numbers are known well enough from fewer.
+FEATURE_PICTURES, SMALLEST_DEVIATION = 1024, 1e-3
 
 
 class TypicalCamera(NamedTuple):
@@ -67,10 +70,24 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
     return (total / (255 * max(count, 1))).float()
 
 
-def excerpts(store: SceneStore) -> Iterator[tuple[PosedSequence, list[int]]]:
-    """The first sequences that can be read, each with evenly spaced frames."""
+def feature_moments(store: SceneStore) -> dict[str, list[float]]:
+    """`picture_mean` and `picture_std` of the `picture_features` of about 1,024 pictures; empty if none can be read."""
+    found = []
+    for sequence, frames in excerpts(store, FEATURE_PICTURES):
+        for frame in frames:
+            with suppress(DataError):
+                found.append(picture_features(store.image(sequence, frame).double() / 255))
+    if not found:
+        return {}
+    features = torch.stack(found)
+    deviation = features.std(0, correction=0).clamp(min=SMALLEST_DEVIATION)
+    return {"picture_mean": features.mean(0).tolist(), "picture_std": deviation.tolist()}
+
+
+def excerpts(store: SceneStore, pictures: int = PICTURES) -> Iterator[tuple[PosedSequence, list[int]]]:
+    """The first sequences that can be read, each with evenly spaced frames, of about so many pictures in all."""
     names = store.names[:SEQUENCES]
-    most = PICTURES // len(names)
+    most = pictures // len(names)
     for name in names:
         with suppress(DataError):
             sequence = store.source.read(name)

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import logging
-import os
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +15,7 @@ import numpy as np
 from rich.filesize import decimal
 from rich.progress import Progress
 
+from completesplat.atomic import atomic_path
 from completesplat.data.packed.manifest import (
     HEADER,
     MANIFEST,
@@ -81,34 +81,33 @@ class ShardWriter:
 
         Raises:
             DataError: something cannot be read, and bad input is not to be skipped.
+            DiskError: the disk is full.
         """
         # Public within `datasets`, though not in its handbook: the documented ways (`from_list`, `from_generator`)
         # hold a whole shard in memory or write it into a cache first.
         from datasets.arrow_writer import ArrowWriter
 
         path = self.folder / plan.file
-        unfinished = path.with_name(path.name + UNFINISHED)
         refused: list[Refusal] = []
         sequences, frames = [], 0
         # One record batch for each sequence, so that writing holds no more than one in memory.
-        with (
-            unfinished.open("wb") as stream,
-            ArrowWriter(features=features(), stream=stream, writer_batch_size=1) as writer,
-        ):
-            for name in plan.names:
-                try:
-                    sequence, kept, pictures = self._encode(plan.split, name, refused)
-                except DataError as error:
-                    self._refuse(error, refused)
-                    continue
-                writer.write_table(to_row(sequence, kept, pictures))
-                sequences.append(name)
-                frames += len(kept)
-            writer.finalize()
-        with unfinished.open("rb+") as file:
-            os.fsync(file.fileno())  # The record must not outlive a shard that a power cut took.
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        unfinished.rename(path)
+        with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
+            with (
+                unfinished.open("wb") as stream,
+                ArrowWriter(features=features(), stream=stream, writer_batch_size=1) as writer,
+            ):
+                for name in plan.names:
+                    try:
+                        sequence, kept, pictures = self._encode(plan.split, name, refused)
+                    except DataError as error:
+                        self._refuse(error, refused)
+                        continue
+                    writer.write_table(to_row(sequence, kept, pictures))
+                    sequences.append(name)
+                    frames += len(kept)
+                writer.finalize()
+            with unfinished.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
         shard = Shard(plan.file, digest, path.stat().st_size, frames, tuple(sequences))
         record = ShardRecord(plan.split, plan.names, shard, tuple(refused))
         write_json(_record_path(path), record)
@@ -285,6 +284,7 @@ def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[S
 
 
 def _claim(out: Path, plan: dict[str, Any]) -> None:
+    out.mkdir(parents=True, exist_ok=True)
     path = out / PLAN
     if not path.is_file():
         if is_packed(out) or any(out.glob("*.arrow")):

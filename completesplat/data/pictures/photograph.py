@@ -1,12 +1,16 @@
-"""Any photograph as the square image that a model takes, with its field of view, and what of it is hidden."""
+"""Any photograph as the square image that a model takes, with its field of view, and what of it is hidden.
+
+Also what tells pictures of one kind from those of another, and the object cut out of its background.
+"""
 
 import io
 import math
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -29,7 +33,9 @@ from completesplat.tensors import TensorDataclass
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
+LARGEST_OBJECT = 4096  # pixels; a larger one is reduced before its square is made, which could be of any size
 LANCZOS_REACH = 3  # of the filter, in pixels of the coarser picture
+CUTTER = "u2net"  # rembg's own default is a network under a licence for non-commercial use
 
 
 @dataclass(frozen=True)
@@ -41,63 +47,88 @@ class Photograph(TensorDataclass):
     fov_source: Literal["given", "exif", "default"]
 
 
+Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
+
+
 def read_photograph(
-    path: str | Path,
+    picture: Picture,
     size: int,
     fov_degrees: float | None = None,
     default_fov_degrees: float = 50.0,
+    remove_background: bool = False,
     background: float = 1.0,
     object_share: float | None = None,
 ) -> Photograph:
-    """Read an image file upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
+    """Turn a picture upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
 
     Transparency is laid over the background; of an animation the first frame is taken; an embedded colour profile is
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1], grey images of floats must lie in it.
 
     Args:
-        path: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content.
+        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content; a PIL image; an
+            array [height, width, 3] of bytes, or of floats in [0, 1]; a tensor [3, height, width] of the same.
         fov_degrees: field of view of the square crop, if it is known.
-        default_fov_degrees: the same for files without usable EXIF focal length (50 is close to a phone's main camera).
-        background: grey value from 0 to 1, white by default.
-        object_share: of pictures that are transparent around an object, the square around that object is taken whose
-            side the object fills by this share; None: the central square, as of all others.
+        default_fov_degrees: the same for pictures without usable EXIF focal length (50 is close to a phone's camera).
+        remove_background: cut the object out, see `without_background`: of the square, or for `object_share` of it all.
+        background: grey value from 0 to 1 that lies behind what is transparent or removed, white by default.
+        object_share: of pictures with an object in front of nothing but transparency, also where the background was
+            removed, the square around the object is taken of whose side it fills this share; None: the central square.
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
             before decoding), less than 8 pixels on a side, or pixel values without one plain meaning.
-        CompleteSplatError: a field of view outside (0, 180) degrees.
+        CompleteSplatError: a field of view outside (0, 180) degrees, or what `without_background` raises.
     """
     for fov in (fov_degrees, default_fov_degrees):
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        _check_file(Path(path))
-        with opened(path, FORMATS) as picture:
-            if min(picture.size) < SMALLEST_SIDE:
-                raise ImageError(f"{picture.size} pixels; at least {SMALLEST_SIDE} on a side are needed")
-            picture.load()
-            exif = read_exif(picture)
-        turned = upright(picture, exif.get(ORIENTATION))
-        square = (None if object_share is None else _around_object(turned, object_share)) or _central(turned)
-        image = _to_tensor(square, picture, size, background)
+        image, recorded = _square(picture, size, remove_background, background, object_share)
     except ImageError as error:
-        raise ImageError(f"{path}: {error}") from error.__cause__
+        name = picture if isinstance(picture, (str, Path)) else "the picture"
+        raise ImageError(f"{name}: {error}") from error.__cause__
     if fov_degrees is not None:
         return Photograph(image, float(fov_degrees), "given")
-    if (recorded := crop_fov(exif, picture.size)) is not None:
+    if recorded is not None:
         return Photograph(image, recorded, "exif")
     return Photograph(image, float(default_fov_degrees), "default")
 
 
-def _central(picture: Image.Image) -> Image.Image:
-    side = min(picture.size)
-    left, top = (picture.width - side) // 2, (picture.height - side) // 2
-    return picture.crop((left, top, left + side, top + side))
+def _square(
+    picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
+) -> tuple[Float[Tensor, "3 size size"], float | None]:
+    """The central square, or the object's, resized; the central one's field of view in degrees where EXIF tells it."""
+    if isinstance(picture, (np.ndarray, Tensor)):
+        picture = _pixels(picture)
+        if isinstance(picture, np.ndarray):
+            if remove_background:
+                raise ImageError("a picture whose background is to be removed is given in bytes, not in floats")
+            return _resized(picture, size), None
+    if not isinstance(picture, Image.Image):
+        _check_file(Path(picture))
+    with nullcontext(picture) if isinstance(picture, Image.Image) else opened(picture, FORMATS) as file:
+        _check_side(*file.size)
+        file.load()
+        exif = read_exif(file)
+    seen = upright(file, exif.get(ORIENTATION))
+    if object_share is None:
+        seen = seen.crop(_central_square(*seen.size))
+    if remove_background:
+        seen = _cut_out(seen, background)
+    if object_share is not None:
+        seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
+    return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
+
+
+def _cut_out(picture: Image.Image, background: float) -> Image.Image:
+    if picture.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {picture.mode} goes without background=remove")
+    return without_background(_to_srgb(picture, background))
 
 
 def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
     """The square around what is not transparent, which may reach beyond the picture; None: all of it is opaque."""
-    if not picture.has_transparency_data:
+    if picture.mode not in EIGHT_BIT_MODES or not picture.has_transparency_data:
         return None
     cut_out = picture.convert("RGBA")
     alpha = cut_out.getchannel("A")
@@ -106,10 +137,47 @@ def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
     box = alpha.getbbox()
     if box is None:
         raise ImageError("nothing but transparency")
-    left, top, right, bottom = box
-    side = round(max(right - left, bottom - top) / share)
-    left, top = (left + right - side) // 2, (top + bottom - side) // 2
+    cut_out = cut_out.crop(box)
+    cut_out = cut_out.reduce(-(-max(cut_out.size) // LARGEST_OBJECT))
+    side = round(max(cut_out.size) / share)
+    left, top = (cut_out.width - side) // 2, (cut_out.height - side) // 2
     return cut_out.crop((left, top, left + side, top + side))
+
+
+def _check_side(width: int, height: int) -> None:
+    if min(width, height) < SMALLEST_SIDE:
+        raise ImageError(f"{width, height} pixels; at least {SMALLEST_SIDE} on a side are needed")
+
+
+def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
+    """Left, upper, right and lower edge."""
+    side = min(width, height)
+    left, top = (width - side) // 2, (height - side) // 2
+    return left, top, left + side, top + side
+
+
+def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
+    """Bytes as an image, floats as they are, of an array with the channel last, or of a tensor with it first."""
+    channel = 0 if isinstance(picture, Tensor) else -1
+    if picture.ndim != 3 or picture.shape[channel] != 3:
+        raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
+    values = picture.detach().cpu().movedim(0, -1).numpy() if isinstance(picture, Tensor) else picture
+    if values.dtype == np.uint8:
+        return Image.fromarray(values)
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ImageError(f"values are {values.dtype}; bytes, or floats in [0, 1], have one meaning")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ImageError("values outside of [0, 1]")
+    return values.astype(np.float32)
+
+
+def _resized(pixels: Float[np.ndarray, "height width 3"], size: int) -> Float[Tensor, "3 size size"]:
+    height, width = pixels.shape[:2]
+    _check_side(width, height)
+    box = _central_square(width, height)
+    channels = [Image.fromarray(np.ascontiguousarray(channel)).crop(box) for channel in np.moveaxis(pixels, -1, 0)]
+    resized = [np.asarray(channel.resize((size, size), Image.Resampling.LANCZOS)) for channel in channels]
+    return torch.from_numpy(np.stack(resized).clip(0, 1))
 
 
 def _check_file(path: Path) -> None:
@@ -148,6 +216,46 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
             converted = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
             return converted if converted is not None else native
     return square.convert("RGB")
+
+
+def without_background(picture: Image.Image) -> Image.Image:
+    """An RGB picture as RGBA, transparent where a network sees background: U2-Net (Qin et al. 2020), by rembg.
+
+    Raises:
+        CompleteSplatError: rembg is not installed, or fails: it downloads the network (176 MB) on first use.
+        ImageError: nothing is left of the picture.
+    """
+    try:
+        import rembg
+    except (ImportError, SystemExit) as error:  # it exits where it has no onnxruntime
+        advice = 'pip install "completesplat[background]"'
+        raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
+    pixels = Image.fromarray(np.array(picture))  # without EXIF, by which rembg would turn it a second time
+    try:
+        cut: Image.Image = rembg.remove(pixels, session=_session())
+    except Exception as error:  # of its HTTP library, of onnxruntime and of the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
+    if not cut.getchannel("A").getbbox():
+        raise ImageError("background=remove leaves nothing of it: no object is found")
+    return cut
+
+
+@cache
+def _session() -> Any:
+    import rembg
+
+    return rembg.new_session(CUTTER)
+
+
+def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
+    """What tells pictures of one kind from others: mean and deviation of red, green and blue, and how fine they are.
+
+    The last two are the mean differences between neighbours in a row, and in a column. All lie in [0, 1].
+    """
+    means, deviations = images.mean((-2, -1)), images.std((-2, -1), correction=0)
+    steps = [images.diff(dim=axis).abs().mean((-3, -2, -1))[..., None] for axis in (-1, -2)]
+    return torch.cat([means, deviations, *steps], dim=-1)
 
 
 def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:

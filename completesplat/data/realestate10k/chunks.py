@@ -9,6 +9,7 @@ import json
 import zipfile
 from collections.abc import Sequence
 from functools import partial
+from os.path import isfile
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -46,7 +47,8 @@ class ChunkedClips:
         for key, name in index.items():
             with refused_to(self.refused.append), at(path, key):
                 paths[key] = inside(folder, name)
-        there = {path for path in set(paths.values()) if path.is_file()}
+        # `Path.is_file` raises where a name is too long.
+        there = {path for path in set(paths.values()) if isfile(path)}
         self.folder = folder
         self._files = {key: path for key, path in paths.items() if path in there}
         self.keys = sorted(self._files, key=lambda key: (self._files[key], key))

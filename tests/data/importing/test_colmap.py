@@ -88,7 +88,7 @@ def test_masks_have_the_names_of_their_pictures(captures, tmp_path, name):
     assert found == [20, 40, 60, 80, 100, 120, 140, 160]
 
 
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
 @pytest.mark.parametrize("share", [0.01, 0.99])
 def test_cut_files_are_refused(captures, tmp_path, file, share):
     path = write_model(captures, tmp_path, "OPENCV") / f"{file}.bin"

@@ -1,0 +1,61 @@
+"""`completesplat new`: a part of the user's own, begun in the working folder with settings and a test that run."""
+
+import keyword
+import re
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from completesplat.commands.jobs import conf_folder
+from completesplat.errors import CompleteSplatError
+
+TEMPLATES = Path(__file__).parents[1] / "templates"
+KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
+FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
+"""A line of a template that names the file which follows."""
+
+
+def overrides(arguments: Sequence[str]) -> list[str]:
+    """Hydra's form of `KIND NAME`; `CompleteSplatError` for more words."""
+    words = [argument for argument in arguments if "=" not in argument and not argument.startswith("-")]
+    if len(words) > 2:
+        raise CompleteSplatError(f"give one kind and one name, not {' '.join(words)}")
+    keys = dict(zip(words, ("kind", "name"), strict=False))
+    return [f"{keys[argument]}='{argument}'" if argument in keys else argument for argument in arguments]
+
+
+def run(config: Any, out: Path) -> None:
+    """Write the part's files into the working folder and print their names, and what to do next."""
+    kind, name = str(config.kind), str(config.name)
+    files = begun(kind, name)
+    for path, text in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        print(path)
+    print(f"next: python -m pytest test_{kind}_{name}.py")
+
+
+def begun(kind: str, name: str) -> dict[Path, str]:
+    """The files of a part of this kind and their texts, by paths in the working folder.
+
+    Raises:
+        CompleteSplatError: no such kind; a name that is none of Python's, or taken; a file that is there already.
+    """
+    if kind not in KINDS:
+        raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
+    if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
+        raise CompleteSplatError(f"name={name}: must be a name of Python's: letters, digits and underscores")
+    classes = "".join(word.capitalize() for word in name.split("_"))
+    text = (TEMPLATES / f"{kind}.txt").read_text().replace("@name@", name).replace("@Name@", classes)
+    _, *parts = FILE.split(text)
+    files = {Path(path): body.strip("\n") + "\n" for path, body in zip(parts[::2], parts[1::2], strict=True)}
+    for path in files:
+        if path.exists():
+            raise CompleteSplatError(f"{path}: is there already; choose another name")
+        if path.parts[0] == "conf" and (conf_folder().parent / path).is_file():
+            raise CompleteSplatError(f"name={name}: the package has {path}; choose another name")
+    # The working folder comes behind all others in which Python looks for modules.
+    if Path(f"{name}.py") in files and find_spec(name) is not None:
+        raise CompleteSplatError(f"name={name}: there is a module of this name; choose another name")
+    return files

@@ -1,0 +1,70 @@
+"""Checkpoints of training: told whole from damaged, and read as plain tensors, without Lightning."""
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from completesplat.errors import WeightsError
+
+END, END_BYTES = b"PK\5\6", 22
+"""How the last record of a zip archive begins, and its length without the comment behind it."""
+CHECKSUM, DIGEST_BYTES = b"sha256:", 64
+
+
+def check_whole(path: Path) -> None:
+    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end."""
+    bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - bytes_of_end))
+        end = file.read()
+        if not end.startswith(END):
+            if end[-END_BYTES:].startswith(END) and end.endswith(b"\0\0"):
+                return
+            raise WeightsError(f"{path}: not a readable checkpoint (damaged at its end, or cut off)")
+        digest, left = hashlib.sha256(), size - DIGEST_BYTES
+        file.seek(0)
+        while left and (part := file.read(min(left, 2**20))):
+            digest.update(part)
+            left -= len(part)
+    if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
+        raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """A checkpoint's contents.
+
+    `WeightsError`: the file is missing, damaged, no checkpoint of plain tensors, or its weights are not finite.
+    """
+    if not Path(path).is_file():
+        raise WeightsError(f"{path}: no such checkpoint")
+    check_whole(Path(path))
+    try:
+        contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        name = not_finite(contents["state_dict"])
+    except Exception as error:
+        raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
+    if name is not None:
+        raise WeightsError(f"{path}: {name} is not finite")
+    return contents
+
+
+def not_finite(weights: Mapping[str, Any]) -> str | None:
+    """The name of the first tensor that holds NaN or infinities, if there is one."""
+    return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
+
+
+def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
+    """Load the weights below `prefix` of a checkpoint into a module; `WeightsError` unless all are there and fit."""
+    weights = read_checkpoint(path)["state_dict"]
+    part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
+    try:
+        module.load_state_dict(part)
+    except RuntimeError as error:
+        first = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
+        raise WeightsError(f"{path}: weights of another architecture: {first}") from error

@@ -1,0 +1,89 @@
+"""What is left by commands that a signal ends: a line that says how to go on, a checkpoint, nothing half written."""
+
+import os
+import shlex
+import signal
+
+import pytest
+from support import SMALL, strict_json
+
+from completesplat.training import encoding
+from completesplat.training.checkpoints import read_checkpoint
+from completesplat.training.reconstruction import ReconstructionModule
+
+pytestmark = pytest.mark.usefixtures("plain_signals")
+
+
+@pytest.fixture
+def signalled(monkeypatch):
+    """Make a method send a signal to its process, the first time that a condition holds."""
+
+    def patch(place, name, number, condition=lambda self: True):
+        original, sent = getattr(place, name), []
+
+        def method(self, *inputs, **options):
+            if not sent and condition(self):
+                sent.append(number)
+                os.kill(os.getpid(), number)
+            return original(self, *inputs, **options)
+
+        monkeypatch.setattr(place, name, method)
+
+    return patch
+
+
+def said(finished, number):
+    """The checkpoint that the last line names, if any, and the arguments of the command that it says."""
+    line = finished.err.splitlines()[-1]
+    before, command = line.split(" with: ")
+    assert before.startswith(f"ended by {signal.Signals(number).name}; ")
+    name, *arguments = shlex.split(command)
+    assert name == "completesplat"
+    return before.partition("the checkpoint is ")[2].partition("; go on")[0], arguments
+
+
+FIT = ["experiment=toy_var", *SMALL, "callbacks.pictures=null", "test=false", "trainer.max_steps=5"]
+
+
+def test_fit_goes_on_with_the_command_that_it_says(command, toy_root, tmp_path, signalled):
+    signalled(ReconstructionModule, "training_step", signal.SIGINT, lambda self: self.global_step == 2)
+    finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
+    assert finished.status == 130, finished.err
+    checkpoint, again = said(finished, signal.SIGINT)
+    assert checkpoint == f"{tmp_path}/run/checkpoints/last.ckpt"
+    assert read_checkpoint(checkpoint)["global_step"] == 3
+    assert not (tmp_path / "run/metrics.json").exists()
+    finished = command(*again)
+    assert finished.status == 0, finished.err
+    assert strict_json(tmp_path / "run/metrics.json")["steps"] == 5
+
+
+def test_a_sweep_ends_with_the_job_that_gets_the_signal(command, toy_root, tmp_path, signalled):
+    signalled(ReconstructionModule, "training_step", signal.SIGHUP, lambda self: self.global_step == 2)
+    given = ["-m", *FIT, f"data.root={toy_root}", "seed=1,2"]
+    finished = command("fit", *given, f"out={tmp_path / 'sweep'}")
+    assert finished.status == 129
+    checkpoint, again = said(finished, signal.SIGHUP)
+    assert checkpoint == f"{tmp_path}/sweep/seed-1/checkpoints/last.ckpt"
+    assert again == ["fit", *given, f"out={tmp_path / 'sweep'}"]
+    assert not (tmp_path / "sweep/seed-2").exists()
+
+
+def test_test_does_not_end_as_if_all_was_well(command, pipeline, tmp_path, signalled):
+    signalled(ReconstructionModule, "test_step", signal.SIGTERM)
+    given = [f"ckpt={pipeline.var}/checkpoints/last.ckpt", "trust=true", "trainer.accelerator=cpu"]
+    finished = command("test", *given, f"out={tmp_path / 'test'}")
+    assert finished.status == 143, finished.err
+    assert said(finished, signal.SIGTERM) == ("", ["test", *given, f"out={tmp_path / 'test'}"])
+    assert not (tmp_path / "test/metrics.json").exists()
+
+
+def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, signalled):
+    signalled(encoding.Moments, "add", signal.SIGTERM)
+    given = ["data_task=latents", f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", "trust=true"]
+    given += [f"overrides=['data.root={packed_toys}']", f"out={tmp_path / 'latents'}"]
+    finished = command("data", *given)
+    assert finished.status == 143, finished.err
+    assert not list((tmp_path / "latents").glob("*.npy"))
+    finished = command(*said(finished, signal.SIGTERM)[1])
+    assert finished.status == 0, finished.err

@@ -1,0 +1,193 @@
+"""Whatever a run trained, its folder and its checkpoints give scenes, or say why not."""
+
+import copy
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from PIL import Image
+from support import SMALL, compose_config, strict_json
+
+from completesplat.commands.fit import export_weights
+from completesplat.commands.trained import Trained
+from completesplat.commands.view import settings_of
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.export.ply import read_ply
+from completesplat.generation import CompleteSplat, OneAnswer
+from completesplat.weights import CONFIG_FILE, SUMS_FILE
+
+FEW = ["frames=4", "video=[]"]
+QUICK = [*SMALL, "callbacks.pictures=null"]
+
+
+@pytest.fixture(scope="module")
+def splatter(pipeline, built_once):
+    """A run of the baseline Splatter Image."""
+    from conftest import made
+
+    given = ["fit", "experiment=toy_var", "model=splatter_image", f"data.root={pipeline.toy}", *QUICK, "test=false"]
+    return built_once("splatter", lambda folder: made(folder / "run", *given, "regressor.channels=[8,16,16]")) / "run"
+
+
+@pytest.fixture
+def run(pipeline, request):
+    return {"var": pipeline.var, "diffusion": pipeline.diffusion}.get(request.param) or request.getfixturevalue(
+        "splatter"
+    )
+
+
+def scenes(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted(folder.glob("sample_*.ply"))]
+
+
+@pytest.mark.parametrize(("run", "samples"), [("var", 1), ("splatter", 1), ("diffusion", 2)], indirect=["run"])
+def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(command, pipeline, tmp_path, run, samples):
+    photograph = pipeline.photograph()
+    found = []
+    for weights in (run, run / "weights", run / "checkpoints/last.ckpt"):
+        out = tmp_path / str(len(found))
+        finished = command("predict", f"image={photograph}", f"weights={weights}", "samples=2", f"out={out}", *FEW)
+        assert finished.status == 0, finished.err
+        assert ("one answer for each picture" in finished.out) == (samples == 1)
+        found.append(scenes(out / photograph.stem))
+        assert strict_json(out / photograph.stem / "scene.json")["settings"]["samples"] == samples
+        assert settings_of(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
+    assert len(found[0]) == samples
+    assert found[0] == found[1] == found[2]
+
+
+@pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)
+def test_a_scene_of_stage_one_is_what_its_test_scores(pipeline, run):
+    model = CompleteSplat.from_pretrained(run)
+    assert isinstance(model, OneAnswer)
+    assert not model.draws_samples
+    module, data = Trained(str(run / "checkpoints/last.ckpt"), [f"data.root={pipeline.toy}"], trust=True).open()
+    data.setup("test")
+    batch = next(iter(data.test_dataloader()))
+    with torch.no_grad():
+        expected = module.eval().reconstruct(batch)
+        found = model.generate(batch.reference.images, batch.reference.cameras, batch.depth_range)
+    for name, values in vars(expected).items():
+        torch.testing.assert_close(getattr(found, name), values)
+    camera = data.typical_camera()
+    assert model.fov_degrees.item() == pytest.approx(camera.fov_degrees)
+    assert model.depth_range.tolist() == pytest.approx(camera.depth_range)
+    assert model.up.tolist() == pytest.approx(camera.up)
+    with pytest.raises(CompleteSplatError, match="samples=2: this model draws none, it gives one answer"):
+        model(pipeline.photograph(), samples=2)
+
+
+def test_what_is_hidden_has_no_influence_on_stage_one(pipeline):
+    model = CompleteSplat.from_pretrained(pipeline.var)
+    photograph = model.read(pipeline.photograph())
+    visible = torch.ones(1, 32, 32)
+    visible[..., 16:] = 0
+    changed = copy.deepcopy(photograph)
+    changed.image[..., 16:] = 0.3
+    assert torch.equal(model(photograph, visible)[0].means, model(changed, visible)[0].means)
+    assert not torch.equal(model(photograph)[0].means, model(changed)[0].means)
+
+
+def test_weights_of_stage_one_are_scored_as_its_checkpoint_is(command, pipeline, tmp_path):
+    data = ["data=toy_objects", f"data.root={pipeline.toy}", "data.evaluation_targets=2", "trainer.accelerator=cpu"]
+    finished = command("test", f"weights={pipeline.var}", *data, f"out={tmp_path / 'test'}")
+    assert finished.status == 0, finished.err
+    scores, own = (strict_json(path / "metrics.json") for path in (tmp_path / "test", pipeline.var))
+    novel, expected = (found["model"]["full"]["novel"] for found in (scores, own["test"]))
+    assert novel["psnr"] == pytest.approx(expected["psnr"], abs=1e-3)
+
+
+def test_another_sampler_is_refused_where_nothing_is_drawn(command, pipeline, tmp_path):
+    given = [f"image={pipeline.photograph()}", f"weights={pipeline.var}", "sampler=dpm20", f"out={tmp_path / 'out'}"]
+    refused = command("predict", *given)
+    assert (refused.status, refused.err.count("\n")) == (2, 1)
+    assert "these weights draw no samples: leave out sampler" in refused.err
+
+
+def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_given(command, pipeline, tmp_path):
+    fitting = ["model=per_scene", "model.fitting.count=300", "model.fitting.steps=3"]
+    run = tmp_path / "run"
+    settings = [f"data.root={pipeline.toy}", *QUICK, *fitting, f"out={run}"]
+    assert command("fit", "experiment=toy_var", *settings).status == 0
+    (folder,) = (run / "scenes").iterdir()
+    assert {path.name for path in folder.iterdir()} == {"scene.ply", "sheet.png", "scene.json"}
+    assert 0 < read_ply(folder / "scene.ply").count <= 300
+    Image.open(folder / "sheet.png").verify()
+    assert strict_json(folder / "scene.json")["settings"]["scene"] in folder.name
+    assert settings_of(run) == {"scene": str(folder)}
+    refused = command("predict", f"image={pipeline.photograph()}", f"weights={run}", f"out={tmp_path / 'out'}")
+    assert (refused.status, refused.err.count("\n")) == (2, 1)
+    assert "PerScene" in refused.err
+    assert f"{run / 'scenes'}" in refused.err
+
+
+def test_the_viewer_shows_the_one_answer(command, pipeline, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    given = [
+        pipeline.photograph(),
+        f"weights={pipeline.var}",
+        "samples=2",
+        "export=page.html",
+        f"out={tmp_path / 'out'}",
+    ]
+    shown = command("view", *map(str, given))
+    assert shown.status == 0, shown.err
+    assert "one answer for each picture" in shown.out
+    assert (tmp_path / "page.html").is_file()
+
+
+@pytest.fixture
+def strangers(pipeline, tmp_path):
+    """A copy of stage 1's run without weights."""
+    shutil.copytree(pipeline.var, tmp_path / "run", ignore=shutil.ignore_patterns("weights", "pictures"))
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("place", ["model.model", "model.model.encoder", "model.model.encoder.channels", "model"])
+def test_a_checkpoint_names_nothing_but_parts_of_a_model(strangers, tmp_path, monkeypatch, place):
+    (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\nclass Trap: pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    config = OmegaConf.load(strangers / "config.yaml")
+    OmegaConf.update(config, place, {"_target_": "trap.Trap"}, merge=False)
+    OmegaConf.save(config, strangers / "config.yaml")
+    for path in (strangers, strangers / "checkpoints/last.ckpt"):
+        with pytest.raises(WeightsError, match=r"trap\.Trap|must be a list"):
+            CompleteSplat.from_pretrained(path)
+    assert not (tmp_path / "sprung").exists()
+    assert "trap" not in sys.modules
+
+
+def test_a_checkpoint_of_another_architecture_or_without_its_camera_is_refused(strangers):
+    config = OmegaConf.load(strangers / "config.yaml")
+    config.model.model.encoder.latent_channels = 512
+    OmegaConf.save(config, strangers / "config.yaml")
+    with pytest.raises(WeightsError, match=r"network\.encoder.*in last.ckpt and .* by config.yaml"):
+        CompleteSplat.from_pretrained(strangers)
+    (strangers / "config.yaml").unlink()
+    with pytest.raises(WeightsError, match=r"configuration .* is missing"):
+        CompleteSplat.from_pretrained(strangers / "checkpoints/last.ckpt")
+
+
+def test_weights_of_one_answer_name_nothing_foreign(pipeline, tmp_path):
+    shutil.copytree(pipeline.var / "weights", tmp_path / "weights")
+    (tmp_path / "weights" / SUMS_FILE).unlink()
+    written = json.loads((tmp_path / "weights" / CONFIG_FILE).read_text())
+    for changed in ({"network": {"_target_": "os.system"}}, {"more": 1}, {"image_size": 10**6}):
+        (tmp_path / "weights" / CONFIG_FILE).write_text(json.dumps(written | changed))
+        with pytest.raises(WeightsError, match=CONFIG_FILE):
+            CompleteSplat.from_pretrained(tmp_path / "weights")
+
+
+def test_a_network_of_the_users_own_is_trained_and_not_exported(tmp_path, caplog):
+    config = compose_config("fit", "experiment=toy_var", *SMALL, "out=RUN")
+    module = instantiate(config.model, _convert_="all")
+    config.model.model._target_, module.camera = "mine.Network", {}
+    export_weights(config, module, None, tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
+    assert "mine.Network" in caplog.text

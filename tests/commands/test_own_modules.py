@@ -1,0 +1,172 @@
+"""Modules and settings of the user's own, in the working folder, as the documents describe them."""
+
+import os
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from support import SMALL, strict_json
+from written_commands import ROOT
+
+from completesplat.commands.jobs import composed, split_config_dir
+
+MINE = """
+from torch import nn
+
+class MyLoss(nn.Module):
+    def forward(self, prediction, truth):
+        return (prediction.images - truth.images).abs().mean()
+"""
+ABLATION = "# @package _global_\nloss: {terms: {ssim: null}}\n"
+OWN_TERM = ["ablation=mine", "+loss.terms.mine.weight=0.1", "+loss.terms.mine.term._target_=mine.MyLoss"]
+KINDS = ["loss", "rasterizer", "dataset", "ablation", "experiment"]
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """A folder with a module of the user's own and an ablation."""
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "conf/ablation").mkdir(parents=True)
+    (tmp_path / "conf/ablation/mine.yaml").write_text(ABLATION)
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+def test_a_loss_and_an_ablation_of_the_working_folder_are_trained_with_and_the_run_is_tested(command, own, toy_root):
+    settings = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    trained = command("fit", "experiment=toy_var", *OWN_TERM, *settings, "out=RUN")
+    assert trained.status == 0, trained.err
+    terms = OmegaConf.load(own / "RUN/config.yaml").loss.terms
+    assert (terms.ssim, terms.mine.term._target_) == (None, "mine.MyLoss")
+    assert "train/mine" in (own / "RUN/metrics.csv").read_text().splitlines()[0]
+    given = ["ckpt=RUN/checkpoints/last.ckpt", "trainer.accelerator=cpu"]
+    tested = command("test", *given, "out=TEST")
+    assert tested.status == 0, tested.err
+
+
+def test_a_misspelt_module_is_one_line(command, own):
+    refused = command("fit", "experiment=toy_var", "rasterizer._target_=missing_module.Mine", "out=RUN")
+    assert refused.status == 2
+    assert refused.err.startswith("error: Error loading 'missing_module.Mine': ModuleNotFoundError")
+    assert refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("flag", [["--config-dir", "more"], ["--config-dir=more"], ["-cd", "more"]])
+def test_a_folder_of_settings_is_added_to_those_of_the_package_wherever_it_is_named(command, own, toy_root, flag):
+    (own / "more/data").mkdir(parents=True)
+    (own / "more/data/mine.yaml").write_text(f"defaults: [toy_objects]\nroot: {toy_root}\nimage_size: 32\n")
+    checked = command("data", "check", *flag, "data=mine", "workers=1", "out=OUT")
+    assert checked.status == 0, checked.err
+    assert strict_json(own / "OUT/check.json")["usable"]["sequences"] == 4
+    missing = command("data", "check", "--config-dir", "nowhere", "data=mine")
+    assert (missing.status, missing.err.count("\n")) == (2, 1)
+    assert "nowhere' not found" in missing.err
+
+
+def test_the_packages_settings_come_first_and_those_of_the_working_folder_are_found_by_every_verb(own, monkeypatch):
+    monkeypatch.chdir(own)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (own / "conf/rasterizer").mkdir()
+    (own / "conf/rasterizer/mine.yaml").write_text("_target_: mine.Mine\n")
+    (own / "conf/rasterizer/reference.yaml").write_text("_target_: mine.Mine\n")
+    for verb in ("fit", "test", "predict", "view"):
+        assert composed(verb, "rasterizer=mine").rasterizer._target_ == "mine.Mine"
+    assert composed("fit", "rasterizer=reference").rasterizer._target_.startswith("completesplat.")
+
+
+def test_where_a_folder_of_settings_is_named_does_not_matter():
+    assert split_config_dir(["a=1", "-cd", "b", "c=2"]) == (["--config-dir=b"], ["a=1", "c=2"])
+    assert split_config_dir(["x", "--config-dir=a=b"]) == (["--config-dir=a=b"], ["x"])
+
+
+def test_modules_of_the_working_folder_stand_in_for_no_others(command, own):
+    (own / "json.py").write_text("raise RuntimeError('not the one of the standard library')\n")
+    (own / "rich.py").write_text("raise RuntimeError('not the one that is installed')\n")
+    program = "import sys; sys.argv[1:] = ['doctor', 'out=OUT']; from completesplat.cli import main; main()"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"}
+    done = subprocess.run([sys.executable, "-c", program], cwd=own, env=environment, capture_output=True, text=True)
+    assert "not the one" not in done.stderr
+
+
+def test_what_is_begun_runs_as_it_is_written(command, own):
+    for kind in KINDS:
+        finished = command("new", kind, f"my_{kind}", "out=OUT")
+        assert finished.status == 0, finished.err
+        written = [line for line in finished.out.splitlines()[:-1] if not line.startswith("next: ")]
+        assert all((own / name).is_file() for name in written)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    program = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *sorted(own.glob("test_*.py"))]
+    done = subprocess.run(program, cwd=own, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+    assert "6 passed" in done.stdout
+    again = command("new", "loss", "my_loss", "out=OUT")
+    assert (again.status, again.err.count("\n")) == (2, 1)
+    assert "is there already" in again.err
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["loss"], "name is needed: give name=VALUE"),
+        (["thing", "mine"], "kind=thing: choose one of loss, rasterizer, dataset, ablation, experiment"),
+        (["loss", "a-b"], "name=a-b: must be a name of Python's"),
+        (["loss", "class"], "name=class: must be a name of Python's"),
+        (["loss", "json"], "name=json: there is a module of this name"),
+        (["loss", "completesplat"], "name=completesplat: there is a module of this name"),
+        (["ablation", "full"], "name=full: the package has conf/ablation/full.yaml"),
+        (["loss", "a", "b"], "give one kind and one name"),
+    ],
+)
+def test_what_cannot_be_begun_is_refused(command, own, given, said):
+    refused = command("new", *given, "out=OUT")
+    assert refused.status == 2
+    assert refused.err.startswith(f"error: {said}")
+    assert {path.name for path in own.iterdir()} <= {"mine.py", "conf", "OUT"}
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_does_what_the_documents_say_in_every_process(own, toy_root):
+    """Two training processes, worker processes that load data, and a job in a process of submitit's."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", own / "dist", ROOT], check=True)
+    venv.create(own / "env", with_pip=True)
+    installed = next((own / "env").glob("lib/python*/site-packages"))
+    # What the wheel requires is there already.
+    (installed / "parent.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("site-packages")))
+    (wheel,) = (own / "dist").glob("*.whl")
+    subprocess.run([own / "env/bin/python", "-m", "pip", "install", "-q", "--no-deps", wheel], check=True)
+    work = own / "work"
+    work.mkdir()
+    for name in ("mine.py", "conf"):
+        (own / name).rename(work / name)
+
+    def run(*arguments: str) -> None:
+        done = subprocess.run(
+            [own / "env/bin/completesplat", *arguments], cwd=work, env=environment, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    run("new", "dataset", "pictures")
+    subprocess.run([own / "env/bin/python", "-c", "import test_dataset_pictures as t; t.write('DATA')"], cwd=work)
+    pictures = ["data=pictures", "data.root=DATA", "data.image_size=32"]
+    run("data", "check", *pictures, "workers=2", "out=CHECK")
+    toys = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    processes = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "data.workers=1"]
+    run("fit", "experiment=toy_var", *OWN_TERM, *toys, *processes, "out=RUN")
+    run("fit", "-m", "experiment=toy_var", *OWN_TERM, *toys, "seed=0,1", "out=SWEEP")
+    run(
+        "fit",
+        "-m",
+        "experiment=toy_var",
+        *OWN_TERM,
+        *toys,
+        "seed=choice(0)",
+        "hydra/launcher=submitit_local",
+        "out=JOBS",
+    )
+    for job in ("RUN", "SWEEP/seed-0", "SWEEP/seed-1", "JOBS/seed-0"):
+        assert strict_json(work / job / "metrics.json")["steps"] == 2
+        assert Path(work / job / "run.json").is_file()

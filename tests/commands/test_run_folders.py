@@ -1,0 +1,117 @@
+"""One process at a time in a run's folder, and a run goes on with the data that it began with."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from omegaconf import OmegaConf
+from support import SMALL, script, strict_json
+
+from completesplat.data.toy import write_objects
+from completesplat.training.reconstruction import ReconstructionModule
+
+# Its child, as a loader's worker, outlives it for a while.
+HOLDER = """
+import os, sys, time
+from pathlib import Path
+from completesplat.commands.jobs import alone_in
+with alone_in(Path(sys.argv[1])):
+    if os.fork() == 0:
+        time.sleep(60)
+        os._exit(0)
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that is at work in the folder `run`."""
+    (tmp_path / "run").mkdir()
+    program = [sys.executable, "-c", HOLDER, str(tmp_path / "run")]
+    process = subprocess.Popen(program, stdout=subprocess.PIPE, start_new_session=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"held\n"
+    yield process
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_second_process_is_refused_until_the_first_is_gone(command, toy_root, tmp_path, holder):
+    given = ["data", "stats", "data=toy_objects", f"data.root={toy_root}", f"out={tmp_path}/run"]
+    refused = command(*given)
+    assert refused.status == 2
+    named = f"process {holder.pid} on {os.uname().nodename}"
+    assert refused.err.startswith(f"error: {tmp_path}/run: {named} is at work in it: ")
+    assert refused.err.count("\n") == 1
+    assert not (tmp_path / "run/config.yaml").exists()
+
+    os.kill(holder.pid, signal.SIGKILL)
+    holder.wait()
+    for _ in range(2):  # also after a process that ended by itself
+        assert command(*given).status == 0
+    assert (tmp_path / "run/.lock").read_text().split()[0] == str(os.getpid())
+
+
+FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=4", "trainer.log_every_n_steps=1"]
+FIT += ["callbacks.pictures=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
+
+
+@pytest.mark.slow
+def test_two_trainings_in_one_folder(toy_root, tmp_path):
+    """The second is refused, the first is whole; after a kill the next one goes on at once."""
+    run = tmp_path / "run"
+    given = ["fit", *FIT, f"data.root={toy_root}", f"out={run}", "trainer.max_steps=20", "data.workers=1"]
+    program = [sys.executable, str(script(tmp_path)), *given]
+    for killed in (True, False):
+        first = subprocess.Popen(program, stdout=subprocess.DEVNULL, start_new_session=True)
+        while not (run / "checkpoints/last.ckpt").exists() or str(first.pid) not in (run / ".lock").read_text():
+            assert first.poll() is None
+            time.sleep(0.05)
+        first.send_signal(signal.SIGSTOP)
+        second = subprocess.run(program, capture_output=True, text=True)
+        first.send_signal(signal.SIGCONT)
+        assert second.returncode == 2
+        assert second.stderr.startswith(f"error: {run}: process {first.pid} on ")
+        if killed:
+            first.kill()  # its worker lives on for seconds
+        assert first.wait() == (-signal.SIGKILL if killed else 0)
+    with (run / "metrics.csv").open() as file:
+        assert [int(row["step"]) for row in csv.DictReader(file) if row["train/mse"]] == list(range(20))
+
+
+def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tmp_path, monkeypatch):
+    root, run = tmp_path / "data", tmp_path / "run"
+    write_objects(root, scenes=4, frames=4, size=32, seed=0, workers=1, progress=False)
+    given = ["fit", *FIT, "data=co3d_category", "data.category=toy_objects", "data.subset=null", "data.workers=0"]
+    given += ["data.val_fraction=0.25", "data.test_fraction=0.25", f"data.root={root}", f"out={run}"]
+    step = ReconstructionModule.training_step
+
+    def interrupted(self, *inputs):
+        if self.global_step == 2:
+            raise KeyboardInterrupt
+        return step(self, *inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ReconstructionModule, "training_step", interrupted)
+        assert command(*given).status == 130
+    more = tmp_path / "more"
+    write_objects(more, scenes=8, frames=4, size=32, seed=0, workers=1, progress=False)
+    root.rename(tmp_path / "before")
+    more.rename(root)
+
+    refused = command(*given)
+    assert refused.status == 2
+    said = f"{root}: not the training data that this run had before (2 sequences then, 5 now)"
+    assert refused.err == f"error: {said}; data.allow_changed=true goes on with these\n"
+    went_on = command(*given, "data.allow_changed=true")
+    assert went_on.status == 0, went_on.err
+    assert said in (run / "commands.log").read_text()
+    assert strict_json(run / "metrics.json")["steps"] == 4
+    assert OmegaConf.load(run / "config.yaml").data.allow_changed
+    assert "finished before" in command(*given).out

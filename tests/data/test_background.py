@@ -1,0 +1,126 @@
+"""Objects cut out of their background, by a stand-in for rembg; what tells pictures of one kind from others."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage
+import torch
+from PIL import Image
+
+from completesplat.data.pictures.photograph import picture_features, read_photograph
+from completesplat.data.toy.module import ToyObjectsDataModule
+from completesplat.errors import CompleteSplatError, ImageError
+
+
+def picture(path: Path, background: str = "red") -> Path:
+    """A blue square in the upper left quarter of what EXIF says is upside down."""
+    image = Image.new("RGB", (32, 32), background)
+    image.paste("blue", (0, 0, 16, 16))
+    exif = Image.Exif()
+    exif[274] = 3
+    image.save(path, exif=exif)
+    return path
+
+
+def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
+    found = read_photograph(picture(tmp_path / "a.png"), 32, remove_background=True).image
+    expected = torch.ones(3, 32, 32)
+    expected[:2, 16:, 16:] = 0
+    assert torch.equal(found, expected)
+    read_photograph(tmp_path / "a.png", 16, remove_background=True)
+    assert rembg.sessions == ["u2net"]  # loaded once, and not rembg's own choice
+    assert read_photograph(tmp_path / "a.png", 32).image[0, 0, 0] == 1
+    assert read_photograph(tmp_path / "a.png", 32).image[1, 0, 0] == 0
+
+
+def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_square(rembg, tmp_path):
+    image = Image.new("RGB", (64, 32), "red")
+    image.paste("blue", (2, 4, 14, 10))  # left of the central square
+    image.save(tmp_path / "a.png")
+    with pytest.raises(ImageError, match="leaves nothing"):
+        read_photograph(tmp_path / "a.png", 24, remove_background=True)
+    found = read_photograph(tmp_path / "a.png", 24, remove_background=True, background=0.0, object_share=0.5).image
+    expected = torch.zeros(3, 24, 24)
+    expected[2, 9:15, 6:18] = 1
+    assert torch.equal(found, expected)
+
+
+def test_an_object_as_long_as_a_picture_may_be_is_reduced_before_its_square_is_made(tmp_path):
+    Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
+    found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
+    assert found[0, 0].min() > 0.9  # white above the line
+    deep = Image.fromarray(np.full((16, 16), 40_000, np.uint16))
+    deep.save(tmp_path / "deep.png", transparency=40_000)
+    assert read_photograph(tmp_path / "deep.png", 16, object_share=0.5).image.min() == 1
+
+
+def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch):
+    picture(tmp_path / "a.png")
+
+    def offline(name):
+        raise OSError("no route to host\nand more")
+
+    monkeypatch.setattr(rembg, "new_session", offline)
+    with pytest.raises(CompleteSplatError, match=r"fails with its network u2net \(no route to host\)$"):
+        read_photograph(tmp_path / "a.png", 16, remove_background=True)
+    monkeypatch.setitem(sys.modules, "rembg", None)
+    with pytest.raises(CompleteSplatError, match=r'needs rembg .* pip install "completesplat\[background\]"'):
+        read_photograph(tmp_path / "a.png", 16, remove_background=True)
+
+
+def test_a_picture_without_an_object_is_refused(rembg, tmp_path):
+    Image.new("RGB", (32, 32), "red").save(tmp_path / "a.png")
+    with pytest.raises(ImageError, match=r"a\.png: background=remove leaves nothing"):
+        read_photograph(tmp_path / "a.png", 16, remove_background=True)
+
+
+def test_features_are_colours_their_spread_and_how_fine_they_are():
+    image = torch.zeros(3, 4, 4)
+    image[0], image[1, :, 2:], image[2, 1::2] = 0.25, 1, 1
+    expected = [0.25, 0.5, 0.5, 0, 0.5, 0.5, 1 / 9, 1 / 3]  # green has one step in three, blue three of three
+    torch.testing.assert_close(picture_features(image), torch.tensor(expected))
+    assert picture_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
+
+
+@pytest.fixture
+def toys(toy_root):
+    return ToyObjectsDataModule(str(toy_root), scenes=4, frames=4, image_size=32, box_masks={"probability": 0.25})
+
+
+def test_data_say_what_weights_are_to_know_of_them(toys):
+    facts = toys.training_facts()
+    assert facts["box_masks"] == 0.25
+    store = toys.store("train")
+    sequences = [toys.source("train").read(name) for name in store.names]
+    pictures = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255
+    features = picture_features(pictures)
+    assert facts["picture_mean"] == pytest.approx(features.mean(0).tolist())
+    assert facts["picture_std"] == pytest.approx(features.std(0, correction=0).clamp(min=1e-3).tolist())
+
+
+@pytest.mark.slow
+def test_photographs_lie_far_from_toy_objects_and_other_toy_objects_near(tmp_path):
+    """Of 60 toy objects never seen none may be called far; of photographs all are."""
+    size = {"scenes": 200, "frames": 4, "image_size": 64}
+    toys = ToyObjectsDataModule(str(tmp_path), **size)
+    toys.prepare_data()
+    facts, store = toys.training_facts(), toys.store("test")
+    mean, deviation = (torch.tensor(facts[name]) for name in ("picture_mean", "picture_std"))
+    own = torch.stack([store.image(store.source.read(name), 0) for name in store.names]).float() / 255
+    folder = Path(skimage.__file__).parent / "data"
+    names = [
+        "astronaut.png",
+        "chelsea.png",
+        "coffee.png",
+        "motorcycle_left.png",
+        "rocket.jpg",
+        "retina.jpg",
+        "camera.png",
+    ]
+    photographs = torch.stack([read_photograph(folder / name, 64).image for name in names])
+    near, far = (
+        ((picture_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
+    )
+    assert near.max() < 2 < far.min()

@@ -1,0 +1,272 @@
+"""Damaged files, for every reader of files that strangers make: it returns or refuses, in bounded memory and time.
+
+`make fuzz` gives each reader as long as it is told; here it gets a few files, the same every time. What broke one is
+kept beside it.
+"""
+
+import copy
+import gzip
+import io
+import json
+import shutil
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET
+from co3d_trees import write_tree as write_category
+from fuzzing import (
+    CLEAR,
+    damaged,
+    damaged_json,
+    damaged_parts,
+    fuzz,
+    gzipped,
+    json_bytes,
+    png_of,
+    png_parts,
+    zip_of,
+    zip_parts,
+)
+from hypothesis import strategies as st
+from PIL import Image, ImageCms
+from realestate10k_trees import make_clip, write_chunk_form
+from support import some_gaussians, write_capture
+
+from completesplat.data.co3d.module import CO3DDataModule
+from completesplat.data.importing import import_capture
+from completesplat.data.importing.capture import read_picture
+from completesplat.data.pictures.crop import Square
+from completesplat.data.pictures.exif import ORIENTATION
+from completesplat.data.pictures.files import decode, picture_size, read_depth
+from completesplat.data.pictures.photograph import read_photograph
+from completesplat.data.realestate10k.chunks import ChunkedClips
+from completesplat.data.validation import read_points
+from completesplat.errors import CompleteSplatError
+from completesplat.export.ply import read_ply, write_ply
+from completesplat.generation import CompleteSplat
+from completesplat.weights import CONFIG_FILE, SUMS_FILE
+
+pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")
+PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
+COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
+MOST_MEMORY_OF_A_PICTURE = 2**31  # of 50 million pixels, which are allowed
+
+
+def each(*reads: Any) -> None:
+    """Call readers of the same file, whichever of them refuse it."""
+    for read in reads:
+        with suppress(CompleteSplatError):
+            read()
+
+
+def encoded(pixels: np.ndarray, form: str, mode: str | None = None, **options: Any) -> bytes:
+    file, picture = io.BytesIO(), Image.fromarray(pixels)
+    (picture if mode is None else picture.convert(mode)).save(file, form, **options)
+    return file.getvalue()
+
+
+def pictures() -> dict[str, list[bytes]]:
+    """Small files of all formats and most modes, by format."""
+    rgb, grey, alpha = PIXELS[..., :3], PIXELS[..., 0], PIXELS[..., 3].astype(np.uint16) * 200
+    record = Image.Exif()
+    record[ORIENTATION] = 6
+    record.get_ifd(0x8769)[0xA405] = 35
+    more = {"exif": record.tobytes(), "icc_profile": ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()}
+    return {
+        "PNG": [
+            *(encoded(rgb, "PNG", mode) for mode in (None, "P", "1", "L", "LA", "RGBA")),
+            *(encoded(part, "PNG") for part in (alpha, PIXELS)),
+            *(encoded(rgb, "PNG", "P", transparency=3), encoded(rgb, "PNG", **more)),
+            encoded(rgb, "PNG", save_all=True, append_images=[Image.fromarray(rgb[::-1])]),
+        ],
+        "JPEG": [encoded(rgb, "JPEG", mode) for mode in (None, "L", "CMYK")]
+        + [encoded(rgb, "JPEG", progressive=True, **more)],
+        "TIFF": [
+            encoded(rgb, "TIFF", compression=kind)
+            for kind in (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
+        ]
+        + [encoded(part, "TIFF") for part in (grey, alpha, grey.astype(np.float32) / 255, PIXELS)],
+        "others": [
+            *(encoded(rgb, form) for form in ("BMP", "GIF", "PPM", "JPEG2000", "WEBP", "AVIF", "MPO")),
+            *(encoded(PIXELS, "WEBP", lossless=True, **more), encoded(grey, "BMP"), encoded(rgb, "BMP", "P")),
+        ],
+    }
+
+
+def test_pictures(tmp_path):
+    files, path = pictures(), tmp_path / "a"
+
+    def read_pictures(content: bytes) -> None:
+        path.write_bytes(content)
+        calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
+        calls += [
+            partial(picture_size, path, "a"),
+            partial(read_depth, path, 1.0),
+            partial(read_picture, path, (12, 16)),
+        ]
+        each(*calls, partial(read_photograph, path, 16))
+
+    depth = np.full((12, 16), 4.0, np.float16).view(np.uint16)
+    parts = [png_parts(content) for content in (*files["PNG"], encoded(depth, "PNG"))]
+    every = st.one_of(*map(damaged, files.values()), damaged_parts(parts, png_of))
+    for content in (content for several in files.values() for content in several):
+        read_pictures(content)
+    fuzz(every, read_pictures, examples=60, most_memory=MOST_MEMORY_OF_A_PICTURE)
+
+
+HEADER = b"""ply
+format ascii 1.0
+comment a
+element camera 1
+property double focal
+element vertex 2
+property float x
+property double y
+property int z
+property uchar red
+element face 1
+property list uchar int vertex_indices
+end_header
+1.5
+0 1 2 3
+4 5.5e3 nan -1
+3 0 1 2
+"""
+
+
+def test_ply(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, some_gaussians(1)[0])
+    splats = path.read_bytes()
+
+    def read_plys(content: bytes) -> None:
+        path.write_bytes(content)
+        each(partial(read_ply, path), partial(read_points, path))
+
+    seeds = [splats, splats.replace(b"little_endian", b"big_endian"), HEADER]
+    words = st.lists(
+        st.sampled_from([*HEADER.split(b"\n"), *HEADER.split(), *splats[:600].split(b"\n"), b"\n", b" ", b"\n" * 3]),
+        max_size=30,
+    )
+    fuzz(damaged(seeds) | words.map(lambda found: b"ply\n" + b"\n".join(found)), read_plys, examples=60)
+
+
+def test_annotations(tmp_path):
+    category = write_category(tmp_path, {"a": 3, "b": 2, "c": 2}, {"train": ["a"], "val": ["b"], "test": ["c"]})
+    files = {name: (category / name).read_bytes() for name in (FRAMES, SEQUENCES, SET_LIST)}
+    packed = {name: name.endswith(".jgz") for name in files}
+    contents = {
+        name: json.loads(gzip.decompress(content) if packed[name] else content) for name, content in files.items()
+    }
+
+    def read_annotations(changed: tuple[str, bytes]) -> None:
+        for name, content in files.items():
+            (category / name).write_bytes(changed[1] if changed[0] == name else content)
+        for subset in (SUBSET, None):
+            data = CO3DDataModule(str(tmp_path), CATEGORY, subset, image_size=8, batch_size=2, targets=1)
+            for split in ("train", "test"):
+                with suppress(CompleteSplatError):
+                    source = data.source(split)
+                    for name in source.names:
+                        each(partial(source.read, name))
+                        each(lambda name=name, source=source: source.read(name).read(0))
+
+    def of(name: str) -> st.SearchStrategy[tuple[str, bytes]]:
+        whole = damaged_json([contents[name]]).map(json_bytes)
+        changed = (whole.map(gzipped) if packed[name] else whole) | damaged([files[name]])
+        return st.tuples(st.just(name), changed)
+
+    huge = copy.deepcopy(contents[FRAMES])
+    huge[0]["image"]["size"] = [10**400, 24]
+    cases = [(FRAMES, gzipped(json_bytes(huge)))]
+    fuzz(st.one_of(*map(of, files)), read_annotations, cases, examples=20)
+
+
+def test_chunks(tmp_path):
+    write_chunk_form(tmp_path, [make_clip("a", frames=3), make_clip("b", frames=2)])
+    index, chunk = tmp_path / "index.json", tmp_path / "000000.torch"
+    table, stored = json.loads(index.read_text()), chunk.read_bytes()
+
+    def read_chunks(changed: tuple[bytes, bytes]) -> None:
+        index.write_bytes(changed[0])
+        chunk.write_bytes(changed[1])
+        clips = ChunkedClips(tmp_path)
+        for key in clips.keys:
+            with suppress(CompleteSplatError):
+                clip = clips.clip(key)
+                clip.read(0, Square(0, 0, 18), 8)
+
+    whole = st.just(json_bytes(table))
+    chunks = damaged([stored]) | damaged_parts([zip_parts(stored)], zip_of)
+    indices = (damaged_json([table]).map(json_bytes) | damaged([json_bytes(table)])).map(lambda text: (text, stored))
+    cases = [(json_bytes({"a": "x" * 5000}), stored)]
+    fuzz(st.tuples(whole, chunks) | indices, read_chunks, cases, examples=60)
+
+
+def test_weights(tiny_weights, tmp_path):
+    folder = shutil.copytree(tiny_weights, tmp_path / "weights")
+    (folder / SUMS_FILE).unlink()
+    text = (folder / CONFIG_FILE).read_bytes()
+
+    def read_weights(content: bytes) -> None:
+        (folder / CONFIG_FILE).write_bytes(content)
+        CompleteSplat.from_pretrained(folder)
+
+    fuzz(damaged_json([json.loads(text)]).map(json_bytes) | damaged([text]), read_weights, examples=30)
+
+
+def test_transforms(tmp_path):
+    capture = tmp_path / "capture"
+    write_capture(capture, 6)
+    path = capture / "transforms.json"
+    write_ply(capture / "points.ply", some_gaussians(1)[0])
+    content = json.loads(path.read_text())
+    lens = {"fl_x": 20.0, "fl_y": 21.0, "cx": 8.0, "cy": 6.0, "w": 16, "h": 12, "k1": 0.01, "k2": 0.0, "p1": 0, "p2": 0}
+    lens |= {"camera_model": "OPENCV", "ply_file_path": "points.ply"}
+    content["frames"][0] |= {"mask_path": "frame1.png", "k3": 0.001}
+
+    def read_transforms(changed: bytes) -> None:
+        path.write_bytes(changed)
+        out = tmp_path / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        import_capture(out, "desk", transforms=path, progress=False)
+
+    fuzz(damaged_json([content, content | lens]).map(json_bytes) | damaged([json_bytes(content)]), read_transforms)
+
+
+def test_colmap(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    write_capture(tmp_path / "images", 6)
+    model = tmp_path / "sparse"
+    model.mkdir()
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 20.0, 16, 12)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for number in range(6):
+        image = pycolmap.Image()
+        image.name, image.camera_id, image.image_id = f"frame{number}.png", 1, number + 1
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), [0, 0, number]))
+    for number in range(3):
+        reconstruction.add_point3D(np.full(3, float(number)), pycolmap.Track(), np.full(3, 9, dtype=np.uint8))
+    reconstruction.write_binary(str(model))
+    files = {path.name: path.read_bytes() for path in model.iterdir()}
+
+    def read_models(changed: tuple[str, bytes]) -> None:
+        for name, content in files.items():
+            (model / name).write_bytes(changed[1] if changed[0] == name else content)
+        out = tmp_path / "out"
+        shutil.rmtree(out, ignore_errors=True)
+        import_capture(out, "desk", colmap=model, images=tmp_path / "images", progress=False)
+
+    def claimed(name: str, place: int, size: int) -> tuple[str, bytes]:
+        """A file that says it has as many of something as numbers of so many bytes can say."""
+        return name, files[name][:place] + b"\xff" * size + files[name][place + size :]
+
+    read_models(("", b""))
+    tracks, records = claimed("points3D.bin", 8 + 43, 8), [claimed(name, 0, 8) for name in files]
+    cases = [tracks, *records, claimed("rigs.bin", 8 + 4, 4), claimed("frames.bin", 8 + 64, 4)]
+    changed = st.sampled_from(sorted(files)).flatmap(lambda name: st.tuples(st.just(name), damaged([files[name]])))
+    fuzz(changed, read_models, cases)

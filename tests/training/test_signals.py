@@ -1,0 +1,128 @@
+"""A signal ends training after the step that it came in; what goes on from there is as if there had been none."""
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import pytest
+import torch
+from small_runs import STEPS, Logging, fit, rows
+
+from completesplat.signals import ENDING, Interrupted, ended_by_signals, received
+from completesplat.training.checkpoints import read_checkpoint
+from completesplat.training.stopping import stopped_together
+
+pytestmark = pytest.mark.usefixtures("plain_signals")
+NEVER = 500  # steps between checkpoints
+
+
+class Signalled(Logging):
+    """Gets a signal in its eighth step, in the first of its batches."""
+
+    number = signal.SIGINT
+
+    def training_step(self, batch, index):
+        if self.global_step == 7 and received() is None:
+            os.kill(os.getpid(), self.number)
+        return super().training_step(batch, index)
+
+
+def interrupted(folder, number, **settings):
+    model = type("Signalled", (Signalled,), {"number": number})
+    before = [signal.getsignal(one) for one in ENDING]
+    with pytest.raises(Interrupted) as stop, stopped_together(), ended_by_signals():
+        fit(folder, every=NEVER, model=model, **settings)
+    assert stop.value.code == 128 + number
+    assert [signal.getsignal(one) for one in ENDING] == before
+
+
+def saved(folder):
+    return read_checkpoint(folder / "checkpoints/last.ckpt")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    fit(folder, every=NEVER)
+    return folder
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_loses_nothing_of_the_steps_before_it(whole, tmp_path, number):
+    interrupted(tmp_path, number)
+    assert saved(tmp_path)["global_step"] == 8
+    assert rows(tmp_path) == rows(whole)[: len(rows(tmp_path))]
+    fit(tmp_path, every=NEVER)
+    assert rows(tmp_path) == rows(whole)
+    expected, found = saved(whole), saved(tmp_path)
+    assert all(torch.equal(found["state_dict"][name], value) for name, value in expected["state_dict"].items())
+    assert found["global_step"] == expected["global_step"] == STEPS
+
+
+def test_a_signal_waits_for_the_end_of_a_step_of_several_batches(tmp_path):
+    interrupted(tmp_path, signal.SIGTERM, accumulate_grad_batches=2)
+    assert saved(tmp_path)["global_step"] == 8
+
+
+def test_slurm_queues_a_job_again_after_its_own_signal_only(tmp_path, monkeypatch):
+    """With the variables of `srun`, as Lightning's plugin reads them, and a `scontrol` that notes its arguments."""
+    called, program = tmp_path / "called", tmp_path / "scontrol"
+    program.write_text(f'#!/bin/sh\necho "$@" >> {called}\n')
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    numbers = {"NTASKS": 1, "PROCID": 0, "LOCALID": 0, "NODEID": 0, "JOB_ID": 4711}
+    for name, value in {**numbers, "JOB_NAME": "training"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", str(value))
+
+    interrupted(tmp_path / "ended", signal.SIGTERM)
+    assert not called.exists()
+    interrupted(tmp_path / "queued", signal.SIGUSR1)
+    assert called.read_text() == "requeue 4711\n"
+    assert saved(tmp_path / "queued")["global_step"] == 8
+
+    monkeypatch.setenv("SLURM_ARRAY_JOB_ID", "4700")
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "11")
+    interrupted(tmp_path / "of_an_array", signal.SIGUSR1)
+    assert called.read_text() == "requeue 4711\nrequeue 4700_11\n"
+    fit(tmp_path / "of_an_array", every=NEVER)
+    assert saved(tmp_path / "of_an_array")["global_step"] == STEPS
+
+
+def process(*lines: str) -> subprocess.Popen:
+    """One that is inside `ended_by_signals` when it has written a line."""
+    program = ["import os, signal, time", "from completesplat.signals import *", *lines]
+    program += ["with ended_by_signals():", "    print(flush=True)", "    time.sleep(60)"]
+    started = subprocess.Popen([sys.executable, "-c", "\n".join(program)], stdout=subprocess.PIPE)
+    started.stdout.readline()
+    return started
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_outside_of_training_the_first_signal_ends_at_once_in_training_the_second(number):
+    with process() as one:
+        one.send_signal(number)
+        assert one.wait(10) == 128 + number
+    with process("keep_signals(True)") as one:
+        one.send_signal(number)
+        time.sleep(0.3)
+        assert one.poll() is None
+        one.send_signal(signal.SIGTERM)
+        assert one.wait(10) == -signal.SIGTERM
+
+
+def test_a_signal_that_is_ignored_as_by_nohup_stays_ignored():
+    with process("signal.signal(signal.SIGHUP, signal.SIG_IGN)") as one:
+        one.send_signal(signal.SIGHUP)
+        time.sleep(0.3)
+        assert one.poll() is None
+        one.send_signal(signal.SIGTERM)
+        assert one.wait(10) == 128 + signal.SIGTERM
+
+
+def test_a_signal_that_was_swallowed_does_not_end_with_success():
+    with pytest.raises(Interrupted), ended_by_signals(), suppress(Interrupted):
+        os.kill(os.getpid(), signal.SIGTERM)

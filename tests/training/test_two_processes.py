@@ -1,0 +1,86 @@
+"""Training by two processes, which talk through gloo, against one: figures, weights, and what is left is rounding."""
+
+import csv
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from support import SMALL, compose_config
+
+from completesplat.training.loggers import ContinuedCSVLogger
+
+# Without anything that is drawn in the steps: what processes draw is their own.
+SETTINGS = ["experiment=toy_var", "ablation=no_variational", "autoreconstructor.skip_dropout=0", *SMALL]
+SETTINGS += ["rasterizer=reference", "data.image_size=16", "data.batch_size=4", "data.references_per_sequence=8"]
+SETTINGS += ["optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1", "trainer.precision=32-true"]
+SETTINGS += ["trainer.log_every_n_steps=1", "trainer.val_check_interval=2"]
+
+
+class Trained(NamedTuple):
+    """Weights, the rows of `metrics.csv`, and what was logged in the end."""
+
+    weights: dict[str, torch.Tensor]
+    rows: list[dict[str, str]]
+    metrics: dict[str, float]
+
+
+def train(root: Path, folder: Path, devices: int, *settings: str) -> Trained:
+    config = compose_config("fit", f"data.root={root}", *SETTINGS, *settings, f"out={folder}")
+    torch.manual_seed(0)
+    data, module = (instantiate(part, _convert_="all") for part in (config.data, config.model))
+    several = {
+        "devices": devices,
+        "strategy": "ddp_fork" if devices > 1 else "auto",
+        "enable_checkpointing": False,
+        "plugins": [],
+    }
+    logger = ContinuedCSVLogger(str(folder))
+    trainer: Any = instantiate(config.trainer, **several, enable_progress_bar=False, logger=logger, _convert_="all")
+    if torch.get_default_dtype() == torch.float64:  # Lightning's own precision=64-true cannot convert frozen classes
+        module.double()
+        module.on_after_batch_transfer = lambda scenes, _: scenes.map(widened)
+    trainer.fit(module, datamodule=data)
+    with (folder / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return Trained(module.state_dict(), rows, {name: x.item() for name, x in trainer.callback_metrics.items()})
+
+
+def widened(values: torch.Tensor) -> torch.Tensor:
+    return values.double() if values.is_floating_point() else values
+
+
+def furthest(one: Trained, other: Trained) -> float:
+    return max((one.weights[name] - value).abs().max().item() for name, value in other.weights.items())
+
+
+def test_the_figures_of_two_processes_are_those_of_one(toy_root, tmp_path):
+    one, two = (train(toy_root, tmp_path / str(n), n, "trainer.max_steps=2") for n in (1, 2))
+    assert len(one.rows) == len(two.rows) > 2
+    for alone, shared in zip(one.rows, two.rows, strict=True):
+        assert alone.keys() == shared.keys()
+        for name, value in alone.items():
+            assert (value == "") == (shared[name] == "")
+            assert value == "" or math.isclose(float(value), float(shared[name]), rel_tol=1e-5, abs_tol=1e-6), name
+    assert two.metrics == pytest.approx(one.metrics, rel=1e-5)
+
+
+@pytest.mark.slow
+def test_the_weights_of_two_processes_are_those_of_one_up_to_rounding(toy_root, tmp_path, monkeypatch):
+    """In float64, of 2**29 times the resolution, they differ by so much less: by rounding alone."""
+    apart, given = {}, ["trainer.val_check_interval=32", "trainer.limit_val_batches=0"]
+    for bits in (32, 64):
+        if bits == 64:
+            # Which networks call to widen what they compute in bfloat16.
+            monkeypatch.setattr(torch.Tensor, "float", torch.Tensor.double)
+            torch.set_default_dtype(torch.float64)
+        try:
+            one, two = (train(toy_root, tmp_path / f"{bits}-{n}", n, "trainer.max_steps=32", *given) for n in (1, 2))
+        finally:
+            torch.set_default_dtype(torch.float32)
+        apart[bits] = furthest(one, two)
+    assert apart[64] < 1e-9
+    assert 0 < apart[32] < 1e-3
+    assert apart[64] < apart[32] * 2**-20
