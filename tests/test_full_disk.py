@@ -35,6 +35,9 @@ SAID = (
 )
 
 
+NOISE = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0))  # of one size, whenever it is written
+
+
 @contextmanager
 def quota(most: int) -> Iterator[None]:
     """No file of this process, and of those that it starts, grows beyond so many bytes."""
@@ -77,7 +80,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "sheet.png": picture,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),
-    "orbit.mp4": lambda path: write_video(path, torch.rand(4, 3, 64, 64)),
+    "orbit.mp4": lambda path: write_video(path, NOISE),
 }
 
 

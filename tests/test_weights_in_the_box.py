@@ -27,7 +27,7 @@ def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
     """Two scenes of another seed than training's: the reference view is met, the naive answers are beaten."""
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
     size = {"scenes": 20, "frames": 4, "image_size": 64}
-    data = ToyObjectsDataModule(str(tmp_path), **size, data_seed=77, evaluation_batch_size=2)
+    data = ToyObjectsDataModule(str(tmp_path), make=True, **size, data_seed=77, evaluation_batch_size=2)
     data.prepare_data()
     data.setup("test")
     scenes = next(iter(data.test_dataloader()))
@@ -47,7 +47,13 @@ def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_they_score_as_the_card_says(command, tmp_path):
     """One sample of each of 12 scenes: all pixels and object pixels, against both naive answers."""
-    given = ["data=toy_objects", f"data.root={tmp_path / 'data'}", "data.scenes=120", "data.data_seed=77"]
+    given = [
+        "data=toy_objects",
+        f"data.root={tmp_path / 'data'}",
+        "data.make=true",
+        "data.scenes=120",
+        "data.data_seed=77",
+    ]
     assert command("test", f"weights={NAME}", *given, f"out={tmp_path / 'scores'}").status == 0
     scores = strict_json(tmp_path / "scores/metrics.json")
     for region in ("full", "object"):

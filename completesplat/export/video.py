@@ -59,7 +59,6 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
         DiskError: the disk is full.
     """
     import imageio.v2 as imageio
-    from imageio_ffmpeg import count_frames_and_secs
 
     if len(frames) == 0 or Path(path).suffix != ".mp4":
         raise ValueError(f"{path}: a video needs at least one frame and a name that ends in .mp4")
@@ -74,5 +73,18 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
                 padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
                 writer.append_data(to_bytes(padded))  # type: ignore[attr-defined]
         # ffmpeg is another process, whose errors imageio does not pass on.
-        if (written := count_frames_and_secs(temporary)[0]) != len(frames):
-            raise RuntimeError(f"{path}: {written} frames were written of {len(frames)}")
+        if not _is_whole(temporary):
+            raise RuntimeError(f"{path}: was not written to its end")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether an `.mp4` ends where its last box does, and has the index of its frames (ISO/IEC 14496-12, 4.2)."""
+    content, at, kinds = path.read_bytes(), 0, set()
+    while at + 8 <= len(content):
+        length, kind = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8]
+        length = int.from_bytes(content[at + 8 : at + 16]) if length == 1 else length
+        if length < 8:
+            return False
+        kinds.add(kind)
+        at += length
+    return at == len(content) and b"moov" in kinds

@@ -4,9 +4,12 @@ from pathlib import Path
 
 import imageio.v3 as imageio
 import pytest
+from omegaconf import OmegaConf
 from support import refused, strict_json, write_capture
 
+from completesplat.commands.jobs import conf_folder
 from completesplat.data.toy import write_rooms
+from completesplat.data.toy.module import OWN_PLACE
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +88,13 @@ def test_an_imported_capture_can_be_shown(command, tmp_path):
     settings += ["data.allow_shared_sequences=true"]
     assert command("data", "show", *settings, "data.image_size=12", f"out={tmp_path / 'show'}").status == 0
     assert (tmp_path / "show/show.png").is_file()
+
+
+@pytest.mark.parametrize("data", ["toy_objects", "toy_rooms", "toy_minis"])
+def test_toy_data_are_not_made_where_a_path_may_be_mistyped(tmp_path, monkeypatch, data):
+    monkeypatch.chdir(tmp_path)
+    line = refused("data", "data_task=stats", f"data={data}", "data.root=typo", "out=stats")
+    assert line == "typo: no toy data: data.make=true makes them there, and so does completesplat data toy"
+    assert not (tmp_path / "typo").exists()
+    config = OmegaConf.load(conf_folder() / f"data/{data}.yaml")
+    assert Path(config.root).is_relative_to(OWN_PLACE)  # where they are made without being asked for

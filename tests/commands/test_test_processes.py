@@ -22,7 +22,13 @@ def scores(checkpoint: Path, out: Path, folder: Path, *settings: str) -> dict:
 def test_two_processes_find_what_one_finds(pipeline, tmp_path):
     checkpoint = pipeline.diffusion / "checkpoints/last.ckpt"
     # Three test scenes: one process has two of them, the other one.
-    changes = [f"data.root={tmp_path / 'more'}", "data.scenes=30", "data.frames=3", "data.evaluation_batch_size=1"]
+    changes = [
+        f"data.root={tmp_path / 'more'}",
+        "data.make=true",
+        "data.scenes=30",
+        "data.frames=3",
+        "data.evaluation_batch_size=1",
+    ]
     settings = ["trainer.accelerator=cpu", "overrides=[" + ",".join(f"'{change}'" for change in changes) + "]"]
     settings += ["sampler=dpm10", "evaluation.scoring.samples=2"]
     one = scores(checkpoint, tmp_path / "one", tmp_path, *settings)

@@ -11,7 +11,7 @@ from completesplat.tensors import stack
 from completesplat.weights.checkpoint_reading import load_part
 
 pytestmark = pytest.mark.slow
-SCENES = ["data.scenes=24", "data.frames=12", "data.image_size=32", "data.depth_before=1.0"]
+SCENES = ["data.make=true", "data.scenes=24", "data.frames=12", "data.image_size=32", "data.depth_before=1.0"]
 SHORT = ["trainer.accelerator=cpu", "trainer.limit_val_batches=0", "callbacks.progress=null"]
 SHORT += ["schedule.warmup_steps=20"]
 
@@ -59,7 +59,14 @@ def test_one_scene_is_learned_by_heart(command, tmp_path):
     A clip through a room, of which one picture shows nearly all that the others do: all around an object, a single
     picture's Gaussians would first have to travel to its far side.
     """
-    one_scene = ["data=toy_rooms", "data.scenes=3", "data.frames=8", "data.max_gap=3", "data.height=32"]
+    one_scene = [
+        "data=toy_rooms",
+        "data.make=true",
+        "data.scenes=3",
+        "data.frames=8",
+        "data.max_gap=3",
+        "data.height=32",
+    ]
     settings = [f"data.root={tmp_path / 'data'}", *one_scene, "data.image_size=32", "data.batch_size=4", *SHORT]
     steps = ["trainer.max_steps=1000", "test=false", "callbacks.pictures=null", "data.color_jitter=null"]
     assert command("fit", "experiment=toy_var", *settings, *steps, f"out={tmp_path / 'run'}").status == 0

@@ -10,10 +10,27 @@ from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
+from completesplat.data.validation import MissingFile
+
+OWN_PLACE = Path("outputs/data")
+"""Below it toy data are made without being asked for: `data.root` of `conf/data/toy_*.yaml` lies there."""
+
+
+def _must_make(root: Path, folder: Path, make: bool) -> bool:
+    """Whether data are to be written: none are there yet (their description is written last), nor prepared ones.
+
+    `MissingFile`: they are not, and nobody asked for them: another place than the usual one may be a typing error.
+    """
+    if is_packed(root) or (folder / "toy.json").is_file():
+        return False
+    if not make and not root.is_relative_to(OWN_PLACE):
+        said = "no toy data: data.make=true makes them there, and so does completesplat data toy"
+        raise MissingFile(said, str(root))
+    return True
 
 
 class ToyObjectsDataModule(CO3DDataModule):
-    """`CO3DDataModule` on toy objects, which are written to `root` on first use.
+    """`CO3DDataModule` on toy objects, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
     Scenes that are already there are taken as they are, however many they are.
 
@@ -31,9 +48,11 @@ class ToyObjectsDataModule(CO3DDataModule):
         category: str = "toy_objects",
         subset: str | None = SUBSET,
         depth_before: float = 1.0,
+        make: bool = False,
         **reading: Any,
     ) -> None:
         super().__init__(root, category, subset, depth_before=depth_before, **reading)
+        self.make = make
         self.scenes = scenes
         self.frames = frames
         self.data_seed = data_seed
@@ -42,8 +61,8 @@ class ToyObjectsDataModule(CO3DDataModule):
         return super().describe() | {"data_set": self.category}
 
     def prepare_data(self) -> None:
-        """Write the scenes unless a complete set is there (its description is written last)."""
-        if not is_packed(self.root) and not (self.root / self.category / "toy.json").is_file():
+        """Write the scenes where there are none; `MissingFile` as `_must_make`."""
+        if _must_make(self.root, self.root / self.category, self.make):
             numbers = self.scenes, self.frames, self.image_size, self.data_seed
             write_objects(self.root, *numbers, category=self.category)
 
@@ -55,7 +74,7 @@ class ToyObjectsDataModule(CO3DDataModule):
 
 
 class ToyRoomsDataModule(RE10KDataModule):
-    """`RE10KDataModule` on toy rooms, which are written to `root` on first use.
+    """`RE10KDataModule` on toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
     Clips that are already there are taken as they are, however many they are.
 
@@ -71,17 +90,18 @@ class ToyRoomsDataModule(RE10KDataModule):
         frames: int = 60,
         height: int = 72,
         data_seed: int = 0,
+        make: bool = False,
         **reading: Any,
     ) -> None:
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / form), **reading)
-        self.home = home
+        self.home, self.make = home, make
         self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
-        """Write the rooms unless a complete set is there (its description is written last)."""
-        if not is_packed(self.home) and not (self.home / ROOMS / "toy.json").is_file():
+        """Write the rooms where there are none; `MissingFile` as `_must_make`."""
+        if _must_make(self.home, self.home / ROOMS, self.make):
             write_rooms(self.home, **self.making)

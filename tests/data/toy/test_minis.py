@@ -56,7 +56,7 @@ def recolored(scene, color):
 @pytest.mark.parametrize("category", ["toy_minis", "toy_marked_minis"])
 def test_hidden_modes_of_written_minis_are_known_with_their_probabilities(tmp_path, monkeypatch, category):
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # so that no process has to be started
-    data = ToyObjectsDataModule(str(tmp_path), scenes=20, frames=12, category=category, image_size=32)
+    data = ToyObjectsDataModule(str(tmp_path), 20, 12, category=category, make=True, image_size=32)
     data.prepare_data()
     scenes = data.hidden_modes(views=2, spread_views=2)
     for scene in (scenes[i] for i in range(len(scenes))):

@@ -115,7 +115,7 @@ SMALL = {"scenes": 4, "frames": 8, "height": 18, "image_size": 16, "batch_size":
 def test_a_module_makes_its_rooms_on_first_use_and_both_forms_hold_the_same(tmp_path):
     scenes = []
     for form, settings in (("text", SMALL), ("chunks", SMALL | {"scenes": 5})):
-        module = ToyRoomsDataModule(str(tmp_path), form=form, **settings)
+        module = ToyRoomsDataModule(str(tmp_path), form=form, make=True, **settings)
         module.prepare_data()
         assert json.loads((tmp_path / "toy_rooms/toy.json").read_text())["scenes"] == 4
         module.setup("test")
