@@ -17,7 +17,7 @@ from torch import Tensor
 from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.diffusion.sampling import draw_noise, with_forward_process
 from completesplat.diffusion.splitting import in_parts
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.parts import (
@@ -29,11 +29,13 @@ from completesplat.parts import (
     sizes_in,
     untrained,
 )
+from completesplat.published import PublishedGenerator
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel
+from completesplat.scene_model import SceneModel, require_one
 from completesplat.tensors import concatenate
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
 from completesplat.weights.checkpoint_reading import read_checkpoint
+from completesplat.weights.splatter_image import is_published
 
 
 class CompleteSplat(SceneModel):
@@ -68,7 +70,9 @@ class CompleteSplat(SceneModel):
         parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
         saved = {name: untrained(part) for name, part in parts.items()}
         facts = {} if training is None else {"training": dict(training)}
-        super().__init__({**saved, "sampler": dict(sampler), "image_size": image_size, **facts})
+        architecture = {**saved, "sampler": dict(sampler), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
         # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
         self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
         self.conditioning = build(conditioning)
@@ -183,12 +187,15 @@ class CompleteSplat(SceneModel):
 
         Args:
             path: a folder of weights, a run's, a checkpoint of a run, a name of the weights in the package, or an id of
-                the Hugging Face hub (`weights_folder`).
+                the Hugging Face hub (`weights_folder`); or `splatter_image:NAME`, or a file or folder of these weights,
+                which are a `PublishedGenerator`.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not;
                 or the run is of a model that makes no scene of a photograph.
         """
+        if is_published(path):
+            return PublishedGenerator(str(path))
         checkpoint = checkpoint_of(path)
         place = weights_folder(path) if checkpoint is None else checkpoint
         try:
@@ -214,7 +221,9 @@ class OneAnswer(SceneModel):
 
     def __init__(self, network: Mapping[str, Any], image_size: int, training: Mapping[str, Any] | None = None) -> None:
         facts = {} if training is None else {"training": dict(training)}
-        super().__init__({"network": untrained(network), "image_size": image_size, **facts})
+        architecture = {"network": untrained(network), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
         self.network = build(self.architecture["network"])
 
     @property
@@ -241,8 +250,7 @@ class OneAnswer(SceneModel):
         Raises:
             CompleteSplatError: several samples.
         """
-        if samples != 1:
-            raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")
+        require_one(samples)
         splatter_image = self.eval().network(images if visible is None else images * visible).splatter_image
         gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
         return gaussians

@@ -15,20 +15,16 @@ from completesplat.data.pictures.photograph import Photograph, Picture, picture_
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
-from completesplat.parts import check_architecture
 from completesplat.scene import Views
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
 
 class SceneModel(nn.Module):
-    """What makes scenes of photographs: `CompleteSplat`, which draws them, and `OneAnswer`.
+    """What makes scenes of photographs: `CompleteSplat`, which draws them, `OneAnswer` and `PublishedGenerator`.
 
     Args:
-        architecture: the configuration, as it is written beside the weights.
-
-    Raises:
-        WeightsError: a part or a setting that weights may not name (`parts`).
+        architecture: the configuration, as it is written beside the weights; it has `image_size`.
     """
 
     fov_degrees: Tensor
@@ -40,7 +36,6 @@ class SceneModel(nn.Module):
 
     def __init__(self, architecture: dict[str, Any]) -> None:
         super().__init__()
-        check_architecture(architecture)
         self.architecture = architecture
         self.image_size: int = architecture["image_size"]
         # Measured on the training set; they serve photographs of unknown cameras.
@@ -81,11 +76,15 @@ class SceneModel(nn.Module):
         scenes = self.eval().generate(
             photograph.image[None].to(device),
             self.camera(photograph)[None],
-            self.depth_range[None],
+            self.depth_range_of(photograph)[None],
             visible=None if visible is None else visible[None].to(device),
             **settings,
         )
         return [scenes[i] for i in range(len(scenes.means))]
+
+    def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
+        """Near and far of what a photograph shows: those of the training set."""
+        return self.depth_range
 
     @torch.no_grad()
     def reconstruct(self, views: Views) -> Gaussians:
@@ -162,3 +161,9 @@ class SceneModel(nn.Module):
             save_file(weights, temporary)
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
+
+
+def require_one(samples: int) -> None:
+    """`CompleteSplatError` where several samples are asked of a model that draws none."""
+    if samples != 1:
+        raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")

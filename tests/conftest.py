@@ -3,14 +3,19 @@
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 from filelock import FileLock
+from PIL import Image, ImageOps
 from support import SMALL, call, tiny_generator
 
+from completesplat.data.pictures import photograph
 from completesplat.data.toy import write_objects
 from completesplat.signals import ENDING
 
@@ -134,3 +139,22 @@ def command(capfd, monkeypatch, tmp_path):
         return Finished(status, *capfd.readouterr())
 
     return run
+
+
+@pytest.fixture
+def rembg(monkeypatch):
+    """rembg's interface as it is used (2.0.86): it turns pictures by their EXIF; here red is the background."""
+    module = ModuleType("rembg")
+    module.sessions = []
+
+    def remove(picture, session=None):
+        turned = ImageOps.exif_transpose(picture).convert("RGBA")
+        pixels = np.array(turned)
+        pixels[..., 3] = np.where(pixels[..., 0] > 128, 0, 255)
+        return Image.fromarray(pixels)
+
+    module.new_session, module.remove = lambda name: module.sessions.append(name), remove
+    monkeypatch.setitem(sys.modules, "rembg", module)
+    photograph._session.cache_clear()
+    yield module
+    photograph._session.cache_clear()

@@ -45,6 +45,7 @@ def needed(group: str, option: str) -> list[str]:
     given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
+    given += ["model.model.weights=x"] if option == "splatter_image_published" else []
     stage2 = group == "experiment" and option.endswith(("_diffusion", "_diffusion_cached"))
     given += ["evaluation.scene_list=x"] if option == "realestate10k_100" else []
     given += ["evaluation.evaluation_index=x"] if option in ("realestate10k_128", "realestate10k_256") else []

@@ -239,7 +239,7 @@ def _predict(
         "box": None if config.box is None else list(config.box),
         "fov_degrees": photograph.fov_degrees,
         "fov_source": photograph.fov_source,
-        "depth_range": model.depth_range.tolist(),
+        "depth_range": model.depth_range_of(photograph).tolist(),
     }
     if (distance := model.distance(photograph)) is not None:
         recorded["distance_from_training"] = distance

@@ -69,6 +69,7 @@ def protocol(
         **data.describe(),
         "image_size": (data.at_model_size or data).image_size,
         "resolution": data.image_size,
+        **({} if data.background is None else {"background": data.background}),
         "precision": evaluation["precision"],
         "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},

@@ -18,6 +18,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.parts import read_architecture
 from completesplat.schema import shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
+from completesplat.weights.splatter_image import find, is_published
 
 # What training needed of weights from elsewhere, before its first step and for its loss.
 ONLY_FOR_TRAINING = (
@@ -96,25 +97,24 @@ class Trained:
         """As `checkpoint_facts`; a folder of weights does not say how training ended."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
-        digest = sha256_of(weights_folder(str(self.weights)) / WEIGHTS_FILE)
-        return {"checkpoint": {"path": str(self.weights), "sha256": digest, "step": None}, "ema": None}
+        weights = str(self.weights)
+        file = find(weights).weights if is_published(weights) else weights_folder(weights) / WEIGHTS_FILE
+        return {"checkpoint": {"path": weights, "sha256": sha256_of(file), "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
         """A stage's module around a model that is loaded; what it would be trained with does not matter."""
-        folder = weights_folder(weights)
-        architecture = read_architecture(folder)
-        if "network" in architecture:
+        published = is_published(weights)
+        folder = weights if published else str(weights_folder(weights))
+        architecture = {} if published else read_architecture(Path(folder))
+        if published or "network" in architecture:
             mse = {"weight": 1.0, "term": {"_target_": "completesplat.losses.mse.MeanSquaredError"}}
             stage: dict[str, Any] = {
                 "_target_": "completesplat.training.reconstruction.ReconstructionModule",
-                "model": {"_target_": "completesplat.commands.trained.network_of", "folder": str(folder)},
-                "loss": {
-                    "_target_": "completesplat.losses.WeightedSum",
-                    "terms": {"mse": {"weight": 1.0, "term": mse}},
-                },
+                "model": {"_target_": "completesplat.commands.trained.network_of", "weights": folder},
+                "loss": {"_target_": "completesplat.losses.WeightedSum", "terms": {"mse": mse}},
             }
         else:
-            loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": str(folder)}
+            loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": folder}
             stage = {
                 "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
                 "completesplat": loaded,
@@ -126,15 +126,36 @@ class Trained:
             "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
+        if published:
+            return _as_published(found, weights)
         found.data.image_size = architecture["image_size"]
         return found
 
 
-def network_of(folder: str) -> Any:
+def _as_published(config: Any, weights: str) -> Any:
+    """Data as published weights know them, objects only on their background, and renders of such Gaussians.
+
+    `CompleteSplatError`: weights that have to be told where objects are, and data that do not.
+    """
+    known = find(weights).data
+    config.model.rasterizer = {
+        "_target_": "completesplat.rasterizers.directional.DirectionalRasterizer",
+        "rasterizer": config.model.rasterizer,
+    }
+    config.model.background = config.data.background = float(known["white_background"])
+    config.data.image_size = known["training_resolution"]
+    if known["origin_distances"]:  # the far end of the depth range says where the object is
+        if "depth_after" not in config.data:
+            raise CompleteSplatError(f"weights={weights}: know objects; these data do not say where objects are")
+        config.data.depth_after = known["zfar"]
+    return config
+
+
+def network_of(weights: str) -> Any:
     """The network of weights that give one answer."""
     from completesplat.generation import CompleteSplat
 
-    return CompleteSplat.from_pretrained(folder).reconstructing
+    return CompleteSplat.from_pretrained(weights).reconstructing
 
 
 def open_generator(config: Any) -> Any:
@@ -147,6 +168,7 @@ def open_generator(config: Any) -> Any:
         CompleteSplatError: a sampler for a model that draws nothing.
     """
     from completesplat.generation import CompleteSplat
+    from completesplat.published import PublishedGenerator
 
     if config.weights in in_the_box():
         print(f"weights: {config.weights}, which come with the package: they know procedural scenes, not photographs")
@@ -160,6 +182,8 @@ def open_generator(config: Any) -> Any:
         if config.get("sampler") is not None:
             raise CompleteSplatError(f"{config.weights}: these weights draw no samples: leave out sampler")
         print(f"weights: {config.weights} gives one answer for each picture and draws no samples: {WITHOUT_EFFECT}")
+        if isinstance(model, PublishedGenerator):
+            print(f"weights: {model.said}")
         config.samples = 1
     if isinstance(model, CompleteSplat) and config.get("sampler") is not None:
         sampler: Any = OmegaConf.to_container(config.sampler)
@@ -198,8 +222,9 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
         if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
     # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
-    if OmegaConf.select(config, "model.rasterizer._target_") == "completesplat.rasterizers.selection.cuda":
-        config.model.rasterizer._target_ = "completesplat.rasterizers.selection.auto"
+    for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
+        if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
+            OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
     return config
 
 

@@ -15,7 +15,7 @@ from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_F
 
 EXPORT = "--export"
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
-KINDS = {".ply": "scene", ".ckpt": "weights"}
+KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 

@@ -162,6 +162,8 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     if protocol.get("name") not in table.evaluations:
         return False
     data_sets = {column.data_set for column in table.columns if column.key in METRICS}
+    if protocol.get("background") is not None:  # objects only, whose scores for all pixels are no table's
+        return False
     if protocol["data_set"] not in data_sets or protocol.get("skipped") or entry.upper_bound:
         return False
     if table.subset and protocol.get("subset") != table.subset:

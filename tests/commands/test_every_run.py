@@ -188,6 +188,6 @@ def test_a_network_of_the_users_own_is_trained_and_not_exported(tmp_path, caplog
     config = compose_config("fit", "experiment=toy_var", *SMALL, "out=RUN")
     module = instantiate(config.model, _convert_="all")
     config.model.model._target_, module.camera = "mine.Network", {}
-    export_weights(config, module, tmp_path / "weights")
+    export_weights(config, module, None, tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
     assert "mine.Network" in caplog.text

@@ -225,7 +225,7 @@ def test_the_background_can_be_removed(predict, tmp_path, monkeypatch):
         given["removed"] = remove_background
         return Photograph(torch.full((3, size, size), 0.5), default, "default")
 
-    monkeypatch.setattr("completesplat.generation.read_photograph", read)
+    monkeypatch.setattr("completesplat.scene_model.read_photograph", read)
     for setting, removed in (("background=remove", True), ("background=1", False)):
         assert predict(picture(tmp_path / "a.png"), setting).status == 0
         settings = strict_json(tmp_path / "out/a/scene.json")["settings"]

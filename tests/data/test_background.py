@@ -2,37 +2,16 @@
 
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import skimage
 import torch
-from PIL import Image, ImageOps
+from PIL import Image
 
-from completesplat.data.pictures import photograph
 from completesplat.data.pictures.photograph import picture_features, read_photograph
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
-
-
-@pytest.fixture
-def rembg(monkeypatch):
-    """rembg's interface as it is used (2.0.86): it turns pictures by their EXIF; here red is the background."""
-    module = ModuleType("rembg")
-    module.sessions = []
-
-    def remove(picture, session=None):
-        turned = ImageOps.exif_transpose(picture).convert("RGBA")
-        pixels = np.array(turned)
-        pixels[..., 3] = np.where(pixels[..., 0] > 128, 0, 255)
-        return Image.fromarray(pixels)
-
-    module.new_session, module.remove = lambda name: module.sessions.append(name), remove
-    monkeypatch.setitem(sys.modules, "rembg", module)
-    photograph._session.cache_clear()
-    yield module
-    photograph._session.cache_clear()
 
 
 def picture(path: Path, background: str = "red") -> Path:
@@ -54,6 +33,27 @@ def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
     assert rembg.sessions == ["u2net"]  # loaded once, and not rembg's own choice
     assert read_photograph(tmp_path / "a.png", 32).image[0, 0, 0] == 1
     assert read_photograph(tmp_path / "a.png", 32).image[1, 0, 0] == 0
+
+
+def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_square(rembg, tmp_path):
+    image = Image.new("RGB", (64, 32), "red")
+    image.paste("blue", (2, 4, 14, 10))  # left of the central square
+    image.save(tmp_path / "a.png")
+    with pytest.raises(ImageError, match="leaves nothing"):
+        read_photograph(tmp_path / "a.png", 24, remove_background=True)
+    found = read_photograph(tmp_path / "a.png", 24, remove_background=True, background=0.0, object_share=0.5).image
+    expected = torch.zeros(3, 24, 24)
+    expected[2, 9:15, 6:18] = 1
+    assert torch.equal(found, expected)
+
+
+def test_an_object_as_long_as_a_picture_may_be_is_reduced_before_its_square_is_made(tmp_path):
+    Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
+    found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
+    assert found[0, 0].min() > 0.9  # white above the line
+    deep = Image.fromarray(np.full((16, 16), 40_000, np.uint16))
+    deep.save(tmp_path / "deep.png", transparency=40_000)
+    assert read_photograph(tmp_path / "deep.png", 16, object_share=0.5).image.min() == 1
 
 
 def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, monkeypatch):

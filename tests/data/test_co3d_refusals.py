@@ -327,3 +327,11 @@ def test_a_mask_threshold_without_meaning_is_refused(category):
     for threshold in (0, 1.5, NAN):
         with pytest.raises(CompleteSplatError, match=r"data\.mask_threshold"):
             module(category.parent, "skip", mask_threshold=threshold)
+
+
+def test_a_background_that_is_no_grey_value_or_is_not_that_of_encoded_pictures_is_refused(category):
+    for background in (-0.1, 1.5):
+        with pytest.raises(CompleteSplatError, match=r"data\.background"):
+            module(category.parent, "skip", background=background)
+    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is of pictures as they are"):
+        module(category.parent, "skip", background=0.0, latent_cache="x")

@@ -32,7 +32,12 @@ logger = logging.getLogger(__name__)
 
 
 def _check_settings(
-    targets: int, mask_threshold: float | None, latent_cache: str | None, augmented: bool, on_bad: str
+    targets: int,
+    mask_threshold: float | None,
+    background: float | None,
+    latent_cache: str | None,
+    augmented: bool,
+    on_bad: str,
 ) -> None:
     """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
     if on_bad not in ("skip", "raise"):
@@ -41,10 +46,12 @@ def _check_settings(
         raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
     if mask_threshold is not None and not 0 < mask_threshold <= 1:
         raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
+    if background is not None and not 0 <= background <= 1:
+        raise CompleteSplatError(f"data.background={background}: must lie between 0 and 1")
     if latent_cache == "":
         raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
-    if latent_cache is not None and augmented:
-        unchanged = "data.color_jitter=null data.horizontal_flip=false"
+    if latent_cache is not None and (augmented or background is not None):
+        unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
 
@@ -60,6 +67,7 @@ class SceneDataModule(LightningDataModule):
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
         references_per_sequence: training items of a sequence in one epoch.
         mask_threshold: masks are cut at this probability; None: they stay soft.
+        background: grey value that pictures have where they are masked out ("Objects only"); None: they stay.
         color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: none.
         horizontal_flip: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none; None: one for each core, at most four.
@@ -80,6 +88,7 @@ class SceneDataModule(LightningDataModule):
         evaluation_batch_size: int = 4,
         references_per_sequence: int = 1,
         mask_threshold: float | None = None,
+        background: float | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
@@ -93,7 +102,7 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip
-        _check_settings(targets, mask_threshold, latent_cache, augmented, on_bad)
+        _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad)
         self.root = Path(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -101,6 +110,7 @@ class SceneDataModule(LightningDataModule):
         self.evaluation_batch_size = evaluation_batch_size
         self.references_per_sequence = references_per_sequence
         self.mask_threshold = mask_threshold
+        self.background = background
         jitter = None if color_jitter is None else ColorJitter(**color_jitter)
         self.box_masks = None if box_masks is None else BoxMasks(**box_masks)
         self.augment = partial(augment, color_jitter=jitter, box_masks=self.box_masks, horizontal_flip=horizontal_flip)
@@ -188,7 +198,7 @@ class SceneDataModule(LightningDataModule):
             logger.info("%s: %d sequences%s", split, len(source.names), left_out)
             if source.refused:
                 logger.warning("%d annotations cannot be used; the first: %s", len(source.refused), source.refused[0])
-            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache)
+            self._stores[split] = SceneStore(used, used.names, self.mask_threshold, self.cache, self.background)
         return self._stores[split]
 
     @cached_property

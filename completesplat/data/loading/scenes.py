@@ -41,14 +41,21 @@ class SceneStore:
     Args:
         mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay.
         cache: keep decoded pictures (uint8) in memory, each from its first use on.
+        background: grey value (0 to 1) that pictures have where they are masked out; None: they stay.
     """
 
     def __init__(
-        self, source: SequenceSource, names: Sequence[str], mask_threshold: float | None = None, cache: bool = False
+        self,
+        source: SequenceSource,
+        names: Sequence[str],
+        mask_threshold: float | None = None,
+        cache: bool = False,
+        background: float | None = None,
     ) -> None:
         self.source = source
         self.names = list(names)
         self.mask_threshold = mask_threshold
+        self.background = background
         self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
@@ -56,10 +63,7 @@ class SceneStore:
         views = [reference, *targets]
         pictures = [self._picture(sequence, view) for view in views]
         images = _shares([picture.image for picture in pictures])
-        everywhere = torch.full_like(pictures[0].image[:1], 255)
-        masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
-        if self.mask_threshold is not None:
-            masks = (masks >= self.mask_threshold).float()
+        masks = self._masks(pictures)
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
         seen, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
         ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
@@ -72,10 +76,22 @@ class SceneStore:
     def _picture(self, sequence: PosedSequence, view: int) -> Picture:
         key = sequence.name, view
         if self._pictures is None:
-            return sequence.read(view)
+            return self._on_background(sequence.read(view))
         if key not in self._pictures:
-            self._pictures[key] = sequence.read(view)
+            self._pictures[key] = self._on_background(sequence.read(view))
         return self._pictures[key]
+
+    def _masks(self, pictures: Sequence[Picture]) -> Float[Tensor, "view 1 size size"]:
+        everywhere = torch.full_like(pictures[0].image[:1], 255)
+        masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
+        return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
+
+    def _on_background(self, picture: Picture) -> Picture:
+        if self.background is None or picture.mask is None:
+            return picture
+        mask = self._masks([picture])[0].numpy()
+        mixed = np.rint(picture.image.numpy() * mask + 255 * self.background * (1 - mask))
+        return picture._replace(image=torch.from_numpy(mixed.astype(np.uint8)))
 
 
 def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:

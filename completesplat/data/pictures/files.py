@@ -137,8 +137,13 @@ def check_sums(picture: Image.Image, source: str | Path | io.BytesIO) -> None:
 
 def over_white(picture: Image.Image) -> Image.Image:
     """The picture in RGB, with its transparency laid over white."""
-    white = Image.new("RGBA", picture.size, "white")
-    return Image.alpha_composite(white, picture.convert("RGBA")).convert("RGB")
+    return over_grey(picture, 1.0)
+
+
+def over_grey(picture: Image.Image, value: float) -> Image.Image:
+    """The same over a grey value from 0 to 1."""
+    grey = Image.new("RGBA", picture.size, (round(255 * value),) * 3)
+    return Image.alpha_composite(grey, picture.convert("RGBA")).convert("RGB")
 
 
 def upright(picture: Image.Image, orientation: object) -> Image.Image:

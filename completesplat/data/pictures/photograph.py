@@ -24,7 +24,7 @@ from completesplat.data.pictures.files import (
     SIXTEEN_BIT_MODES,
     deep_grey,
     opened,
-    over_white,
+    over_grey,
     upright,
 )
 from completesplat.errors import CompleteSplatError, ImageError
@@ -33,6 +33,7 @@ from completesplat.tensors import TensorDataclass
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
+LARGEST_OBJECT = 4096  # pixels; a larger one is reduced before its square is made, which could be of any size
 LANCZOS_REACH = 3  # of the filter, in pixels of the coarser picture
 CUTTER = "u2net"  # rembg's own default is a network under a licence for non-commercial use
 
@@ -55,10 +56,12 @@ def read_photograph(
     fov_degrees: float | None = None,
     default_fov_degrees: float = 50.0,
     remove_background: bool = False,
+    background: float = 1.0,
+    object_share: float | None = None,
 ) -> Photograph:
     """Turn a picture upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
 
-    Transparency is laid over white; of an animation the first frame is taken; an embedded colour profile is
+    Transparency is laid over the background; of an animation the first frame is taken; an embedded colour profile is
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1], grey images of floats must lie in it.
 
     Args:
@@ -66,7 +69,10 @@ def read_photograph(
             array [height, width, 3] of bytes, or of floats in [0, 1]; a tensor [3, height, width] of the same.
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for pictures without usable EXIF focal length (50 is close to a phone's camera).
-        remove_background: cut the object out, see `without_background`.
+        remove_background: cut the object out, see `without_background`: of the square, or for `object_share` of it all.
+        background: grey value from 0 to 1 that lies behind what is transparent or removed, white by default.
+        object_share: of pictures with an object in front of nothing but transparency, also where the background was
+            removed, the square around the object is taken of whose side it fills this share; None: the central square.
 
     Raises:
         ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
@@ -77,7 +83,7 @@ def read_photograph(
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        image, recorded = _square(picture, size, remove_background)
+        image, recorded = _square(picture, size, remove_background, background, object_share)
     except ImageError as error:
         name = picture if isinstance(picture, (str, Path)) else "the picture"
         raise ImageError(f"{name}: {error}") from error.__cause__
@@ -88,8 +94,10 @@ def read_photograph(
     return Photograph(image, float(default_fov_degrees), "default")
 
 
-def _square(picture: Picture, size: int, remove_background: bool) -> tuple[Float[Tensor, "3 size size"], float | None]:
-    """The central square, resized, and its field of view in degrees where EXIF tells it."""
+def _square(
+    picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
+) -> tuple[Float[Tensor, "3 size size"], float | None]:
+    """The central square, or the object's, resized; the central one's field of view in degrees where EXIF tells it."""
     if isinstance(picture, (np.ndarray, Tensor)):
         picture = _pixels(picture)
         if isinstance(picture, np.ndarray):
@@ -102,9 +110,38 @@ def _square(picture: Picture, size: int, remove_background: bool) -> tuple[Float
         _check_side(*file.size)
         file.load()
         exif = read_exif(file)
-    turned = upright(file, exif.get(ORIENTATION))
-    image = _to_tensor(turned.crop(_central_square(*turned.size)), file, size, remove_background)
-    return image, crop_fov(exif, file.size)
+    seen = upright(file, exif.get(ORIENTATION))
+    if object_share is None:
+        seen = seen.crop(_central_square(*seen.size))
+    if remove_background:
+        seen = _cut_out(seen, background)
+    if object_share is not None:
+        seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
+    return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
+
+
+def _cut_out(picture: Image.Image, background: float) -> Image.Image:
+    if picture.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {picture.mode} goes without background=remove")
+    return without_background(_to_srgb(picture, background))
+
+
+def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
+    """The square around what is not transparent, which may reach beyond the picture; None: all of it is opaque."""
+    if picture.mode not in EIGHT_BIT_MODES or not picture.has_transparency_data:
+        return None
+    cut_out = picture.convert("RGBA")
+    alpha = cut_out.getchannel("A")
+    if alpha.getextrema()[0] == 255:
+        return None
+    box = alpha.getbbox()
+    if box is None:
+        raise ImageError("nothing but transparency")
+    cut_out = cut_out.crop(box)
+    cut_out = cut_out.reduce(-(-max(cut_out.size) // LARGEST_OBJECT))
+    side = round(max(cut_out.size) / share)
+    left, top = (cut_out.width - side) // 2, (cut_out.height - side) // 2
+    return cut_out.crop((left, top, left + side, top + side))
 
 
 def _check_side(width: int, height: int) -> None:
@@ -154,29 +191,23 @@ def _check_file(path: Path) -> None:
         raise ImageError("the file is empty")
 
 
-def _to_tensor(
-    square: Image.Image, source: Image.Image, size: int, remove_background: bool
-) -> Float[Tensor, "3 size size"]:
+def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
     """Pixels as sRGB in [0, 1]; `source` is the opened file, which alone knows its TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
-        if remove_background:
-            raise ImageError(f"colour mode {square.mode} goes without background=remove")
         grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
         return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
     if square.mode not in EIGHT_BIT_MODES:
         raise ImageError(f"colour mode {square.mode} is not supported")
-    rgb = _to_srgb(square)
-    cut = over_white(without_background(rgb)) if remove_background else rgb
-    small = cut.resize((size, size), Image.Resampling.LANCZOS)
+    small = _to_srgb(square, background).resize((size, size), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
 
 
-def _to_srgb(square: Image.Image) -> Image.Image:
-    """An RGB image, transparency laid over white, converted from its own colour profile where it has one."""
+def _to_srgb(square: Image.Image, background: float) -> Image.Image:
+    """An RGB image, transparency laid over the background, converted from its own colour profile where it has one."""
     profile = square.info.get("icc_profile")
     if square.has_transparency_data:
-        square = over_white(square)
+        square = over_grey(square, background)
     if profile:
         # A damaged profile, or one of another colour model than the pixels, is ignored, as viewers do.
         with suppress(ImageCms.PyCMSError, OSError):

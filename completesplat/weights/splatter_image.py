@@ -1,0 +1,162 @@
+"""The weights of Splatter Image that its authors published (Szymanowicz et al., CVPR 2024), as they are on the hub.
+
+`config_NAME.yaml` is Hydra's record of a training, of which a few settings are read as data; `model_NAME.pth` a
+checkpoint of torch with `model_state_dict`. The weights of objects of all kinds are `model_latest.pth` there.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+
+import torch
+import yaml
+from torch import Tensor
+
+from completesplat.errors import WeightsError
+from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
+from completesplat.weights import read_small
+
+HUB = "szymanowiczs/splatter-image-v1"
+PREFIX = "splatter_image:"
+STATE = "model_state_dict"
+GENERAL, GENERAL_FILE = "objaverse", "model_latest.pth"
+MODEL_FILE = re.compile(r"model_(\w+)\.pth")
+
+
+class Camera(TypedDict):
+    """What is read of the section `data`."""
+
+    training_resolution: Annotated[int, Range(8, 1024)]
+    znear: Annotated[float, Range(-1e6, 1e6)]
+    zfar: Annotated[float, Range(-1e6, 1e6)]
+    white_background: bool
+    origin_distances: bool
+    input_images: Literal[1]
+
+
+class Network(TypedDict):
+    """What is read of the section `model`; the values that have no choice are those of all published weights."""
+
+    name: Literal["SingleUNet"]
+    base_dim: Width
+    num_blocks: Few
+    attention_resolutions: Annotated[Sequence[Natural], AtMost(8)]
+    max_sh_degree: Literal[1]
+    network_with_offset: Literal[True]
+    isotropic: Literal[False]
+
+
+class Embedding(TypedDict):
+    """What is read of the section `cam_embd`: models of two pictures embed their cameras."""
+
+    embedding: None
+
+
+SECTIONS = {"data": Camera, "model": Network, "cam_embd": Embedding}
+
+
+class Published(NamedTuple):
+    """The two files, and the sections `data` and `model` of the first."""
+
+    weights: Path
+    data: Camera
+    model: Network
+
+
+def is_published(weights: Path | str) -> bool:
+    """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or a folder that has one."""
+    path = Path(str(weights)).expanduser()
+    return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (path.is_dir() and bool(_models_in(path)))
+
+
+def find(weights: str) -> Published:
+    """The files that `weights` means: `splatter_image:NAME` of the hub (downloaded once), or a file or folder here.
+
+    Raises:
+        WeightsError: they are missing, cannot be downloaded, or have settings that no published weights have.
+    """
+    config, model = _download(weights.removeprefix(PREFIX)) if weights.startswith(PREFIX) else _local(weights)
+    return Published(model, **_read_config(config))
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a checkpoint by name, mapped from the file: what is not used of it takes no memory.
+
+    Raises:
+        WeightsError: it is damaged, holds other things than plain data, or no tensors of a model.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:  # torch has many for a damaged file
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise WeightsError(f"{path}: damaged, or not plain numbers ({reason}); fetch it again") from error
+    tensors = checkpoint.get(STATE) if isinstance(checkpoint, dict) else None
+    if not isinstance(tensors, dict) or not all(isinstance(value, Tensor) for value in tensors.values()):
+        raise WeightsError(f"{path}: no {STATE} in it; give Splatter Image's own file")
+    return tensors
+
+
+def _models_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("model_*.pth") if _config_beside(path).is_file())
+
+
+def _config_beside(model: Path) -> Path:
+    found = MODEL_FILE.fullmatch(model.name)
+    name = GENERAL if model.name == GENERAL_FILE else found[1] if found else "NAME"
+    return model.with_name(f"config_{name}.yaml")
+
+
+def _local(weights: str) -> tuple[Path, Path]:
+    path = Path(weights).expanduser()
+    models = _models_in(path) if path.is_dir() else [path]
+    if len(models) > 1:
+        names = ", ".join(model.name for model in models)
+        raise WeightsError(f"{path}: holds {names}; give one of these files")
+    if not models or not models[0].is_file():
+        raise WeightsError(f"{path}: no such file")
+    config = _config_beside(models[0])
+    if not config.is_file():
+        raise WeightsError(f"{models[0]}: {config.name} is missing beside it; both are at https://huggingface.co/{HUB}")
+    return config, models[0]
+
+
+def _download(name: str) -> tuple[Path, Path]:
+    from huggingface_hub import hf_hub_download
+
+    if not re.fullmatch(r"\w+", name):
+        raise WeightsError(
+            f"{PREFIX}{shown(name)}: give the NAME of a config_NAME.yaml at https://huggingface.co/{HUB}"
+        )
+    files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
+    try:
+        config, model = (Path(hf_hub_download(HUB, file)) for file in files)
+    except Exception as error:  # of the hub, of its HTTP library and of the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise WeightsError(
+            f"{PREFIX}{name}: not to be had from the hub ({reason}); where there is a network, `hf download {HUB} "
+            f"{' '.join(files)} --local-dir DIR` fetches it; then give weights=DIR/{files[1]}"
+        ) from error
+    return config, model
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    """The settings in `SECTIONS`; one that is missing counts as null, `input_images` as 1."""
+    text = read_small(path)
+    try:
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise WeightsError(f"{path}: has aliases, which can unpack to any size; Splatter Image's files have none")
+        config = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise WeightsError(f"{path}: not readable as YAML ({type(error).__name__})") from error
+    found: dict[str, Any] = {}
+    for section, kind in SECTIONS.items():
+        given = config.get(section) if isinstance(config, Mapping) else None
+        given = {"input_images": 1} | dict(given) if isinstance(given, Mapping) else {}
+        found[section] = {name: given.get(name) for name in kind.__annotations__}
+        for name, value, reason in refused(kind, found[section]):
+            said = f"{path}: {section}{name} is {shown(value)}: {reason}"
+            raise WeightsError(f"{said}; only Splatter Image's weights for one picture, as published, are read")
+    if not found["data"]["znear"] < found["data"]["zfar"]:
+        raise WeightsError(f"{path}: data.znear must be below data.zfar")
+    return {"data": found["data"], "model": found["model"]}

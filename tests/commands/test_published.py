@@ -1,0 +1,166 @@
+"""`predict`, `test` and `view` with Splatter Image's published weights: files of their format with random values."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from PIL import Image
+from published_weights import write_published
+from support import compose_config, strict_json
+
+from completesplat.commands.trained import Trained
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.export.ply import read_ply
+from completesplat.gaussians import Gaussians
+from completesplat.generation import CompleteSplat
+from completesplat.published import PublishedGenerator
+from completesplat.rasterizers.directional import DirectionalRasterizer
+
+
+def cut_out(path, size=(60, 40)):
+    """An orange rectangle of 20 x 10 pixels, transparent around it."""
+    picture = Image.new("RGBA", size, (0, 0, 255, 0))
+    picture.paste((255, 128, 0, 255), (5, 8, 25, 18))
+    picture.save(path)
+    return path
+
+
+def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(tmp_path):
+    image = cut_out(tmp_path / "a.png")
+    of_objects = PublishedGenerator(str(write_published(tmp_path / "objects", "objaverse", size=40)))
+    photograph = of_objects.read(image)
+    assert (photograph.fov_degrees, photograph.fov_source) == (pytest.approx(49.1343, abs=1e-3), "default")
+    orange = photograph.image[2] < 0.5
+    rows, columns = orange.any(1).nonzero(), orange.any(0).nonzero()
+    assert len(columns) == pytest.approx(0.65 * 40, abs=1)
+    assert len(rows) == pytest.approx(0.325 * 40, abs=1)
+    assert abs(rows.float().mean() - 19.5) <= 1
+    assert abs(columns.float().mean() - 19.5) <= 1
+    assert photograph.image[:, 0, 0].tolist() == [1, 1, 1]
+    of_captures = PublishedGenerator(str(write_published(tmp_path / "captures", "hydrants", size=40)))
+    seen = of_captures.read(image, 60)
+    assert (seen.fov_degrees, seen.fov_source) == (60, "given")
+    assert seen.image[:, 0, 0].tolist() == [0, 0, 0]  # the central square, its left border cuts the object
+    near, far = of_captures.depth_range_of(seen).tolist()
+    assert far - near == pytest.approx(4)
+    assert (far + near) / 2 == pytest.approx(1.14 * 34.64 / 15, rel=1e-3)  # 15 of the object's 20 pixels are left
+    assert of_objects.depth_range_of(photograph).tolist() == pytest.approx([0.8, 3.2])
+
+
+def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tmp_path):
+    weights = write_published(tmp_path / "objects", "objaverse")
+    image = cut_out(tmp_path / "a.png")
+    given = [f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", "frames=2", "samples=4"]
+    finished = command("predict", *given)
+    assert finished.status == 0, finished.err
+    assert "one answer for each picture and draws no samples" in finished.out
+    assert "give pictures that are transparent or white around one, or background=remove" in finished.out
+    folder = tmp_path / "out/a"
+    assert {path.name for path in folder.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
+    settings = strict_json(folder / "scene.json")["settings"]
+    assert settings["depth_range"] == pytest.approx([0.8, 3.2])
+    assert not {"sampler", "steps"} & settings.keys()
+    assert settings["samples"] == 1
+    model = CompleteSplat.from_pretrained(weights)
+    assert isinstance(model, PublishedGenerator)
+    scene = model(image)[0]
+    assert type(scene) is Gaussians  # which every rasterizer takes
+    torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
+    for settings, said in (
+        (["fov=40"], "as of 49 degrees"),
+        (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),
+    ):
+        refused = command("predict", *given, *settings)
+        assert (refused.status, len(refused.err.splitlines())) == (2, 1)
+        assert said in refused.err
+    with pytest.raises(CompleteSplatError, match="samples=2: this model draws none"):
+        model(image, samples=2)
+    with pytest.raises(WeightsError, match="copy these"):
+        model.save_pretrained(tmp_path / "copy")
+
+
+def test_a_photograph_of_an_object_becomes_a_scene_without_its_background(rembg, command, tmp_path):
+    weights = write_published(tmp_path / "objects", "objaverse", size=40)
+    Image.new("RGB", (120, 80), "red").save(tmp_path / "a.png")
+    with Image.open(tmp_path / "a.png") as picture:
+        picture.paste((0, 128, 255), (5, 8, 25, 18))
+        picture.save(tmp_path / "a.png")
+    given = [f"image={tmp_path / 'a.png'}", f"weights={weights}", f"out={tmp_path / 'out'}", "video=[]"]
+    finished = command("predict", *given, "background=remove")
+    assert finished.status == 0, finished.err
+    model = CompleteSplat.from_pretrained(weights)
+    with Image.open(tmp_path / "a.png") as picture:
+        seen = model.read(picture, remove_background=True)
+    blue = seen.image[0] < 0.5
+    assert blue.sum() == pytest.approx(26 * 13, rel=0.1)
+    assert (seen.image[:, ~blue] > 0.5).all()  # no red is left
+    torch.testing.assert_close(read_ply(tmp_path / "out/a/sample_00.ply").means, model(seen)[0].means)
+    assert strict_json(tmp_path / "out/a/scene.json")["settings"]["background"] == "remove"
+
+
+def test_what_is_hidden_counts_as_background(tmp_path):
+    model = CompleteSplat.from_pretrained(write_published(tmp_path, "objaverse"))
+    photograph = model.read(cut_out(tmp_path / "a.png"))
+    visible = torch.ones(1, 16, 16)
+    visible[..., 8:] = 0
+    changed = replace(photograph, image=photograph.image.clone())
+    changed.image[..., 8:] = 1
+    assert torch.equal(model(photograph, visible)[0].means, model(changed)[0].means)
+    assert not model.knows_hidden
+
+
+def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(command, pipeline, tmp_path):
+    weights = write_published(tmp_path / "captures", "hydrants", size=32)
+    given = ["ckpt=null", f"weights={weights}", "data=toy_objects", f"data.root={pipeline.toy}"]
+    finished = command("test", *given, "trainer.accelerator=cpu", f"out={tmp_path / 'out'}")
+    assert finished.status == 0, finished.err
+    metrics = strict_json(tmp_path / "out/metrics.json")
+    assert (metrics["protocol"]["method"], metrics["protocol"]["background"]) == ("PublishedSplatterImage", 0)
+    assert metrics["protocol"]["checkpoint"]["path"] == str(weights)
+    assert metrics["model"]["full"]["novel"]["psnr"] > 0
+    config = compose_config("test", *given)
+    trained = Trained(None, weights=str(weights), data=config.data, rasterizer=config.rasterizer)
+    module, data = trained.open()
+    assert isinstance(module.rasterizer, DirectionalRasterizer)
+    data.prepare_data()
+    data.setup("test")
+    scenes = next(iter(data.test_dataloader()))
+    scenes = getattr(scenes, "scenes", scenes)
+    assert (scenes.reference.images * (scenes.reference.masks == 0)).max() == 0
+    found = module.eval().reconstruct(scenes)
+    depths = module.model.depths.range(scenes.depth_range)
+    torch.testing.assert_close(depths[:, 1] - depths[:, 0], torch.full((len(depths),), 4.0))
+    torch.testing.assert_close(depths[:, 1], scenes.depth_range[:, 1])
+    assert found.means.shape == (len(depths), 32 * 32, 3)
+
+
+def test_the_option_of_fit_is_the_same_network(tmp_path):
+    weights = write_published(tmp_path, "objaverse")
+    settings = ["model=splatter_image_published", f"model.model.weights={weights}", "rasterizer=reference"]
+    module = instantiate(compose_config("fit", *settings).model, _convert_="all")
+    assert OmegaConf.is_missing(compose_config("fit", settings[0]).model.model, "weights")
+    assert (module.method, module.draws_samples) == ("PublishedSplatterImage", False)
+    assert all(parameter.requires_grad for parameter in module.model.parameters())
+
+
+def test_the_page_has_no_sliders_for_one_answer(tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from completesplat.commands.view import make_page
+    from completesplat.viewer.page import stop_server
+
+    weights, image = write_published(tmp_path / "objects", "objaverse"), cut_out(tmp_path / "a.png")
+    export = tmp_path / "page.html"
+    settings = [f"weights={weights}", f"image={image}", f"export={export}", "rasterizer=reference"]
+    page = make_page(compose_config("view", *settings), tmp_path)
+    try:
+        assert page.worker.wait(60)
+        assert [sample.gaussians.count for sample in page.stage.samples] == [16 * 16]
+        handles = page.server.gui._gui_input_handle_from_uuid.values()
+        shown = [getattr(handle, "label", "") for handle in handles if handle.visible]
+        assert "Samples" not in shown
+        assert "Keep earlier samples" in shown
+    finally:
+        page.close()
+        stop_server(page.server)
