@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rich.filesize import decimal
-
 from completesplat.errors import CompleteSplatError, DiskError
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -92,6 +90,8 @@ def _refusal_of_disk(path: Path) -> OSError | None:
 
 def _disk_error(error: OSError, path: Path, size: int, temporary: Path | None = None) -> DiskError | None:
     """The refusal to show; None for an error that is not of the disk. What `temporary` takes is going to be free."""
+    from rich.filesize import decimal
+
     if not path.parent.is_dir():
         return DiskError(f"{path}: cannot be written, {path.parent} is not there any more")
     if error.errno in NO_SPACE:

@@ -219,9 +219,9 @@ def _predict(
     on_sample: Callable[[], None],
 ) -> None:
     photograph = model.read(image, config.fov, config.background == REMOVE)
-    if found := remarks(photograph, model):
-        log.warning("%s: %s", printable(image.name), "; ".join(found))
     visible = visible_part(config, image, model.image_size)
+    if found := remarks(photograph, model, whole=visible is None):
+        log.warning("%s: %s", printable(image.name), "; ".join(found))
     settings = {name: config[name] for name in ("samples", "seed")}
     how = {}
     if isinstance(model, CompleteSplat):
@@ -241,8 +241,6 @@ def _predict(
         "fov_source": photograph.fov_source,
         "depth_range": model.depth_range_of(photograph).tolist(),
     }
-    if (distance := model.distance(photograph)) is not None:
-        recorded["distance_from_training"] = distance
     if config.background == REMOVE:
         recorded["background"] = REMOVE
     shown = photograph.image if visible is None else photograph.image * visible
@@ -250,10 +248,11 @@ def _predict(
     write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 
-def remarks(photograph: Photograph, model: SceneModel) -> list[str]:
-    """What makes a photograph unlike those that the model was trained on."""
+def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
+    """What makes a photograph unlike those that the model was trained on; its contents count if it is shown whole."""
     found = [unusual_field_of_view(photograph, model.fov_degrees.item())]
-    if (distance := model.distance(photograph)) is not None and distance > UNLIKE:
+    distance = model.distance(photograph) if whole else None
+    if distance is not None and distance > UNLIKE:
         found.append(
             f"colours, contrast or detail lie {distance:.1f} standard deviations from the training pictures'"
             f" ({UNLIKE:g} is far): expect little of it in the scenes"

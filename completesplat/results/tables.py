@@ -252,6 +252,7 @@ def as_latex(table: Table) -> str:
 
 def write_tables(tables: Sequence[Table], out: Path) -> None:
     """Write `tables.md`, `tables.tex` and `tables.csv`, the last with a line for each cell."""
+    out.mkdir(parents=True, exist_ok=True)
     write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
     write_text(out / "tables.tex", "\n".join(map(as_latex, tables)))
     lines = [

@@ -64,7 +64,8 @@ class ReconstructionModule(SceneModule):
             raise CompleteSplatError(
                 "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
             )
-        self.camera = {name: torch.tensor(value).tolist() for name, value in data.typical_camera()._asdict().items()}
+        measured = {} if data is None else data.typical_camera()._asdict()  # a benchmark trains on one batch
+        self.camera = {name: torch.tensor(value).tolist() for name, value in measured.items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """With the training set's typical camera."""

@@ -107,6 +107,7 @@ class Saver:
         """Write these samples as `ply` or `video`, or the page as it stands as `html`."""
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
+        self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
             return [write_page(self.stage.server, self._next("page", ".html"))]
         return [self._ply(sample) if kind == "ply" else self._video(sample) for sample in samples]
