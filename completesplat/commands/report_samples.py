@@ -67,7 +67,7 @@ def samplers(
     title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
     samplers_study.plot_samplers(rows, out / "samplers.png", title)
     Console(width=120).print(table(f"Samplers, from the same noise. {SSIM_NOTE}", SAMPLERS, rows))
-    name, count = samplers_study.REFERENCE
+    name, count = rows[0]["sampler"], rows[0]["steps"]
     print(
         f"fewest denoiser calls within {samplers_study.CLOSE} dB of {name} with {count} steps: {best['calls']} "
         f"({best['sampler']}, {best['steps']} steps, {best['psnr'] - rows[0]['psnr']:+.2f} dB)"

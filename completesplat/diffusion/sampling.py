@@ -141,13 +141,22 @@ def fresh_noise(noise: Latents) -> Iterator[Latents]:
         yield torch.stack(drawn).to(noise)
 
 
+def _scheduler_names(*samplers: Mapping[str, Any]) -> list[str]:
+    return [str(sampler["scheduler"].get("_target_")).rpartition(".")[2] for sampler in samplers]
+
+
+def of_one_kind(*samplers: Mapping[str, Any]) -> bool:
+    """Whether the samplers of these configurations are all of diffusion, or all of flow matching."""
+    return len({name.startswith("FlowMatch") for name in _scheduler_names(*samplers)}) == 1
+
+
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
     """A sampler's configuration with the noise schedule and the prediction type of the one trained with.
 
     `CompleteSplatError`: one of the two is of diffusion, the other of flow matching.
     """
-    names = [str(config["scheduler"].get("_target_")).rpartition(".")[2] for config in (sampler, trained)]
-    if len({name.startswith("FlowMatch") for name in names}) > 1:
+    if not of_one_kind(sampler, trained):
+        names = _scheduler_names(sampler, trained)
         raise CompleteSplatError(f"sampler: {names[0]} cannot draw from a denoiser that was trained for {names[1]}")
     kept = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
     return {**sampler, "scheduler": {**sampler["scheduler"], **kept}}

@@ -9,13 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.diffusion.sampling import of_one_kind
 from completesplat.metrics.images import psnr, ssim
 from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
-REFERENCE = ("ddim", 50)
+REFERENCES = (("ddim", 50), ("flow", 50))  # of a denoiser that predicts noise, and of flow matching
 CLOSE = 0.1  # difference in PSNR, in dB, that does not count
 
 
@@ -27,16 +28,18 @@ def rows(
     settings: Mapping[str, float],
     tick: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """A row for each sampler and number of steps, the reference (50 steps of DDIM) first.
+    """A row for each sampler that fits the denoiser and number of steps, the reference (50 steps of one) first.
 
     PSNR and SSIM are of novel views, mean over samples, views and scenes; `agreement` is the PSNR against the
     reference's renders from the same noise. `ms` is the time of a sample with its reconstruction, without rendering,
     of the fastest scene.
     """
     settled: list[Float[Tensor, "sample view 3 height width"]] = []
-    others = [(name, count) for name, counts in steps.items() for count in counts if (name, count) != REFERENCE]
-    found = []
-    for name, count in [REFERENCE, *others]:
+    trained, found = renderer.model.architecture["sampler"], []
+    fitting = [name for name, sampler in samplers.items() if of_one_kind(sampler, trained)]
+    reference = next(one for one in REFERENCES if one[0] in fitting)
+    wanted = [(name, count) for name in fitting for count in steps.get(name, ())]
+    for name, count in [reference, *(one for one in wanted if one != reference)]:
         tick(f"{name}, {count} steps")
         renderer.model.replace_sampler(samplers[name])
         found.append({"sampler": name, "steps": count} | _row(renderer, scenes, {**settings, "steps": count}, settled))
@@ -110,7 +113,7 @@ def fewest(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 PANELS = [
     ("psnr", "PSNR of novel views, dB"),
     ("ssim", "SSIM of novel views"),
-    ("agreement", "PSNR against 50 steps of DDIM, dB"),
+    ("agreement", "PSNR against the first row's pictures, dB"),
     ("diversity", "Difference of two samples (RMS)"),
     ("ms", "Time of a sample, ms"),
 ]

@@ -1,8 +1,12 @@
 """`completesplat report`: what its studies of samples write, say and refuse, on a model without skill."""
 
+from types import SimpleNamespace
+
 import imageio.v3 as imageio
 import pytest
 from support import refused, strict_json
+
+from completesplat.studies import samplers as samplers_study
 
 
 @pytest.fixture
@@ -31,6 +35,23 @@ def test_samplers_are_measured_from_the_same_noise(report, tmp_path):
     assert imageio.imread(tmp_path / "out/samplers.png").ndim == 3
     assert f"steps: {results['fewest']['calls']} (" in said
     assert said.splitlines()[-1] == str(tmp_path / "out")
+
+
+def test_flow_matching_is_measured_with_its_own_samplers(monkeypatch):
+    monkeypatch.setattr(samplers_study, "_row", lambda *measured: {})
+
+    def configured(name: str) -> dict:
+        return {"scheduler": {"_target_": f"diffusers.{name}"}, "name": name}
+
+    names = {"ddim": "DDIMScheduler", "flow": "FlowMatchEulerDiscreteScheduler"}
+    samplers = {key: configured(name) for key, name in names.items()}
+    chosen = []
+    model = SimpleNamespace(architecture={"sampler": samplers["flow"]}, replace_sampler=chosen.append)
+    renderer = SimpleNamespace(model=model)
+    steps = {"ddim": [2], "flow": [50, 5]}
+    rows = samplers_study.rows(renderer, samplers, steps, [], {}, print)
+    assert [(row["sampler"], row["steps"]) for row in rows] == [("flow", 50), ("flow", 5)]
+    assert chosen == [samplers["flow"]] * 2
 
 
 @pytest.mark.parametrize("degrees", [100, 0], ids=["a view is near", "no view is near"])
