@@ -7,6 +7,7 @@ import pytest
 from support import refused, strict_json
 
 from completesplat.studies import samplers as samplers_study
+from completesplat.studies.samples import SampleRenderer
 
 
 @pytest.fixture
@@ -46,8 +47,10 @@ def test_flow_matching_is_measured_with_its_own_samplers(monkeypatch):
     names = {"ddim": "DDIMScheduler", "flow": "FlowMatchEulerDiscreteScheduler"}
     samplers = {key: configured(name) for key, name in names.items()}
     chosen = []
+
+    renderer = object.__new__(SampleRenderer)  # whose model is not asked for a sample here
     model = SimpleNamespace(architecture={"sampler": samplers["flow"]}, replace_sampler=chosen.append)
-    renderer = SimpleNamespace(model=model)
+    object.__setattr__(renderer, "model", model)
     steps = {"ddim": [2], "flow": [50, 5]}
     rows = samplers_study.rows(renderer, samplers, steps, [], {}, print)
     assert [(row["sampler"], row["steps"]) for row in rows] == [("flow", 50), ("flow", 5)]
