@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict, is_typeddict
 
 import torch
 from diffusers import (
@@ -239,6 +239,8 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
             raise WeightsError(f"{shown(key)}: there is no such setting, but {', '.join(hints)}")
         if name in PARTS and (value is not None or name != "view_encoder"):
             _check_part(key, value, PARTS[name])
+        elif is_typeddict(hints[name]) and isinstance(value, Mapping):
+            _check_settings(key, hints_of(hints[name]), value)
         elif name not in PARTS and (found := refused(hints[name], value)):
             raise WeightsError(f"{key}={shown(value)}: {found[0].reason}")
 
