@@ -18,6 +18,7 @@ from completesplat.scene import SceneBatch
 from completesplat.schema import Filled, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
+from completesplat.studies import layers as layers_study
 from completesplat.studies import masked as masked_study
 from completesplat.studies import samplers as samplers_study
 from completesplat.studies import views as views_study
@@ -157,6 +158,20 @@ def views(
     Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
 
 
+def layers(ckpt: str, overrides: Sequence[str], trust: bool, scenes: Positive, out: Path) -> None:
+    """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings.
+
+    Refused as by `Trained.open`, `first_scenes` and `layers.rows`.
+    """
+    quieten()
+    module, data = Trained(ckpt, overrides, trust).open()
+    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    with _status() as tick:
+        rows = layers_study.rows(module, [scene.to(module.device) for scene in first_scenes(data, scenes)], tick)
+    write_json(out / "layers.json", {"settings": {"scenes": scenes}, "rows": rows})
+    Console(width=120).print(table("Layers on the object, behind what the picture shows (scene units)", LAYERS, rows))
+
+
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
     """What draws a run's samples, the first test scenes, and the settings that are written beside what is found.
 
@@ -196,6 +211,13 @@ CONTROLS: list[Column] = [
     ("diversity", "diversity", ".4f"),
 ]
 VIEWS: list[Column] = [("views", "views", "d"), ("all pixels", "psnr", ".2f"), ("object", "object_psnr", ".2f")]
+LAYERS: list[Column] = [
+    ("", "layer", ""),
+    ("opacity", "opacity", ".2f"),
+    ("behind the front", "behind", ".3f"),
+    ("of the thickness", "ratio", ".0%"),
+    ("pixels on the back", "on_back", ".0%"),
+]
 DEPTH = [*WEIGHTS]
 for _view in ("reference", "far"):
     DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]

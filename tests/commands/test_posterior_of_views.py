@@ -112,6 +112,19 @@ def test_psnr_is_told_by_the_number_of_views(runs, stage, command, tmp_path):
     assert "5 views, and half of the targets are 4" in refused("report", "report_task=views", *given[2:], "counts=[5]")
 
 
+@pytest.mark.parametrize("stage", ["var", "diffusion"])
+def test_layers_are_told_beside_the_true_back(runs, stage, command, tmp_path):
+    done = command(
+        "report", "layers", f"ckpt={runs / stage / 'checkpoints/last.ckpt'}", "scenes=1", f"out={tmp_path / 'out'}"
+    )
+    assert done.status == 0, done.error
+    back, first, second = strict_json(tmp_path / "out/layers.json")["rows"]
+    assert 0.1 < back["behind"] < 2
+    for layer in (first, second):
+        assert layer["ratio"] == pytest.approx(layer["behind"] / back["behind"], rel=1e-5)
+        assert 0 <= layer["on_back"] <= 1
+
+
 def test_pictures_that_cannot_be_taken_together_are_refused(runs, tiny_weights, tmp_path):
     write_capture(tmp_path, 6)
     pictures = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"

@@ -1,0 +1,87 @@
+"""Where the layers of a Splatter Image lie: how far behind what the picture shows, beside the object's true back."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import pixel_centers, project, unproject
+from completesplat.scene import SceneBatch, Views
+from completesplat.studies.samples import autoreconstructor_of
+
+CLOSE = 0.3
+"""Of the thickness: a layer that is this near to the back counts as on it."""
+
+
+@torch.no_grad()
+def rows(module: Any, scenes: Sequence[SceneBatch], tick: Callable[[str], None]) -> list[dict[str, float | str]]:
+    """A row for each layer and one for the object's true back: means over the object's pixels of all scenes.
+
+    Scenes are batches of one. `behind` is the distance from the true front along the reference's optical axis, in scene
+    units; `ratio` that to the mean thickness; `on_back` the share of pixels where the layer is nearer to the back than
+    `CLOSE` of the thickness. Gaussians are those of the posterior's mode, which sees all views if it can see any.
+
+    `CompleteSplatError`: another model than a variational autoreconstructor. `DataError`: no true depth, or no object.
+    """
+    own = autoreconstructor_of(module)
+    if own is None:
+        raise CompleteSplatError(
+            "this model has no layers of its own: take a run of the autoreconstructor, or of stage 2"
+        )
+    measured = []
+    for number, scene in enumerate(scenes):
+        tick(f"scene {number + 1} of {len(scenes)}")
+        if scene.reference.depths is None:
+            raise DataError("the data have no true depth", str(scene.names[0]))
+        views = scene.all_views() if own.sees_views else None
+        posterior, features = own.posterior(scene.reference.images, views, scene.depth_range)
+        splatter_image = own.reconstructor(posterior.mode(), features)
+        gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
+        size = scene.reference.images.shape[-2:]
+        front = scene.reference.depths[0, 0]
+        thickness, known = true_thickness(scene[0].reference, scene[0].targets)
+        behind = gaussians.means[0, :, 2].view(-1, *size) - front
+        opacity = gaussians.opacities[0].view(-1, *size)
+        measured.append((behind[:, known], opacity[:, known], thickness[known]))
+    behinds, opacities, thicknesses = (torch.cat(values, dim=-1) for values in zip(*measured, strict=True))
+    if not len(thicknesses):
+        raise DataError("no pixel shows an object whose back another view shows", ", ".join(scenes[0].names))
+    found: list[dict[str, float | str]] = [{"layer": "true back", "behind": thicknesses.mean().item()}]
+    for layer, (behind, opacity) in enumerate(zip(behinds, opacities, strict=True)):
+        found.append(
+            {
+                "layer": f"layer {layer + 1}",
+                "opacity": opacity.mean().item(),
+                "behind": behind.mean().item(),
+                "ratio": (behind.mean() / thicknesses.mean()).item(),
+                "on_back": ((behind - thicknesses).abs() < CLOSE * thicknesses).float().mean().item(),
+            }
+        )
+    return found
+
+
+def true_thickness(
+    reference: Views, others: Views
+) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """How far behind the front of the object its last surface lies, at the reference's pixels; and where that is known.
+
+    The last surface is the farthest point of the object (mask over 0.5) that another view [view] shows in the pixel, by
+    true depth; in units of the cameras, along the reference's optical axis. Unknown where no view shows one.
+    """
+    assert reference.depths is not None
+    assert others.depths is not None
+    height, width = reference.images.shape[-2:]
+    pixels = pixel_centers(height, width, others.depths.device, others.depths.dtype).flatten(0, 1)
+    places, ahead = project(reference.cameras, unproject(others.cameras, pixels, others.depths.flatten(1)))
+    inside = (ahead > 0) & (places >= 0).all(-1) & (places < places.new_tensor([width, height])).all(-1)
+    inside &= (others.depths.flatten(1) > 0) & (others.masks.flatten(1) > 0.5)
+    columns, lines = places[inside].floor().long().unbind(-1)
+    last = torch.zeros(height * width, dtype=ahead.dtype, device=ahead.device)
+    last.scatter_reduce_(0, lines * width + columns, ahead[inside], "amax")
+    front = reference.depths[0]
+    thickness = last.view(height, width) - front
+    known = (reference.masks[0] > 0.5) & (front > 0) & (thickness > 0)
+    return thickness, known
