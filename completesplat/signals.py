@@ -7,6 +7,7 @@ The first signal raises `Interrupted` where the program stands, or is kept until
 import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import parent_process
@@ -93,6 +94,17 @@ def end_with_parent() -> None:
     leave_to_parent()
     signal.signal(signal.SIGTERM, _raise)
     threading.Thread(target=_outlive_nobody, daemon=True).start()
+
+
+def end_with(starter: int) -> None:
+    """In a process that another started: it does not outlive that, however that ends, wherever it stands itself."""
+    threading.Thread(target=_outlive, args=(starter,), daemon=True).start()
+
+
+def _outlive(starter: int) -> None:
+    while os.getppid() == starter:
+        time.sleep(1)
+    os._exit(1)
 
 
 def _raise(number: int, frame: object) -> None:

@@ -19,7 +19,7 @@ from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryV
 from completesplat.commands import jobs, new, view
 from completesplat.commands.jobs import conf_folder
 from completesplat.errors import CompleteSplatError
-from completesplat.signals import ended_by_signals
+from completesplat.signals import end_with, ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 TASKS = ("data", "bench", "report")
@@ -43,7 +43,9 @@ def launch(verb: str, arguments: list[str]) -> None:
     jobs.use_working_folder()
     # A further process of a job: Lightning starts one for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
-        out = Path(arguments[0].partition("=")[2])
+        starter, _, out_name = arguments[0].partition("=")[2].partition(":")
+        out = Path(out_name)
+        end_with(int(starter))
         with ended_by_signals():
             return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
     program, given = sys.argv[0], arguments

@@ -187,7 +187,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
         if OmegaConf.select(config, f"model.{key}") is not None:
             config.model[key] = resolved["model"][key]
     try:
-        with ended_by_signals(), _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={out}"]):
+        with ended_by_signals(), _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
             start(verb, config, out)
     except Interrupted as stop:
         if first:

@@ -3,6 +3,8 @@
 import os
 import shlex
 import signal
+import subprocess
+import sys
 
 import pytest
 from support import SMALL, strict_json
@@ -87,3 +89,39 @@ def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, s
     assert not list((tmp_path / "latents").glob("*.npy"))
     finished = command(*said(finished, signal.SIGTERM)[1])
     assert finished.status == 0, finished.err
+
+
+STARTED = """
+import sys, time
+from completesplat.signals import end_with
+end_with(int(sys.argv[1]))
+time.sleep(90)
+print("alive")
+"""
+STARTER = """
+import os, subprocess, sys, time
+subprocess.Popen([sys.executable, "-c", sys.argv[1], str(os.getpid())])
+print("started", flush=True)
+time.sleep(90)
+"""
+
+
+def test_a_process_of_a_job_does_not_outlive_the_one_that_started_it():
+    """Also where that ends before this one has begun to look."""
+    starter = subprocess.Popen([sys.executable, "-c", STARTER, STARTED], stdout=subprocess.PIPE, text=True)
+    assert starter.stdout.readline() == "started\n"
+    starter.kill()
+    assert starter.wait() == -signal.SIGKILL
+    assert starter.stdout.read() == ""  # ends when the other process has ended
+
+
+def test_lightning_starts_processes_that_know_which_one_started_them(command, toy_root, tmp_path, monkeypatch):
+    given = []
+    monkeypatch.setattr("completesplat.commands.fit.run", lambda config, out: given.extend(sys.argv))
+    assert command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}").status == 0
+    assert given[2] == f"--process-of={os.getpid()}:{tmp_path / 'run'}"
+    ended, started = [], []
+    monkeypatch.setattr("completesplat.commands.end_with", ended.append)
+    monkeypatch.setattr("completesplat.commands.fit.run", lambda config, out: started.append(out))
+    assert command("fit", given[2]).status == 0
+    assert (ended, started) == ([os.getpid()], [tmp_path / "run"])
