@@ -25,6 +25,7 @@ import torch
 from support import SMALL, script, strict_json
 
 from completesplat import cli
+from completesplat.commands.jobs import LOCK
 from completesplat.errors import WeightsError
 from completesplat.results.machine import machine
 from completesplat.training.checkpoints import read_checkpoint
@@ -288,7 +289,7 @@ def left_wrong(place: str, kind: str, out: Path, log: str) -> Iterator[str]:
         yield "leaked semaphores"
     if f"ended by {kind}" not in log:
         yield "no line that says so"
-    half = {path for pattern in ("*.unfinished", ".*", "*.npy") for path in run.rglob(pattern)}
+    half = {path for pattern in ("*.unfinished", ".*", "*.npy") for path in run.rglob(pattern)} - {run / LOCK}
     if half and not (place == "data latents" and (run / "latents.json").exists()):
         yield f"half written: {', '.join(path.name for path in half)}"
 
@@ -340,7 +341,8 @@ def main() -> None:
     given, begun = parser.parse_args(), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="reliability") as name:
         script(Path(name))
-        rows = list(measured(make(Path(name), 40), given.kills, given.resumes, given.signals, given.seconds))
+        counted = measured(make(Path(name), 40), given.kills, given.resumes, given.signals, given.seconds)
+        rows = [row for row in counted if row.tried]
     here = machine()
     print("| fault | tried | as it should be |\n|---|---|---|")
     for row in rows:
