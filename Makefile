@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser fuzz reliability check lock bench docs notebooks clean
+.PHONY: help demo demo-train test test-slow test-browser fuzz reliability check lock bench gpu docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -88,6 +88,9 @@ bench: $(READY) ## Time the rasterizer backends, data loading, and stage 2, side
 	$(BIN)/completesplat bench rasterizers
 	$(BIN)/completesplat bench data
 	$(BIN)/completesplat bench diffusion
+
+gpu: $(READY) ## What only a GPU can show, 25 minutes, in outputs/gpu: tests, times, trainings (SMALL=1: tiny sizes, anywhere)
+	PYTHONPATH=. $(BIN)/python tests/gpu_day.py $(if $(SMALL),--small)
 
 docs: $(READY) ## The API reference, from the docstrings, in outputs/api
 	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat
