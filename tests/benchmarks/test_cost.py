@@ -5,7 +5,8 @@ import json
 import pytest
 from support import refused, strict_json
 
-MACHINE = {"processor": "P", "cores": 1, "threads": 1, "system": "Linux", "python": "3", "torch": "2", "date": "today", "gpu": "G"}
+MACHINE = {"processor": "P", "cores": 1, "threads": 1, "system": "Linux", "gpu": "G"}
+MACHINE |= {"python": "3", "torch": "2", "date": "today"}
 WORK = {"device": "cuda", "image_size": 128, "batch": 32, "samples": 20, "steps": 50, "repeats": 1}
 ROWS = [
     {"name": "stage1_step", "way": "float32", "ms": 864.0, "memory_mb": 5000.0},
