@@ -194,7 +194,7 @@ def command(material: Material, place: str, who: str) -> list[str]:
     given = [*material.arguments("var"), *devices, "trainer.max_steps=100000", "trainer.log_every_n_steps=1"]
     given += ["trainer.val_check_interval=50", "data.references_per_sequence=4", "data.workers=2"]
     given += ["callbacks.checkpoint.every_n_train_steps=100000"]
-    return [*given, "-m", "seed=0,1"] if place == "fit -m" else given
+    return ["fit", "-m", *given[1:], "seed=0,1"] if place == "fit -m" else given
 
 
 def processes_of(session: int) -> list[tuple[int, str]]:
@@ -224,8 +224,10 @@ def signalled(material: Material, place: str, kind: str, who: str, seconds: floa
             os.killpg(process.pid, signal.SIGKILL)
             return [f"{label}: not at work after {STARTS_WITHIN:g} seconds: {(folder / 'log.txt').read_text()[-1000:]}"]
         time.sleep(chance.uniform(0, longest))
-        if process.poll() != 0:
+        if process.poll() is None:
             break
+        if process.poll() != 0:
+            return [f"{label}: status {process.poll()} by itself: {(folder / 'log.txt').read_text()[-1000:]}"]
         longest /= 2  # it had come to its end
     found = outcome(process, place, kind, who, out, folder / "log.txt", seconds)
     shutil.rmtree(folder)

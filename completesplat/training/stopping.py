@@ -45,10 +45,13 @@ def stopped_together() -> Iterator[None]:
     connector.register_signal_handlers, launcher._launch_process_observer = lambda self: None, observe
     try:
         yield
-    except Interrupted as stop:
+    except (Interrupted, RuntimeError) as error:
+        number = error.signal if isinstance(error, Interrupted) else signals.received()
+        if number is None:
+            raise
         for process in started:
-            _end(process, stop.signal)
-        raise
+            _end(process, number)
+        raise Interrupted(number) from error  # other processes may have gone before, for which this one waited
     finally:
         connector.register_signal_handlers, launcher._launch_process_observer = before
         if started:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from small_runs import STEPS, Logging, fit, rows
 
+from completesplat import signals
 from completesplat.signals import ENDING, Interrupted, ended_by_signals, received
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.stopping import stopped_together
@@ -126,3 +127,12 @@ def test_a_signal_that_is_ignored_as_by_nohup_stays_ignored():
 def test_a_signal_that_was_swallowed_does_not_end_with_success():
     with pytest.raises(Interrupted), ended_by_signals(), suppress(Interrupted):
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_what_fails_after_a_signal_because_another_process_has_gone_ends_as_the_signal_does(monkeypatch):
+    with pytest.raises(RuntimeError, match="reset"), stopped_together():
+        raise RuntimeError("Connection reset by peer")
+    monkeypatch.setattr(signals, "received", lambda: signal.SIGTERM)
+    with pytest.raises(Interrupted) as stop, stopped_together():
+        raise RuntimeError("Connection reset by peer")
+    assert stop.value.signal == signal.SIGTERM
