@@ -26,7 +26,7 @@ from torch import nn
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.reconstructor import Reconstructor
-from completesplat.autoreconstructor.view_encoders import CrossAttention, PlaneSweep
+from completesplat.autoreconstructor.view_encoders import PlaneSweep
 from completesplat.baselines.regressor import SplatterImageUNet
 from completesplat.diffusion.conditioning import LearnedConditioning, StableDiffusionConditioning
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
@@ -42,7 +42,7 @@ PARTS: dict[str, tuple[type, ...]] = {
     "encoder": (Encoder,),
     "reconstructor": (Reconstructor,),
     "parameterization": (Parameterization,),
-    "view_encoder": (PlaneSweep, CrossAttention),
+    "view_encoder": (PlaneSweep,),
     "conditioning": (LearnedConditioning, StableDiffusionConditioning),
     "denoiser": (Denoiser, TextlessStableDiffusion),
     "network": (VariationalAutoReconstructor, SplatterImageUNet),

@@ -225,7 +225,7 @@ def test_every_setting_of_every_class_is_checked():
 @pytest.mark.parametrize(
     "chosen",
     [
-        ["autoreconstructor=stable_diffusion", "denoiser=stable_diffusion", "posterior=views_attention"],
+        ["autoreconstructor=stable_diffusion", "denoiser=stable_diffusion", "posterior=views"],
         ["autoreconstructor=minis", "conditioning=stable_diffusion", "posterior=views", "sampler=dpm20"],
         ["denoiser=stable_diffusion_no_text", "posterior=image", "objective=flow"],
         ["ablation=no_skips", "sampler=unipc5"],

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import vae_encoder
-from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, project, rays_through
+from completesplat.geometry.cameras import pixel_centers, project, rays_through
 from completesplat.scene import Views
 from completesplat.schema import Few, Range, Width, Widths
 
@@ -89,57 +89,6 @@ def sweep(
     sides = [(values * (sign * SHARPNESS * cosine + hidden).softmax(1)).sum(1) for sign in (1, -1)]
     found = torch.stack(sides, -2) * seen.any(1)[..., None]
     return found.view(batch, planes, height // 2, width // 2, 2, 4).permute(0, 1, 4, 5, 2, 3)
-
-
-class CrossAttention(nn.Module):
-    """The reference's tokens attend to those of all views, which are pictures with Pluecker rays.
-
-    Args:
-        width, blocks, heads: of the transformer.
-        channels, layers_per_block, latent_channels, norm_groups: of the encoder that makes tokens; levels as the
-            autoreconstructor's.
-    """
-
-    def __init__(
-        self,
-        width: Width = 256,
-        blocks: Annotated[int, Range(1, 64)] = 4,
-        heads: Width = 8,
-        channels: Widths = (128, 256, 512, 512),
-        layers_per_block: Few = 2,
-        latent_channels: Width = 4,
-        norm_groups: Width = 32,
-    ) -> None:
-        super().__init__()
-        self.network = vae_encoder(9, width, channels, layers_per_block, norm_groups)
-        layer = nn.TransformerDecoderLayer(
-            width, heads, 4 * width, dropout=0.0, activation="gelu", batch_first=True, norm_first=True
-        )
-        self.blocks = nn.TransformerDecoder(layer, blocks, nn.LayerNorm(width))
-        self.out = nn.Linear(width, 2 * latent_channels)
-        _zero(self.out)
-
-    def forward(
-        self, views: Views, depth_range: Float[Tensor, "batch 2"]
-    ) -> Float[Tensor, "batch moment latent_height latent_width"]:
-        """Views, the reference first and its frame as the world -> what to add to the moments."""
-        batch, count = views.images.shape[:2]
-        rays = pluecker(views.cameras) / depth_range[:, 1:, None, None, None].sqrt()
-        maps = self.network(torch.cat([views.images * 2 - 1, rays], 2).flatten(0, 1))
-        tokens = maps.flatten(2).mT.reshape(batch, count, -1, maps.shape[1])
-        moments: Tensor = self.out(self.blocks(tokens[:, 0], tokens.flatten(1, 2))).mT
-        return moments.reshape(batch, -1, *maps.shape[-2:]).float()
-
-
-def pluecker(cameras: Cameras) -> Float[Tensor, "*batch 6 height width"]:
-    """Unit directions and moments (origin x direction) of all pixels' rays in the cameras' world."""
-    with torch.autocast(cameras.intrinsics.device.type, enabled=False):
-        rotation = cameras.camera_to_world[..., :3, :3]
-        directions = nn.functional.normalize(
-            torch.einsum("...ij,...hwj->...hwi", rotation, pixel_rays(cameras)), dim=-1
-        )
-        origins = cameras.centers[..., None, None, :].expand_as(directions)
-        return torch.cat([directions, torch.linalg.cross(origins, directions)], -1).movedim(-1, -3)
 
 
 @torch.no_grad()
