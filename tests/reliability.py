@@ -333,6 +333,9 @@ def measured(material: Material, kills: int, resumes: int, repeated: int, second
 
 
 def main() -> None:
+    # Where this was started by `nohup`, or by a script with `&`, some are ignored, and would be by what it starts.
+    for number in KINDS.values():
+        signal.signal(number, signal.SIG_DFL)
     for module in MODULES:
         import_module(f"completesplat.{module}")
     parser = argparse.ArgumentParser(description=__doc__)
