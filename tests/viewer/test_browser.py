@@ -190,8 +190,8 @@ def space(tiny_weights):
     said: list[str] = []
     for line in process.stdout:
         said.append(line)
-        if found := re.search(r"http://127\.0\.0\.1:\d+", line):
-            yield found[0]
+        if "public link" in line:  # gradio's last word before it waits
+            yield re.search(r"http://127\.0\.0\.1:\d+", "".join(said))[0]
             break
     else:
         pytest.fail("".join(said))
@@ -203,18 +203,18 @@ def space(tiny_weights):
 def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium, space, tmp_path):
     file = tmp_path / "photo.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)).save(file)
-    tab = chromium.new_page(viewport={"width": 1000, "height": 900})
+    tab = chromium.new_page(viewport={"width": 500, "height": 600})
+    tab.set_default_timeout(1000 * SECONDS)
     tab.goto(space)
     tab.locator("input[type=file]").first.set_input_files(file)
     tab.get_by_role("button", name="Complete").click()
-    for i in range(2):
-        frame = tab.locator("iframe").nth(i)
-        frame.wait_for(timeout=1000 * SECONDS)
-        frame.scroll_into_view_if_needed()
-        frame.content_frame.locator("canvas").first.wait_for(timeout=1000 * SECONDS)
-        until(lambda frame=frame: drawn(frame), "no scene in the frame")
+    frame = tab.locator("iframe").first
+    frame.wait_for()
+    assert tab.locator("iframe").count() == 2
+    frame.content_frame.locator("canvas").first.wait_for()
+    until(lambda: drawn(frame), "no scene in the frame")
     for name in ("sample_00.ply", "sample_01.html", "scene.json"):
-        tab.get_by_text(name).wait_for(timeout=1000 * SECONDS)
+        tab.get_by_text(name).wait_for()
 
 
 def drawn(frame) -> bool:
