@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-browser fuzz reliability check lock bench gpu docs notebooks clean
+.PHONY: help demo demo-train test test-slow test-wheel test-browser fuzz reliability check lock bench gpu docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -62,6 +62,9 @@ test: check ## Lint, types and the tests (CPU, 4 minutes on two cores)
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
 
+test-wheel: $(READY) ## The wheel in a new environment: a prediction, a sweep and a page from an empty folder
+	$(BIN)/python -m pytest -q -m slow tests/test_wheel.py
+
 test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install chromium); skipped where it is missing
 	$(BIN)/python -m pytest -q -m browser -rs
 
@@ -96,8 +99,8 @@ docs: $(READY) ## The API reference, from the docstrings, in outputs/api
 	$(BIN)/pdoc --docformat google --output-directory outputs/api completesplat
 	@echo "outputs/api/completesplat.html"
 
-notebooks: $(READY) ## Run every notebook from top to bottom
-	$(BIN)/jupyter execute notebooks/*.ipynb
+notebooks: $(READY) ## Run every notebook from top to bottom, and store what it prints and draws
+	$(BIN)/python tests/stored_notebooks.py
 
 clean: ## Remove everything that can be made again, the environment included
 	rm -rf .venv outputs multirun build dist .hypothesis .pytest_cache .mypy_cache .ruff_cache *.egg-info

@@ -3,7 +3,9 @@
 import os
 import shutil
 import signal
+import subprocess
 import sys
+import venv
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -18,6 +20,8 @@ from support import SMALL, call, tiny_generator
 from completesplat.data.pictures import photograph
 from completesplat.data.toy import write_objects
 from completesplat.signals import ENDING
+
+ROOT = Path(__file__).parents[1]
 
 # W&B would go on reading what later tests of the process print, and complain in their logs that its run has ended.
 os.environ.setdefault("WANDB_CONSOLE", "off")
@@ -108,6 +112,39 @@ def latent_cache(pipeline: Pipeline, packed_toys: Path, built_once: Folders) -> 
 def tiny_weights(built_once: Folders) -> Path:
     """Of an untrained model for pictures of 32 x 32."""
     return built_once("weights", lambda folder: tiny_generator().save_pretrained(folder))
+
+
+class Installed(NamedTuple):
+    """The wheel, and an environment with it in which what it requires is that of this one."""
+
+    wheel: Path
+    environment: Path
+
+    def run(self, folder: Path, *arguments: str | Path) -> str:
+        """What a program of the environment prints, which must succeed, in a folder."""
+        outside = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        command = [self.environment / "bin" / arguments[0], *arguments[1:]]
+        done = subprocess.run(command, cwd=folder, env=outside, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+        return done.stdout
+
+
+@pytest.fixture(scope="session")
+def installed(built_once: Folders) -> Installed:
+    """Nothing is downloaded but what builds the wheel (hatchling)."""
+
+    def install(folder: Path) -> None:
+        building = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+        subprocess.run(building, check=True)
+        venv.create(folder / "env", with_pip=True)
+        packages = next((folder / "env").glob("lib/python*/site-packages"))
+        (packages / "parent.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("-packages")))
+        # Forced, because this package may be installed here as well.
+        installing = ["-m", "pip", "install", "-q", "--no-deps", "--force-reinstall", *folder.glob("*.whl")]
+        subprocess.run([folder / "env/bin/python", *installing], check=True)
+
+    folder = built_once("installed", install)
+    return Installed(next(folder.glob("*.whl")), folder / "env")
 
 
 @pytest.fixture

@@ -61,6 +61,11 @@ def test_the_groups_of_settings_are_all_described():
     assert described == {path.name for path in (ROOT / "conf").iterdir() if path.is_dir()}
 
 
+def test_the_extras_are_all_described():
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE)
+    assert sorted(rows) == sorted(PROJECT["optional-dependencies"])
+
+
 def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
     citation = OmegaConf.load(ROOT / "CITATION.cff")
     paper, text = citation["preferred-citation"], README.read_text()

@@ -3,8 +3,7 @@
 import os
 import subprocess
 import sys
-import venv
-from pathlib import Path
+from functools import partial
 
 import pytest
 from omegaconf import OmegaConf
@@ -128,45 +127,25 @@ def test_what_cannot_be_begun_is_refused(command, own, given, said):
 
 
 @pytest.mark.slow
-def test_an_installed_wheel_does_what_the_documents_say_in_every_process(own, toy_root):
+def test_an_installed_wheel_does_what_the_documents_say_in_every_process(installed, own, toy_root):
     """Two training processes, worker processes that load data, and a job in a process of submitit's."""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", own / "dist", ROOT], check=True)
-    venv.create(own / "env", with_pip=True)
-    installed = next((own / "env").glob("lib/python*/site-packages"))
-    # What the wheel requires is there already.
-    (installed / "parent.pth").write_text("".join(f"{path}\n" for path in sys.path if path.endswith("site-packages")))
-    (wheel,) = (own / "dist").glob("*.whl")
-    subprocess.run([own / "env/bin/python", "-m", "pip", "install", "-q", "--no-deps", wheel], check=True)
-    work = own / "work"
-    work.mkdir()
-    for name in ("mine.py", "conf"):
-        (own / name).rename(work / name)
-
-    def run(*arguments: str) -> None:
-        done = subprocess.run(
-            [own / "env/bin/completesplat", *arguments], cwd=work, env=environment, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr[-3000:]
-
+    run = partial(installed.run, own, "completesplat")
     run("new", "dataset", "pictures")
-    subprocess.run([own / "env/bin/python", "-c", "import test_dataset_pictures as t; t.write('DATA')"], cwd=work)
+    installed.run(own, "python", "-c", "import test_dataset_pictures as t; t.write('DATA')")
     pictures = ["data=pictures", "data.root=DATA", "data.image_size=32"]
     run("data", "check", *pictures, "workers=2", "out=CHECK")
-    toys = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
-    processes = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "data.workers=1"]
-    run("fit", "experiment=toy_var", *OWN_TERM, *toys, *processes, "out=RUN")
-    run("fit", "-m", "experiment=toy_var", *OWN_TERM, *toys, "seed=0,1", "out=SWEEP")
-    run(
-        "fit",
-        "-m",
+    own_fit = [
         "experiment=toy_var",
         *OWN_TERM,
-        *toys,
-        "seed=choice(0)",
-        "hydra/launcher=submitit_local",
-        "out=JOBS",
-    )
+        f"data.root={toy_root}",
+        *SMALL,
+        "callbacks.pictures=null",
+        "test=false",
+    ]
+    processes = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "data.workers=1"]
+    run("fit", *own_fit, *processes, "out=RUN")
+    run("fit", "-m", *own_fit, "seed=0,1", "out=SWEEP")
+    run("fit", "-m", *own_fit, "seed=choice(0)", "hydra/launcher=submitit_local", "out=JOBS")
     for job in ("RUN", "SWEEP/seed-0", "SWEEP/seed-1", "JOBS/seed-0"):
-        assert strict_json(work / job / "metrics.json")["steps"] == 2
-        assert Path(work / job / "run.json").is_file()
+        assert strict_json(own / job / "metrics.json")["steps"] == 2
+        assert (own / job / "run.json").is_file()

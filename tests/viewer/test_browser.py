@@ -2,8 +2,12 @@
 
 import io
 import os
+import re
 import shutil
+import subprocess
+import sys
 import time
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -175,3 +179,45 @@ def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
     expected = ours(*seen.shape[:2], shrink=3)
     for _, color in BALLS.values():
         assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1)
+
+
+@pytest.fixture
+def space(tiny_weights):
+    """The address of a Space on this machine, in a process of its own."""
+    program = [sys.executable, "-m", "completesplat.viewer.space", str(tiny_weights)]
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    said: list[str] = []
+    for line in process.stdout:
+        said.append(line)
+        if "public link" in line:  # gradio's last word before it waits
+            yield re.search(r"http://127\.0\.0\.1:\d+", "".join(said))[0]
+            break
+    else:
+        pytest.fail("".join(said))
+    process.terminate()
+    process.wait(timeout=SECONDS)
+
+
+@pytest.mark.skipif(find_spec("gradio") is None, reason='gradio is not installed (pip install "completesplat[space]")')
+def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium, space, tmp_path):
+    file = tmp_path / "photo.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)).save(file)
+    tab = chromium.new_page(viewport={"width": 500, "height": 600})
+    tab.set_default_timeout(1000 * SECONDS)
+    tab.goto(space)
+    tab.locator("input[type=file]").first.set_input_files(file)
+    tab.get_by_role("button", name="Complete").click()
+    frame = tab.locator("iframe").first
+    frame.wait_for()
+    assert tab.locator("iframe").count() == 2
+    frame.content_frame.locator("canvas").first.wait_for()
+    until(lambda: drawn(frame), "no scene in the frame")
+    links = tab.eval_on_selector_all("a", "links => links.map(link => link.href)")
+    assert {"sample_00.ply", "sample_01.html", "scene.json"} <= {link.rpartition("/")[2] for link in links}
+
+
+def drawn(frame) -> bool:
+    """Whether the lower half of a frame, below viser's notices, shows more than one grey."""
+    seen = np.asarray(Image.open(io.BytesIO(frame.screenshot())).convert("RGB")).astype(float)
+    return bool(seen[len(seen) * 2 // 3 :].std() > 5)

@@ -1,0 +1,54 @@
+"""The stored notebooks are what `make notebooks` stores: run whole, in order, from the code that they have."""
+
+import base64
+import io
+import json
+from copy import deepcopy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from stored_notebooks import HASH, NOTEBOOKS, ROOT, WIDEST, code_cells, hash_of, slimmed
+
+MOST_BYTES = 1_000_000
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_has_the_outputs_of_its_code_and_nothing_of_the_machine(path):
+    notebook = json.loads(path.read_text())
+    assert notebook["metadata"]["completesplat"][HASH] == hash_of(notebook), "the code has changed: make notebooks"
+    cells = code_cells(notebook)
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    kinds = {(output["output_type"], output.get("name")) for output in outputs}
+    assert kinds <= {("stream", "stdout"), ("execute_result", None), ("display_data", None)}
+    assert any("image/jpeg" in output.get("data", {}) for output in outputs)
+    assert path.stat().st_size <= MOST_BYTES
+    assert not any(place in path.read_text() for place in (str(ROOT), str(Path.home()) + "/", "site-packages"))
+
+
+def test_the_first_notebook_installs_the_package_before_anything_needs_it():
+    first, second = (["".join(cell["source"]) for cell in code_cells(json.loads(NOTEBOOKS[0].read_text()))])[:2]
+    assert "%pip install" in first
+    assert "import completesplat" not in first
+    assert "import completesplat" in second
+
+
+def test_outputs_are_made_small_and_a_change_of_the_code_is_noticed():
+    noise = np.random.default_rng(0).integers(0, 255, (600, 2 * WIDEST, 3), np.uint8)
+    Image.fromarray(noise).save(buffer := io.BytesIO(), "PNG")
+    picture = {"image/png": base64.b64encode(buffer.getvalue()).decode(), "text/plain": "<a picture>"}
+    said = [{"output_type": "stream", "name": "stdout", "text": [f"{i}\n"]} for i in range(2)]
+    outputs = [*said, {"output_type": "display_data", "data": {"text/plain": "a bar"}}]
+    outputs.append({"output_type": "execute_result", "data": picture})
+    cell = {"cell_type": "code", "source": ["1 +\n", "1"], "outputs": outputs}
+    notebook = slimmed({"cells": [{"cell_type": "markdown", "source": ["text"]}, cell], "metadata": {}})
+    stream, result = cell["outputs"]
+    assert stream["text"] == ["0\n", "1\n"]
+    assert result["data"].keys() == {"image/jpeg", "text/plain"}
+    assert Image.open(io.BytesIO(base64.b64decode(result["data"]["image/jpeg"]))).size == (WIDEST, 300)
+    assert notebook["metadata"]["completesplat"][HASH] == hash_of(notebook)
+    changed = deepcopy(notebook)
+    code_cells(changed)[0]["source"] = ["1 + 1"]
+    assert hash_of(changed) != hash_of(notebook)

@@ -1,0 +1,54 @@
+"""The wheel: what is in it, and that it works from an empty folder, as somebody has it who has nothing else."""
+
+import re
+from email import message_from_bytes
+from functools import partial
+from zipfile import ZipFile
+
+import pytest
+from support import SMALL, strict_json
+from written_commands import ROOT
+
+pytestmark = pytest.mark.slow
+FOLDERS = {"completesplat": "completesplat", "conf": "completesplat/conf"}
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def files(folder: str) -> set[str]:
+    """Of the repository, as the wheel names them."""
+    paths = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    return {f"{FOLDERS[folder]}/{path.relative_to(ROOT / folder).as_posix()}" for path in paths}
+
+
+def test_the_wheel_has_the_package_its_settings_and_weights_and_no_link_that_leads_nowhere(installed):
+    with ZipFile(installed.wheel) as wheel:
+        names = set(wheel.namelist())
+        metadata = message_from_bytes(wheel.read(next(name for name in names if name.endswith(".dist-info/METADATA"))))
+    package = {name for name in names if ".dist-info/" not in name}
+    assert package == files("completesplat") | files("conf")
+    assert {"completesplat/py.typed", "completesplat/weights/toy_objects/model.safetensors"} <= package
+    assert "Typing :: Typed" in metadata.get_all("Classifier")
+    description, readme = metadata.get_payload(), (ROOT / "README.md").read_text()
+    assert [link for link in LINK.findall(description) if "://" not in link] == []
+    assert {link for link in LINK.findall(readme) if "://" in link} <= set(LINK.findall(description))
+    commands = [line for line in readme.splitlines() if line.startswith(("completesplat", "##"))]
+    assert [line for line in description.splitlines() if line.startswith(("completesplat", "##"))] == commands
+    assert "![" not in description
+    assert "*A toy scene" not in description
+
+
+def test_the_installed_wheel_predicts_sweeps_and_writes_a_page_from_an_empty_folder(installed, toy_root, tmp_path):
+    run = partial(installed.run, tmp_path, "completesplat")
+    place = installed.run(tmp_path, "python", "-c", "import completesplat; print(completesplat.__file__)")
+    assert place.startswith(str(installed.environment))
+    picture = next(toy_root.glob("*/*/images/*.jpg"))
+    run("predict", f"image={picture}", "samples=1", "steps=2", "frames=2", "out=SCENES")
+    scenes = tmp_path / "SCENES" / picture.stem
+    assert {path.name for path in scenes.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
+    brief = [f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
+    run("fit", "-m", "experiment=toy_var", *brief, "seed=0,1", "out=SWEEP")
+    assert [strict_json(tmp_path / f"SWEEP/seed-{seed}/metrics.json")["steps"] for seed in (0, 1)] == [2, 2]
+    run("report", "html", "runs=.", "out=PAGE")
+    (page,) = (tmp_path / "PAGE").glob("*.html")
+    assert picture.stem in page.read_text()
+    assert "seed-1" in page.read_text()
