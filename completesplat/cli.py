@@ -8,7 +8,7 @@ VERBS = {
     "data": "make, check, look at, import and prepare data sets",
     "fit": "train a model, one stage at a time",
     "test": "score a trained model on held-out scenes",
-    "predict": "draw complete scenes from photographs",
+    "predict": "draw complete scenes from photographs (predict photo.jpg [more.jpg ...])",
     "view": "a page in the browser: look at scenes, draw new ones from a photograph (view PATH)",
     "report": "tables beside the paper's (report runs=DIR), a page with all (report html), samplers, ... (report NAME)",
     "new": "start a part of your own in this folder: loss, rasterizer, dataset, ablation or experiment (new loss NAME)",

@@ -16,14 +16,13 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.commands import jobs, new, view
+from completesplat.commands import jobs
+from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
 from completesplat.commands.jobs import conf_folder
 from completesplat.errors import CompleteSplatError
 from completesplat.signals import ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
-TASKS = ("data", "bench", "report")
-SHORT_FORMS = {"view": view.overrides, "new": new.overrides}
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -37,8 +36,8 @@ UNHELPFUL_WARNINGS = (
 def launch(verb: str, arguments: list[str]) -> None:
     """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
-    `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`. `view PATH` is short
-    for `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
+    `data toy` is short for `data data_task=toy`, `predict A B` for `predict image=[A,B]`, `view PATH` for
+    `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
     """
     jobs.use_working_folder()
     # A further process of a job: Lightning starts one for each device.
@@ -51,13 +50,9 @@ def launch(verb: str, arguments: list[str]) -> None:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
     logging.raiseExceptions = False
-    flags, arguments = jobs.split_config_dir(arguments)
-    if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
-        arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
-    if verb in SHORT_FORMS:
-        arguments = SHORT_FORMS[verb](arguments)
-    arguments = [*flags, *arguments]
-    if "-m" in arguments or "--multirun" in arguments:
+    flags, arguments = split_config_dir(arguments)
+    arguments = [*flags, *for_hydra(verb, arguments)]
+    if any(flag in arguments for flag in SWEEP):
         arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")

@@ -37,7 +37,6 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
-CONFIG_DIR = ("--config-dir", "-cd")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -70,24 +69,6 @@ def composed(verb: str, *overrides: str) -> Any:
     use_working_folder()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(verb, overrides=list(overrides))
-
-
-def split_config_dir(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """What names a further folder of settings (`--config-dir DIR`), in one piece, and the other arguments.
-
-    Hydra takes its flags before or behind the settings, not between them. `CompleteSplatError`: no folder is named.
-    """
-    flags, others, given = [], [], iter(arguments)
-    for argument in given:
-        name, equals, folder = argument.partition("=")
-        if name not in CONFIG_DIR:
-            others.append(argument)
-            continue
-        folder = folder if equals else next(given, "")
-        if not folder:
-            raise CompleteSplatError(f"{name} needs a folder: {name} DIR")
-        flags.append(f"{CONFIG_DIR[0]}={folder}")
-    return flags, others
 
 
 def one_of_several() -> bool:

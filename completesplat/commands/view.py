@@ -1,7 +1,6 @@
 """`completesplat view`: a page on which to look at scenes and to draw new ones."""
 
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -13,7 +12,6 @@ from completesplat.schema import Range, Share, check_settings
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
-EXPORT = "--export"
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
@@ -31,23 +29,6 @@ class ViewNumbers(TypedDict):
     port: Annotated[int, Range(1, 65535)]
     frames: Annotated[int, Range(1, 1000)]
     background: Share
-
-
-def overrides(arguments: Sequence[str]) -> list[str]:
-    """Hydra's form of what people type: `PATH` is `path=PATH`, `--export FILE` is `export=FILE`."""
-    found, given = [], iter(arguments)
-    for argument in given:
-        name, value = "path", argument
-        if argument.partition("=")[0] == EXPORT:
-            name, value = "export", argument.partition("=")[2] or next(given, "")
-            if not value:
-                raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
-        elif argument.startswith("-") or "=" in argument:
-            found.append(argument)
-            continue
-        escaped = value.replace("'", "\\'")  # quoted, so that hydra takes every character as it is
-        found.append(f"{name}='{escaped}'")
-    return found
 
 
 def run(config: Any, out: Path) -> None:
