@@ -18,6 +18,7 @@ VERBS = {
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
     f"  {verb:9} {description}" for verb, description in VERBS.items()
 )
+USAGE += "\n\ncompletesplat completion bash|zsh|fish prints what makes that shell complete verbs, groups and settings"
 
 
 def main() -> None:
@@ -34,8 +35,21 @@ def main() -> None:
 
         print(f"completesplat {__version__}")
         return
+    if arguments[0] == "--complete":
+        from completesplat.shell import candidates
+
+        print("\n".join(candidates(arguments[1:], VERBS)))
+        return
+    if arguments[0] == "completion":
+        from completesplat.shell import SCRIPTS
+
+        if len(arguments) != 2 or arguments[1] not in SCRIPTS:
+            sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))
+        return print(SCRIPTS[arguments[1]], end="")
     if arguments[0] not in VERBS:
-        sys.exit(_refuse(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}"))
+        from completesplat.options import meant
+
+        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{meant(arguments[0], VERBS)}"))
 
     # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work at full speed, for
     # milliseconds, in which they keep the rasterizer's threads and other processes off the cores.

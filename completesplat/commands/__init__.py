@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import secrets
 import sys
 import time
@@ -16,13 +17,16 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.commands import jobs
+from completesplat.commands import help, jobs
 from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
-from completesplat.commands.jobs import conf_folder
+from completesplat.commands.settings import misspelt
 from completesplat.errors import CompleteSplatError
+from completesplat.options import conf_folder
 from completesplat.signals import ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
+CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
+LIGHTNINGS = "MisconfigurationException"
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -45,6 +49,8 @@ def launch(verb: str, arguments: list[str]) -> None:
         out = Path(arguments[0].partition("=")[2])
         with ended_by_signals():
             return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+    if any(flag in arguments for flag in help.FLAGS):
+        return print(help.page(verb, arguments))
     program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
@@ -60,16 +66,20 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     failures: list[Exception] = []
 
-    def job(config: Any) -> None:
+    def job(config: Any) -> float | None:
         try:
             with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
-                jobs.run_job(verb, config, program, given)
+                return jobs.run_job(verb, config, program, given)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end
             failures.append(error)
+            return None
 
-    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
+    except (HydraException, ValueError) as error:
+        raise misspelt(error, verb, arguments, jobs.composed) or error from error
     if failures:
         raise failures[0]
 
@@ -104,11 +114,21 @@ def refusal(error: BaseException) -> str | None:
         return f"{key} is needed: give {key}=VALUE"
     if isinstance(error, InstantiationException):
         # A module or name that is not there may be misspelt; what else is raised while parts are made is a fault.
-        missing = error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError)
-        return " ".join(str(error.__cause__).split()) if missing else None
+        if error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError):
+            return " ".join(str(error.__cause__).split())
+        return _of_a_library(error)
     if isinstance(error, HydraException | OmegaConfBaseException):
         return " ".join(str(error).split())
     return None
+
+
+def _of_a_library(error: InstantiationException) -> str | None:
+    """One line for a setting that a library's class refuses; None for what the package itself raises."""
+    called, cause = CALLED.match(str(error)), error.__cause__
+    if called is None or not (isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS):
+        return None
+    key = str(error).rpartition("full_key: ")[2].strip()
+    return f"{key}: {' '.join(str(cause).split())}"
 
 
 def exit_status(error: BaseException) -> int:

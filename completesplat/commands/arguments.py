@@ -10,6 +10,7 @@ from hydra.errors import HydraException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.names import printable
+from completesplat.options import TASKS, groups, meant, options
 
 EXPORT = "--export"
 CONFIG_DIR = ("--config-dir", "-cd")
@@ -90,7 +91,6 @@ def of_task(verb: str) -> Callable[[Sequence[str]], list[str]]:
     return overrides
 
 
-TASKS = ("data", "bench", "report")
 SHORT_FORMS = {"predict": of_predict, "view": of_view, "new": of_new, **{verb: of_task(verb) for verb in TASKS}}
 
 
@@ -147,7 +147,9 @@ def _with_file(argument: str) -> str:
 def _refuse_unreadable(argument: str, sweep: bool) -> None:
     key, equals, value = argument.partition("=")
     if not equals and not argument.startswith("~"):
-        raise CompleteSplatError(f"{_shown(argument)}: no setting, which are given as key=value")
+        chosen = [f"{group}={argument}" for group in groups() if argument in options(group)]
+        nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else meant(argument, groups())
+        raise CompleteSplatError(f"{_shown(argument)}: no setting, which are given as key=value{nearest}")
     try:
         read = OverridesParser.create().parse_override(argument)
     except HydraException:

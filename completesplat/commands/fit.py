@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
@@ -16,6 +17,7 @@ from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.commands.settings import check_image_size
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import OneAnswer
@@ -61,6 +63,8 @@ def run(config: Any, out: Path) -> None:
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     refuse_missing(config)
+    check_image_size(config)
+    check_optimizer(config.optimizer)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     # What cannot be scored is refused now, not after the training.
@@ -129,6 +133,14 @@ def refuse_missing(config: Any) -> None:
         for key in sorted(OmegaConf.missing_keys(part)):
             example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
             raise CompleteSplatError(f"{key} is needed: give {key}={example}")
+
+
+def check_optimizer(config: Any) -> None:
+    """`CompleteSplatError`: the optimizer refuses its settings, which it sees when the model is there, without this."""
+    try:
+        instantiate(config, _convert_="all")([nn.Parameter(torch.zeros(1))])
+    except (ValueError, TypeError) as error:
+        raise CompleteSplatError(f"optimizer: {error}") from error
 
 
 def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:

@@ -6,8 +6,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from completesplat.commands.jobs import conf_folder
 from completesplat.errors import CompleteSplatError
+from completesplat.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")

@@ -4,11 +4,10 @@ import time
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
-from completesplat.schema import Range, Share, check_settings
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
@@ -18,19 +17,6 @@ MOST_CAMERAS = 24
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 
 
-class ViewNumbers(TypedDict):
-    """The settings that are numbers."""
-
-    samples: Annotated[int, Range(1, 8)]
-    skip_weight: Share | None
-    guidance_weight: Share
-    steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**31)]
-    port: Annotated[int, Range(1, 65535)]
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share
-
-
 def run(config: Any, out: Path) -> None:
     """Open the page and stay until Ctrl-C; with `export`, write it as a file instead."""
     try:
@@ -38,7 +24,6 @@ def run(config: Any, out: Path) -> None:
     except ImportError as error:
         raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
 
-    check_settings(ViewNumbers, config)
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
     page = make_page(config, out)
     try:

@@ -5,7 +5,8 @@ import pytest
 from support import compose_config
 from viewer_scenes import balls
 
-from completesplat.commands.view import ViewNumbers, data_cameras, settings_of
+from completesplat.commands.settings import View
+from completesplat.commands.view import data_cameras, settings_of
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.schema import check_settings
@@ -47,7 +48,7 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
 def test_settings_out_of_their_ranges_are_refused():
     for setting, said in (("samples=9", "between 1 and 8"), ("port=99999", "between 1 and 65535")):
         with pytest.raises(CompleteSplatError, match=f"{setting}: must lie {said}"):
-            check_settings(ViewNumbers, compose_config("view", setting))
+            check_settings(View, compose_config("view", setting))
 
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):
