@@ -18,9 +18,7 @@ def test_a_job_returns_the_figure_that_is_asked_for_and_names_those_that_it_has(
     assert optimized(None, tmp_path) is None
     assert optimized("val/psnr_novel", tmp_path) == 20.5
     assert math.isnan(optimized("val/loss", tmp_path))
-    said = (
-        r"^optimized_metric=val/psnr: no figure in .*, there are val/psnr_novel, val/loss; did you mean val/psnr_nov"
-    )
+    said = r"^optimized_metric=val/psnr: no figure in .*, there are val/psnr_novel, val/loss; did you mean val/psnr_nov"
     for name in ("val/psnr", "steps", "upper_bound", "test"):
         with pytest.raises(CompleteSplatError, match=said if name == "val/psnr" else "no figure in"):
             optimized(name, tmp_path)
