@@ -36,12 +36,12 @@ def main() -> None:
         print(f"completesplat {__version__}")
         return
     if arguments[0] == "--complete":
-        from completesplat.shell import candidates
+        from completesplat.options import candidates
 
         print("\n".join(candidates(arguments[1:], VERBS)))
         return
     if arguments[0] == "completion":
-        from completesplat.shell import SCRIPTS
+        from completesplat.options import SCRIPTS
 
         if len(arguments) != 2 or arguments[1] not in SCRIPTS:
             sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))

@@ -1,10 +1,11 @@
 """What can be chosen and set, as the files of `conf/` say: read line by line, comments too, without importing anything.
 
-A comment above a key or behind its value explains it; the first comment of a file is about the file.
+A comment above a key or behind its value explains it; the first comment of a file is about the file. Shells that
+complete the command line call `completesplat --complete WORDS`, which is answered from here: it has to be quick.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,50 @@ PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.7
+
+
+BASH = r"""# eval "$(completesplat completion bash)"   in ~/.bashrc
+_completesplat() {
+    local line=${COMP_LINE:0:COMP_POINT} current
+    local -a words
+    read -ra words <<< "$line"
+    [[ $line == *[[:space:]] ]] && words+=("")
+    current=${words[${#words[@]}-1]}
+    local IFS=$'\n'
+    COMPREPLY=($("${words[0]}" --complete "${words[@]:1}" 2>/dev/null))
+    # bash completes what follows the last =.
+    if [[ $current == *=* && $COMP_WORDBREAKS == *=* ]]; then
+        COMPREPLY=("${COMPREPLY[@]#"${current%%=*}="}")
+    elif [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *= ]]; then
+        compopt -o nospace 2>/dev/null
+    fi
+}
+complete -o default -F _completesplat completesplat
+"""
+ZSH = r"""#compdef completesplat
+# eval "$(completesplat completion zsh)"   in ~/.zshrc, below compinit
+_completesplat() {
+    local -a found
+    found=("${(@f)$("${words[1]}" --complete "${(@)words[2,CURRENT]}" 2>/dev/null)}")
+    found=(${found:#})
+    if (( ${#found} )); then
+        compadd -S '' -- "${found[@]}"
+    else
+        compset -P '*='
+        _files
+    fi
+}
+compdef _completesplat completesplat
+"""
+FISH = r"""# completesplat completion fish | source   in ~/.config/fish/config.fish
+function __completesplat
+    set -l words (commandline -opc) (commandline -ct)
+    $words[1] --complete $words[2..-1] 2>/dev/null
+end
+complete -c completesplat -a '(__completesplat)'
+"""
+SCRIPTS = {"bash": BASH, "zsh": ZSH, "fish": FISH}
+SWITCHES = ("true", "false")
 
 
 class Setting(NamedTuple):
@@ -35,7 +80,7 @@ class Choice(NamedTuple):
     comment: str
 
 
-class Written(NamedTuple):
+class ConfFile(NamedTuple):
     """What a file of `conf/` says. `package`: the place of its settings, if it names one."""
 
     about: str
@@ -74,7 +119,7 @@ def about_groups() -> dict[str, str]:
     return {name: about for names, about in NAMED.findall(text) for name in re.findall(r"`(\w+)`", names)}
 
 
-def read(name: str) -> Written:
+def read(name: str) -> ConfFile:
     """A file of `conf/`, by its name without ending: `fit`, `data/toy_objects`. `FileNotFoundError`: there is none."""
     for folder in folders():
         if (folder / f"{name}.yaml").is_file():
@@ -82,12 +127,12 @@ def read(name: str) -> Written:
     raise FileNotFoundError(name)
 
 
-def parse(text: str) -> Written:
+def parse(text: str) -> ConfFile:
     """What a file's lines say."""
     head: list[str] = []
     comments: list[str] = []
     package, above = None, [""]
-    found = Written("", None, [], [], [])
+    found = ConfFile("", None, [], [], [])
     lines = text.splitlines()
     while lines and (lines[0].startswith("#") or not lines[0]):
         line = lines.pop(0)
@@ -115,7 +160,7 @@ def parse(text: str) -> Written:
     return found._replace(about=about, package=package)
 
 
-def own_settings(written: Written, without: tuple[str, ...] = ()) -> Iterator[Setting]:
+def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[Setting]:
     """A file's settings that have values, in its order; not those below the keys in `without`."""
     keys = {setting.key for setting in written.settings}
     for setting in written.settings:
@@ -148,7 +193,7 @@ def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
     return list({setting.key: setting for setting in found}.values())
 
 
-def with_bases(group: str, option: str) -> Written:
+def with_bases(group: str, option: str) -> ConfFile:
     """An option's file with the settings and choices of those that it takes over."""
     written = read(f"{group}/{option}")
     inherited = [with_bases(group, base) for base in written.bases]
@@ -167,3 +212,42 @@ def meant(name: str, names: Any, most: int = 3) -> str:
     """What to add to a message on a name that is not there: the nearest of those that are, if any is near."""
     found = get_close_matches(name, list(names), n=most, cutoff=LEAST_LIKE)
     return f"; did you mean {' or '.join(found)}?" if found else ""
+
+
+def candidates(words: Sequence[str], verbs: Collection[str]) -> list[str]:
+    """What the last of the words behind `completesplat` may become; an empty list where that may be anything."""
+    if len(words) < 2:
+        found = [*verbs, "completion"]
+    elif words[0] == "completion":
+        found = list(SCRIPTS)
+    elif words[0] in verbs:
+        found = _behind_verb(words[0], words[1:])
+    else:
+        found = []
+    return [one for one in found if one.startswith(words[-1] if words else "")]
+
+
+def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
+    tasks = options(f"{verb}_task") if verb in TASKS else []
+    task = None
+    if tasks:
+        task = next(choice.option for choice in read(verb).choices if choice.group == f"{verb}_task")
+        task = words[0] if words[0] in tasks and len(words) > 1 else task
+    chosen = {choice.place: (choice.group, choice.option) for choice in choices_of_verb(verb, task)}
+    for word in words[:-1]:
+        place, _, option = word.partition("=")
+        if place in chosen and option in options(chosen[place][0]):
+            chosen[place] = (chosen[place][0], option)
+    settings = {setting.key: setting.value for setting in settings_of_verb(verb, task)}
+    for place, (group, option) in chosen.items():
+        if option in options(group) and group not in ("experiment", "ablation"):
+            own = settings_of_option(group, option, None if place == group else place)
+            settings |= {one.key: one.value for one in own if not one.key.rpartition(".")[2].startswith("_")}
+    key, equals, _ = words[-1].partition("=")
+    if equals:
+        values = options(chosen[key][0]) if key in chosen else SWITCHES if settings.get(key) in SWITCHES else ()
+        return [f"{key}={value}" for value in values]
+    found = [f"{name}=" for name in [*settings, *chosen]]
+    # Keys below the first point are shown when it is typed.
+    near = [name for name in found if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
+    return [*(tasks if len(words) == 1 else []), *near, "--help"]

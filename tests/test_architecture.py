@@ -23,7 +23,7 @@ LAYERS = """
     errors names options signals atomic schema ply_files weights tensors geometry gaussians splatter_image scene
     rasterizers
     data autoreconstructor diffusion losses metrics baselines parts scene_model published generation export training
-    viewer results studies commands shell cli
+    viewer results studies commands cli
     benchmarks
 """
 FLOORS = LAYERS.split()

@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from support import compose_config
 
 from completesplat.cli import VERBS
@@ -78,5 +79,7 @@ def _first_job(argument: str) -> str:
     override = OverridesParser.create().parse_override(argument)
     if not override.is_sweep_override():
         return argument
+    if isinstance(override.value(), IntervalSweep):
+        return f"{override.get_key_element()}={override.value().start}"
     value = "full" if "glob(" in argument else str(next(override.sweep_string_iterator()))
     return f"{override.get_key_element()}={value}"

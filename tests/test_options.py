@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from completesplat.cli import VERBS
-from completesplat.shell import SCRIPTS, candidates
+from completesplat.options import SCRIPTS, candidates
 
 
 def completed(*words: str) -> list[str]:
@@ -20,7 +20,7 @@ def test_verbs_tasks_groups_options_and_settings_are_completed():
     assert completed("data", "ch") == ["check"]
     assert completed("fit", "experiment=toy_v")[0] == "experiment=toy_var"
     assert completed("fit", "optimizer.l") == ["optimizer.lr="]
-    assert completed("fit", "opt") == ["optimizer.lr=", "optimizer="]
+    assert completed("fit", "opt") == ["optimized_metric=", "optimizer.lr=", "optimizer="]
     assert "data.root=" in completed("fit", "data.")
     assert "data.category=" not in completed("fit", "data=toy_rooms", "data.")
     assert completed("predict", "sam") == ["samples=", "sampler="]
