@@ -8,7 +8,7 @@ VERBS = {
     "data": "make, check, look at, import and prepare data sets",
     "fit": "train a model, one stage at a time",
     "test": "score a trained model on held-out scenes",
-    "predict": "draw complete scenes from photographs",
+    "predict": "draw complete scenes from photographs (predict photo.jpg [more.jpg ...])",
     "view": "a page in the browser: look at scenes, draw new ones from a photograph (view PATH)",
     "report": "tables beside the paper's (report runs=DIR), a page with all (report html), samplers, ... (report NAME)",
     "new": "start a part of your own in this folder: loss, rasterizer, dataset, ablation or experiment (new loss NAME)",
@@ -18,6 +18,7 @@ VERBS = {
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
     f"  {verb:9} {description}" for verb, description in VERBS.items()
 )
+USAGE += "\n\ncompletesplat completion bash|zsh|fish prints what makes that shell complete verbs, groups and settings"
 
 
 def main() -> None:
@@ -34,8 +35,21 @@ def main() -> None:
 
         print(f"completesplat {__version__}")
         return
+    if arguments[0] == "--complete":
+        from completesplat.options import candidates
+
+        print("\n".join(candidates(arguments[1:], VERBS)))
+        return
+    if arguments[0] == "completion":
+        from completesplat.options import SCRIPTS
+
+        if len(arguments) != 2 or arguments[1] not in SCRIPTS:
+            sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))
+        return print(SCRIPTS[arguments[1]], end="")
     if arguments[0] not in VERBS:
-        sys.exit(_refuse(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}"))
+        from completesplat.options import meant
+
+        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{meant(arguments[0], VERBS)}"))
 
     # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work at full speed, for
     # milliseconds, in which they keep the rasterizer's threads and other processes off the cores.

@@ -1,5 +1,6 @@
 """Settings are checked against the signature of the function that they start, before anything is done."""
 
+import inspect
 import math
 import typing
 from collections.abc import Mapping, Sequence
@@ -9,7 +10,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args,
 
 from completesplat.errors import CompleteSplatError
 
-KINDS = {int: "a whole number", float: "a number", bool: "true or false", NoneType: "null"}
+MOST_SHOWN = 1e6  # bounds above it are no help
+KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,10 @@ class Range:
             return None
         limited = f"lie between {self.least:g} and {self.most:g}"
         return f"must be at least {self.least:g}" if math.isinf(self.most) else f"must {limited}"
+
+    def words(self) -> str:
+        """The range in a few words."""
+        return f"at least {self.least:g}" if self.most > MOST_SHOWN else f"{self.least:g} to {self.most:g}"
 
 
 @dataclass(frozen=True)
@@ -72,6 +78,7 @@ class Exactly:
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
 Share = Annotated[float, Range(0, 1)]
+Side = Annotated[int, Range(8, 4096)]  # of a picture, in pixels
 
 # Sizes of networks. Their bounds lie beyond what anyone trains; they hold off configurations that strangers wrote.
 Width = Annotated[int, Range(1, 8192)]
@@ -99,10 +106,14 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
     """
     hints = hints_of(function)
     for name in [name for name in settings if name in hints]:
-        for place, value, reason in refused(hints[name], settings[name]):
-            key = name + place
-            example = f", such as {key}=[{value}]" if reason == "must be a list" else ""
-            raise CompleteSplatError(f"{key}={value}: {reason}{example}")
+        check_value(name, hints[name], settings[name])
+
+
+def check_value(key: str, annotation: Any, value: Any) -> None:
+    """Hold one setting against an annotation; `CompleteSplatError`: it does not fit, with what it may be."""
+    for place, part, reason in refused(annotation, value):
+        example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
+        raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
 
 
 def hints_of(function: Any) -> dict[str, Any]:
@@ -113,6 +124,28 @@ def hints_of(function: Any) -> dict[str, Any]:
     return hints
 
 
+def arguments_of(target: Any) -> tuple[dict[str, Any], bool]:
+    """Annotations of what a class or function is called with, by name, and whether there are no others.
+
+    What a class hands on to the one above it (`**settings: Any`) is the other's.
+    """
+    kinds = target.__mro__ if isinstance(target, type) else ()
+    functions = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [target]
+    found: dict[str, Any] = {}
+    for function in functions:
+        try:
+            hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
+        except (NameError, TypeError, ValueError):  # of others: they may name what is there for type checkers alone
+            return found, False
+        named = {one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)}
+        more = [one for one in parameters if one.kind is one.VAR_KEYWORD]
+        named |= {name for name in hints if name != "return"} - {one.name for one in parameters}
+        found = {name: hints.get(name, Any) for name in named - {"self"}} | found
+        if not more or get_origin(get_type_hints(function).get(more[0].name)) is Unpack:
+            return found, True
+    return found, False
+
+
 def refused(annotation: Any, value: Any) -> list[Refused]:
     """The parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)
@@ -121,7 +154,14 @@ def refused(annotation: Any, value: Any) -> list[Refused]:
         reasons = [rule.refusal(value) for rule in rules] if not refused(kind, value) else []
         return refused(kind, value) + [Refused("", value, reason) for reason in reasons if reason]
     if origin in (Union, UnionType):
-        found = [refused(member, value) for member in arguments]
+        literals = [one for member in arguments for one in get_args(member) if get_origin(member) is Literal]
+        if literals and all(get_origin(member) is Literal or member is NoneType for member in arguments):
+            choices = (*literals, None) if NoneType in arguments else tuple(literals)
+            return refused(Annotated[Any, OneOf(choices)], value)
+        # What is written in settings is no object of another class (`float | Tensor`); alone, that may be anything.
+        plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
+        numbers = {int, float} & set(arguments) and isinstance(value, str | int | float | Sequence)
+        found = [refused(member, value) for member in (plain if numbers else arguments)]
         return [] if [] in found else found[0]
     if origin is Literal:
         return refused(Annotated[Any, OneOf(arguments)], value)
@@ -140,6 +180,25 @@ def refused(annotation: Any, value: Any) -> list[Refused]:
     if annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
     return []
+
+
+def described(annotation: Any) -> str:
+    """What a setting with this annotation may be, in a few words; empty where that is not known."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        kind, *rules = arguments
+        choices = [", ".join(map(str, rule.choices)) for rule in rules if isinstance(rule, OneOf)]
+        ranges = [rule.words() for rule in rules if isinstance(rule, Range)]
+        return ", ".join(choices or filter(None, [described(kind), *ranges]))
+    if origin in (Union, UnionType):
+        return " or ".join(dict.fromkeys(filter(None, map(described, arguments))))
+    if origin is Literal:
+        return ", ".join(map(str, arguments))
+    if origin is Sequence:
+        return "list"
+    if origin is Mapping or typing.is_typeddict(annotation):
+        return "mapping"
+    return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
 
 
 def _is_a(kind: type, value: Any) -> bool:

@@ -5,10 +5,12 @@ import shlex
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
 from support import compose_config
 
 from completesplat.cli import VERBS
-from completesplat.commands import SHORT_FORMS, TASKS, conf_folder
+from completesplat.commands import conf_folder
+from completesplat.commands.arguments import SWEEP, for_hydra
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -69,17 +71,15 @@ def composed(command: str):
         hydra.errors.HydraException: the command would be refused.
     """
     verb, *arguments = arguments_of(command)
-    arguments = [argument for argument in arguments if argument not in ("-m", "--multirun")]
-    if verb in TASKS and arguments and "=" not in arguments[0]:
-        arguments[0] = f"{verb}_task={arguments[0]}"
-    if verb in SHORT_FORMS:
-        arguments = SHORT_FORMS[verb](arguments)
-    return compose_config(verb, *map(_first_job, arguments))
+    given = [argument for argument in for_hydra(verb, arguments) if argument not in SWEEP]
+    return compose_config(verb, *map(_first_job, given))
 
 
 def _first_job(argument: str) -> str:
     override = OverridesParser.create().parse_override(argument)
     if not override.is_sweep_override():
         return argument
+    if isinstance(override.value(), IntervalSweep):
+        return f"{override.get_key_element()}={override.value().start}"
     value = "full" if "glob(" in argument else str(next(override.sweep_string_iterator()))
     return f"{override.get_key_element()}={value}"

@@ -15,6 +15,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Views
+from completesplat.schema import Positive, Share
 from completesplat.splatter_image import SH_C0
 
 Render = Callable[[Gaussians, Cameras], Tensor]
@@ -37,10 +38,10 @@ class FittingSettings:
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
     """
 
-    count: int = 4000
-    steps: int = 300
-    views: int = 2
-    opacity: float = 0.1
+    count: Positive = 4000
+    steps: Positive = 300
+    views: Positive = 2
+    opacity: Share = 0.1
     position_rate: float = 30.0
     other_rates: float = 4.0
 

@@ -106,6 +106,7 @@ class PublishedSplatterImage(nn.Module):
     def __init__(self, weights: str) -> None:
         super().__init__()
         file, data, model = find(weights)
+        self.file = file
         size = self.image_size = data["training_resolution"]
         self.background = float(data["white_background"])
         self.depths = Depths(data["znear"], data["zfar"], data["origin_distances"])

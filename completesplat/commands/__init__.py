@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import secrets
 import sys
 import time
@@ -16,14 +17,16 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.commands import jobs, new, view
-from completesplat.commands.jobs import conf_folder
+from completesplat.commands import help, jobs
+from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
+from completesplat.commands.settings import misspelt
 from completesplat.errors import CompleteSplatError
+from completesplat.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
-TASKS = ("data", "bench", "report")
-SHORT_FORMS = {"view": view.overrides, "new": new.overrides}
+CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
+LIGHTNINGS = "MisconfigurationException"
 UNHELPFUL_WARNINGS = (
     ".*does not have many workers.*",
     ".*but have no `val_dataloader`.*",
@@ -37,8 +40,8 @@ UNHELPFUL_WARNINGS = (
 def launch(verb: str, arguments: list[str]) -> None:
     """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
-    `data`, `bench` and `report` have several tasks: `data toy` is short for `data data_task=toy`. `view PATH` is short
-    for `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
+    `data toy` is short for `data data_task=toy`, `predict A B` for `predict image=[A,B]`, `view PATH` for
+    `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
     """
     jobs.use_working_folder()
     # A further process of a job: Lightning starts one for each device.
@@ -48,18 +51,16 @@ def launch(verb: str, arguments: list[str]) -> None:
         end_with(int(starter))
         with ended_by_signals():
             return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+    if any(flag in arguments for flag in help.FLAGS):
+        return print(help.page(verb, arguments))
     program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
     logging.raiseExceptions = False
-    flags, arguments = jobs.split_config_dir(arguments)
-    if verb in TASKS and arguments and "=" not in arguments[0] and not arguments[0].startswith("-"):
-        arguments = [f"{verb}_task={arguments[0]}", *arguments[1:]]
-    if verb in SHORT_FORMS:
-        arguments = SHORT_FORMS[verb](arguments)
-    arguments = [*flags, *arguments]
-    if "-m" in arguments or "--multirun" in arguments:
+    flags, arguments = split_config_dir(arguments)
+    arguments = [*flags, *for_hydra(verb, arguments)]
+    if any(flag in arguments for flag in SWEEP):
         arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
@@ -67,16 +68,20 @@ def launch(verb: str, arguments: list[str]) -> None:
 
     failures: list[Exception] = []
 
-    def job(config: Any) -> None:
+    def job(config: Any) -> float | None:
         try:
             with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
-                jobs.run_job(verb, config, program, given)
+                return jobs.run_job(verb, config, program, given)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
                 raise  # hydra says which job it was, goes on with the others, and raises in the end
             failures.append(error)
+            return None
 
-    hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
+    except (HydraException, ValueError) as error:
+        raise misspelt(error, verb, arguments, jobs.composed) or error from error
     if failures:
         raise failures[0]
 
@@ -111,11 +116,21 @@ def refusal(error: BaseException) -> str | None:
         return f"{key} is needed: give {key}=VALUE"
     if isinstance(error, InstantiationException):
         # A module or name that is not there may be misspelt; what else is raised while parts are made is a fault.
-        missing = error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError)
-        return " ".join(str(error.__cause__).split()) if missing else None
+        if error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError):
+            return " ".join(str(error.__cause__).split())
+        return _of_a_library(error)
     if isinstance(error, HydraException | OmegaConfBaseException):
         return " ".join(str(error).split())
     return None
+
+
+def _of_a_library(error: InstantiationException) -> str | None:
+    """One line for a setting that a library's class refuses; None for what the package itself raises."""
+    called, cause = CALLED.match(str(error)), error.__cause__
+    if called is None or not (isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS):
+        return None
+    key = str(error).rpartition("full_key: ")[2].strip()
+    return f"{key}: {' '.join(str(cause).split())}"
 
 
 def exit_status(error: BaseException) -> int:

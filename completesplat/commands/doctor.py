@@ -20,8 +20,8 @@ from rich.table import Table
 from rich.text import Text
 
 from completesplat import __version__
-from completesplat.commands.jobs import conf_folder
 from completesplat.commands.protocol import write_json
+from completesplat.options import conf_folder
 
 ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {

@@ -6,16 +6,19 @@ import math
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import OmegaConf
 from torch import nn
 
+from completesplat.baselines.published import PublishedSplatterImage
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.commands.settings import check_image_size
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import OneAnswer
@@ -28,6 +31,7 @@ from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
+from completesplat.weights.splatter_image import write_trained
 
 logger = logging.getLogger(__name__)
 
@@ -61,11 +65,14 @@ def run(config: Any, out: Path) -> None:
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     refuse_missing(config)
+    check_image_size(config)
+    check_optimizer(config.optimizer)
     seed_everything(config.seed, verbose=False)
     data = instantiate(config.data, _convert_="all")
     # What cannot be scored is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
     module = instantiate(config.model, _convert_="all")
+    check_published_size(module, config)
     if tested is not None:
         set_scoring(module, config.evaluation)
     callbacks, loggers = _parts(config.callbacks), _parts(config.logger)
@@ -131,8 +138,24 @@ def refuse_missing(config: Any) -> None:
             raise CompleteSplatError(f"{key} is needed: give {key}={example}")
 
 
+def check_published_size(module: Any, config: Any) -> None:
+    """`CompleteSplatError`: published weights know pictures of another size than the data have."""
+    network = getattr(module, "model", None)
+    if isinstance(network, PublishedSplatterImage) and config.data.image_size != network.image_size:
+        said = f"{network.file.name} wants {network.image_size}"
+        raise CompleteSplatError(f"data.image_size={config.data.image_size}: {said}")
+
+
+def check_optimizer(config: Any) -> None:
+    """`CompleteSplatError`: the optimizer refuses its settings, which it sees when the model is there, without this."""
+    try:
+        instantiate(config, _convert_="all")([nn.Parameter(torch.zeros(1))])
+    except (ValueError, TypeError) as error:
+        raise CompleteSplatError(f"optimizer: {error}") from error
+
+
 def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:
-    """Write what `predict` and `from_pretrained` read: of either stage, and of the baseline Splatter Image.
+    """Write what `predict` and `from_pretrained` read: of either stage, and of Splatter Image, the published one too.
 
     A network that weights may not name is left out, with a warning.
     """
@@ -141,6 +164,8 @@ def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:
         return module.completesplat.save_pretrained(folder)
     if type(module) is not ReconstructionModule:
         return None
+    if isinstance(module.model, PublishedSplatterImage):
+        return write_trained(folder, module.model.file, module.model.state_dict())
     architecture: Any = {"network": OmegaConf.to_container(config.model.model), "image_size": config.data.image_size}
     try:
         model = OneAnswer.with_trained(architecture, module.model.state_dict(), module.camera)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import platform
 import re
@@ -27,7 +28,9 @@ from omegaconf import OmegaConf
 from completesplat import __version__
 from completesplat.atomic import atomic_path, writing
 from completesplat.commands.protocol import git_commit, write_json
+from completesplat.commands.settings import check_verb
 from completesplat.errors import CompleteSplatError
+from completesplat.options import conf_folder, meant
 from completesplat.results.runs import typed
 from completesplat.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
@@ -37,14 +40,7 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
-CONFIG_DIR = ("--config-dir", "-cd")
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
-
-
-def conf_folder() -> Path:
-    """The configuration tree: inside an installed package, or beside it in the repository."""
-    package = Path(__file__).parents[1]
-    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
@@ -70,24 +66,6 @@ def composed(verb: str, *overrides: str) -> Any:
     use_working_folder()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(verb, overrides=list(overrides))
-
-
-def split_config_dir(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """What names a further folder of settings (`--config-dir DIR`), in one piece, and the other arguments.
-
-    Hydra takes its flags before or behind the settings, not between them. `CompleteSplatError`: no folder is named.
-    """
-    flags, others, given = [], [], iter(arguments)
-    for argument in given:
-        name, equals, folder = argument.partition("=")
-        if name not in CONFIG_DIR:
-            others.append(argument)
-            continue
-        folder = folder if equals else next(given, "")
-        if not folder:
-            raise CompleteSplatError(f"{name} needs a folder: {name} DIR")
-        flags.append(f"{CONFIG_DIR[0]}={folder}")
-    return flags, others
 
 
 def one_of_several() -> bool:
@@ -162,11 +140,11 @@ def job_name(*keys: str, _root_: Any) -> str:
     return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
 
 
-def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
+def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | None:
     """Run one job in its own directory, leaving there what is needed to know what was run.
 
     A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
-    started with the arguments `given` behind the verb.
+    started with the arguments `given` behind the verb. The result is that of `optimized`, for sweepers that want it.
     """
     use_working_folder()  # a cluster may have started this process
     hydra_config = HydraConfig.get()
@@ -176,7 +154,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
-        return
+        return optimized(config.get("optimized_metric"), out)
     first = is_first()
     if first:
         with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
@@ -194,6 +172,23 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> None:
             print(_said(stop, verb, given, out), file=sys.stderr)
         raise
     print(out)
+    return optimized(config.get("optimized_metric"), out)
+
+
+def optimized(metric: str | None, out: Path) -> float | None:
+    """A figure of a finished job, NaN if it was not finite; None if no metric is asked for.
+
+    `CompleteSplatError`: the job has no figure of this name; it names those that it has.
+    """
+    if metric is None:
+        return None
+    figures = json.loads((out / METRICS).read_text())
+    lost = {one.partition(": ")[0] for one in figures.get("not_finite", [])}
+    known = [name for name, x in figures.items() if name in lost or isinstance(x, float)]
+    if metric not in known:
+        there = f"there are {', '.join(known)}{meant(metric, known)}"
+        raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {there}")
+    return math.nan if metric in lost else float(figures[metric])
 
 
 def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
@@ -213,6 +208,7 @@ def start(verb: str, config: Any, out: Path) -> None:
 
     A verb that has a single task calls its own.
     """
+    check_verb(verb, config)
     if config.get("task") is None:
         import_module(f"completesplat.commands.{verb}").run(config, out)
         return
@@ -232,7 +228,7 @@ def is_finished(out: Path, config: Any) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different -= {"ckpt_path", "data.allow_changed"}
+    different -= {"ckpt_path", "data.allow_changed", "optimized_metric"}
     if different:
         first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
         raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")

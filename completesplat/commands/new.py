@@ -2,27 +2,17 @@
 
 import keyword
 import re
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from completesplat.commands.jobs import conf_folder
 from completesplat.errors import CompleteSplatError
+from completesplat.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
 """A line of a template that names the file which follows."""
-
-
-def overrides(arguments: Sequence[str]) -> list[str]:
-    """Hydra's form of `KIND NAME`; `CompleteSplatError` for more words."""
-    words = [argument for argument in arguments if "=" not in argument and not argument.startswith("-")]
-    if len(words) > 2:
-        raise CompleteSplatError(f"give one kind and one name, not {' '.join(words)}")
-    keys = dict(zip(words, ("kind", "name"), strict=False))
-    return [f"{keys[argument]}='{argument}'" if argument in keys else argument for argument in arguments]
 
 
 def run(config: Any, out: Path) -> None:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Any
 
 from hydra.utils import instantiate
 from jaxtyping import Float
@@ -30,7 +30,6 @@ from completesplat.geometry.trajectories import PATHS
 from completesplat.names import folder_names, printable, safe_name
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel
-from completesplat.schema import Positive, Range, Share, check_settings
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
@@ -42,23 +41,8 @@ REMOVE = "remove"
 log = logging.getLogger(__name__)
 
 
-class PredictNumbers(TypedDict):
-    """The settings that are numbers. All samples of a picture, and all frames of a video, are in memory at once."""
-
-    samples: Annotated[int, Range(1, 1000)]
-    skip_weight: Share | None
-    guidance_weight: Share
-    steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**63 - 1)]
-    batch: Positive | None
-    fov: float | None
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share | Literal["remove"]
-
-
 def run(config: Any, out: Path) -> None:
     """Write each photograph's files into `out/<its name>/`."""
-    check_settings(PredictNumbers, config)
     pictures = find_pictures(config.image)
     if config.mask is not None and len(pictures) > 1:
         raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")

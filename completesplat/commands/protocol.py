@@ -11,7 +11,6 @@ from completesplat import __version__
 from completesplat.atomic import write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import origin
-from completesplat.weights import sha256_of
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -107,6 +106,7 @@ def drawing(module: Any) -> dict[str, Any]:
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
     """Path, checksum and step of a checkpoint, and whether it holds an average (Lightning's `WeightAveraging`)."""
+    from completesplat.weights import sha256_of
     from completesplat.weights.checkpoint_reading import read_checkpoint
 
     contents = read_checkpoint(path)

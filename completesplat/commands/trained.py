@@ -12,9 +12,9 @@ from typing import Any
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
-from completesplat.commands.jobs import conf_folder
 from completesplat.commands.protocol import checkpoint_facts
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.options import conf_folder
 from completesplat.parts import read_architecture
 from completesplat.schema import shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder

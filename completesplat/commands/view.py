@@ -1,53 +1,20 @@
 """`completesplat view`: a page on which to look at scenes and to draw new ones."""
 
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
-from completesplat.schema import Range, Share, check_settings
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
-EXPORT = "--export"
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
 SCENE_FILES = ("sample_*.ply", "scene.ply")
-
-
-class ViewNumbers(TypedDict):
-    """The settings that are numbers."""
-
-    samples: Annotated[int, Range(1, 8)]
-    skip_weight: Share | None
-    guidance_weight: Share
-    steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**31)]
-    port: Annotated[int, Range(1, 65535)]
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share
-
-
-def overrides(arguments: Sequence[str]) -> list[str]:
-    """Hydra's form of what people type: `PATH` is `path=PATH`, `--export FILE` is `export=FILE`."""
-    found, given = [], iter(arguments)
-    for argument in given:
-        name, value = "path", argument
-        if argument.partition("=")[0] == EXPORT:
-            name, value = "export", argument.partition("=")[2] or next(given, "")
-            if not value:
-                raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
-        elif argument.startswith("-") or "=" in argument:
-            found.append(argument)
-            continue
-        escaped = value.replace("'", "\\'")  # quoted, so that hydra takes every character as it is
-        found.append(f"{name}='{escaped}'")
-    return found
 
 
 def run(config: Any, out: Path) -> None:
@@ -57,7 +24,6 @@ def run(config: Any, out: Path) -> None:
     except ImportError as error:
         raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
 
-    check_settings(ViewNumbers, config)
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
     page = make_page(config, out)
     try:

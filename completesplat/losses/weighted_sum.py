@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.scene import Views
+from completesplat.schema import Natural
 from completesplat.tensors import TensorDataclass
 
 
@@ -38,6 +39,14 @@ class Weighted(NamedTuple):
     start_step: int = 0
 
 
+class Term(TypedDict, total=False):
+    """The settings of a `Weighted`."""
+
+    weight: float
+    term: Any
+    start_step: Natural
+
+
 class WeightedSum:
     """Sum of weighted terms, by name.
 
@@ -49,7 +58,7 @@ class WeightedSum:
         CompleteSplatError: there is nothing to train on at step 0.
     """
 
-    def __init__(self, terms: Mapping[str, Mapping[str, Any] | None]) -> None:
+    def __init__(self, terms: Mapping[str, Term | None]) -> None:
         self.terms = {name: Weighted(**entry) for name, entry in terms.items() if entry and entry["weight"]}
         if all(entry.start_step > 0 for entry in self.terms.values()):
             raise CompleteSplatError("no loss at step 0: loss.terms needs a term with start_step=0")

@@ -17,6 +17,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.schema import Positive, Share
 
 BAD_STEPS = "train/bad_steps"
 
@@ -54,7 +55,7 @@ class BadSteps(Callback):
         most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`.
     """
 
-    def __init__(self, most_bad_steps: int = 10) -> None:
+    def __init__(self, most_bad_steps: Positive = 10) -> None:
         if most_bad_steps < 1:
             raise CompleteSplatError(f"callbacks.bad_steps.most_bad_steps={most_bad_steps}: must be at least 1")
         self.most_bad_steps = most_bad_steps
@@ -109,7 +110,7 @@ class ExponentialMovingAverage(WeightAveraging):
     buffers drift by rounding; linear interpolation leaves them exactly as they are. The paper states no `decay`.
     """
 
-    def __init__(self, decay: float) -> None:
+    def __init__(self, decay: Share) -> None:
         averages: Callable[[float], Any] = get_ema_multi_avg_fn
         super().__init__(multi_avg_fn=averages(decay))
 

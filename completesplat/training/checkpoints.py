@@ -19,6 +19,7 @@ from torch import Tensor
 
 from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.stopping import agreed, end_training
@@ -73,9 +74,9 @@ class Checkpoints(Checkpoint):
     def __init__(
         self,
         folder: str,
-        every_n_train_steps: int | None = None,
+        every_n_train_steps: Positive | None = None,
         every_minutes: float | None = None,
-        keep_every: int | None = None,
+        keep_every: Positive | None = None,
     ) -> None:
         for name, steps in (("every_n_train_steps", every_n_train_steps), ("keep_every", keep_every)):
             if steps is not None and steps < 1:

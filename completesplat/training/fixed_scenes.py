@@ -20,6 +20,7 @@ from completesplat.export.pictures import SheetCell, color_depth, picture_sheet,
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
+from completesplat.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.reconstruction import ReconstructionModule
@@ -116,7 +117,7 @@ class Pictures(DrawsFixedScenes):
     has a posterior (`latent_bits`). Weights & Biases gets the pictures and histograms too.
     """
 
-    def __init__(self, folder: str, every_n_steps: int = 1000, scenes: int = 4) -> None:
+    def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
     def draw(self, trainer: Trainer, module: SceneModule, scenes: list[SceneBatch]) -> None:

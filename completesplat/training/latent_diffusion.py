@@ -17,6 +17,7 @@ from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
+from completesplat.schema import Positive, Share
 from completesplat.training.encoding import check_cache
 from completesplat.training.scene_module import SceneModule, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
@@ -55,11 +56,11 @@ class LatentDiffusion(SceneModule):
         completesplat: CompleteSplat,
         autoreconstructor_checkpoint: str | None = None,
         checkpoint: str | None = None,
-        unconditional_probability: float = 0.2,
-        skip_weight: float = 1.0,
-        guidance_weight: float = 0.0,
-        scale_batches: int = 50,
-        noise_draws: int = 1,
+        unconditional_probability: Share = 0.2,
+        skip_weight: Share = 1.0,
+        guidance_weight: Share = 0.0,
+        scale_batches: Positive = 50,
+        noise_draws: Positive = 1,
         channels_last: bool = False,
         compile: bool = False,
         **rendering_and_optimization: Any,

@@ -14,6 +14,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
+from completesplat.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.fixed_scenes import DrawsFixedScenes, log_drawings
 from completesplat.training.latent_diffusion import LatentDiffusion
@@ -35,7 +36,13 @@ class Samples(DrawsFixedScenes):
     """
 
     def __init__(
-        self, folder: str, every_n_steps: int = 2000, scenes: int = 2, samples: int = 4, views: int = 8, strip: int = 8
+        self,
+        folder: str,
+        every_n_steps: Positive = 2000,
+        scenes: Natural = 2,
+        samples: Positive = 4,
+        views: Positive = 8,
+        strip: Positive = 8,
     ) -> None:
         super().__init__(folder, every_n_steps, scenes, views)
         self.samples = samples

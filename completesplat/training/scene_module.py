@@ -23,6 +23,7 @@ from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import Evaluation
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
+from completesplat.schema import Share
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
@@ -114,7 +115,7 @@ class SceneModule(LightningModule):
         rasterizer: Rasterizer,
         optimizer: Callable[[Iterable[Tensor]], Optimizer],
         schedule: Callable[[Optimizer, float], LRScheduler],
-        background: float = 0.5,
+        background: Share = 0.5,
     ) -> None:
         super().__init__()
         self.rasterizer = rasterizer

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from completesplat.schema import Natural, Share
+
 
 def exponential(
-    optimizer: Optimizer, total_steps: float, warmup_steps: int = 100, final_ratio: float = 0.01
+    optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
 ) -> LambdaLR:
     """Linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
 
@@ -17,7 +19,9 @@ def exponential(
     return _after_warmup(optimizer, lambda x: math.exp(math.log(final_ratio) * x), total_steps, warmup_steps)
 
 
-def cosine(optimizer: Optimizer, total_steps: float, warmup_steps: int = 100, final_ratio: float = 0.01) -> LambdaLR:
+def cosine(
+    optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
+) -> LambdaLR:
     """Linear warm-up, then half a cosine down to `final_ratio` at the end."""
     half_a_cosine = lambda x: final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))  # noqa: E731
     return _after_warmup(optimizer, half_a_cosine, total_steps, warmup_steps)

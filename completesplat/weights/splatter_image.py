@@ -13,9 +13,10 @@ import torch
 import yaml
 from torch import Tensor
 
+from completesplat.atomic import atomic_path, write_text
 from completesplat.errors import WeightsError
 from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
-from completesplat.weights import read_small
+from completesplat.weights import RUN_WEIGHTS, read_small
 
 HUB = "szymanowiczs/splatter-image-v1"
 PREFIX = "splatter_image:"
@@ -65,7 +66,7 @@ class Published(NamedTuple):
 
 
 def is_published(weights: Path | str) -> bool:
-    """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or a folder that has one."""
+    """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
     path = Path(str(weights)).expanduser()
     return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (path.is_dir() and bool(_models_in(path)))
 
@@ -97,8 +98,18 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     return tensors
 
 
+def write_trained(folder: Path, weights: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write weights that were trained on, as their authors' files: their settings go with them as they are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    config = _config_beside(weights)
+    write_text(folder / config.name, read_small(config))
+    with atomic_path(folder / weights.name) as temporary:
+        torch.save({STATE: {name: value.detach().cpu() for name, value in tensors.items()}}, temporary)
+
+
 def _models_in(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("model_*.pth") if _config_beside(path).is_file())
+    found = [*folder.glob("model_*.pth"), *(folder / RUN_WEIGHTS).glob("model_*.pth")]
+    return sorted(path for path in found if _config_beside(path).is_file())
 
 
 def _config_beside(model: Path) -> Path:

@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 from written_commands import ROOT
 
-from completesplat.commands.jobs import composed, split_config_dir
+from completesplat.commands.arguments import split_config_dir
+from completesplat.commands.jobs import composed
 
 MINE = """
 from torch import nn

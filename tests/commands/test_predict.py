@@ -9,7 +9,8 @@ from PIL import Image
 from plyfile import PlyData
 from support import compose_config, strict_json
 
-from completesplat.commands.predict import PredictNumbers, visible_part
+from completesplat.commands.predict import visible_part
+from completesplat.commands.settings import Predict
 from completesplat.errors import CompleteSplatError
 from completesplat.schema import check_settings
 
@@ -114,7 +115,7 @@ def test_settings_have_ranges():
         ("guidance_weight=-1", "0 and 1"),
     ):
         with pytest.raises(CompleteSplatError, match=f"{setting}: must .*{least}"):
-            check_settings(PredictNumbers, compose_config("predict", "image=a.png", setting))
+            check_settings(Predict, compose_config("predict", "image=a.png", setting))
 
 
 def test_what_hides_nothing_is_refused(tmp_path):

@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from PIL import Image
 from published_weights import write_published
-from support import compose_config, strict_json
+from support import SMALL, compose_config, strict_json
 
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -143,6 +143,27 @@ def test_the_option_of_fit_is_the_same_network(tmp_path):
     assert OmegaConf.is_missing(compose_config("fit", settings[0]).model.model, "weights")
     assert (module.method, module.draws_samples) == ("PublishedSplatterImage", False)
     assert all(parameter.requires_grad for parameter in module.model.parameters())
+
+
+def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tmp_path):
+    weights = write_published(tmp_path / "captures", "hydrants", size=32)
+    given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
+    given += [f"data.root={toy_root}", "data.background=0", "callbacks.pictures=null", "test=false"]
+    refused = command("fit", *given, "data.image_size=64", "out=OTHER")
+    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth wants 32\n")
+    trained = command("fit", *given, "optimizer.lr=1e-3", "out=RUN")
+    assert trained.status == 0, trained.err
+    assert {path.name for path in (tmp_path / "RUN/weights").iterdir()} == {
+        "config_hydrants.yaml",
+        "model_hydrants.pth",
+    }
+    before, after = (CompleteSplat.from_pretrained(path).network.state_dict() for path in (weights, tmp_path / "RUN"))
+    same = {name for name, value in before.items() if torch.equal(value, after[name])}
+    assert same < set(before)
+    quick = ["samples=1", "video=[]", "rasterizer=reference", "out=OUT"]
+    finished = command("predict", str(cut_out(tmp_path / "a.png")), "weights=RUN", *quick)
+    assert finished.status == 0, finished.err
+    assert (tmp_path / "OUT/a/sample_00.ply").is_file()
 
 
 def test_the_page_has_no_sliders_for_one_answer(tmp_path):

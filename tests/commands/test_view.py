@@ -5,24 +5,11 @@ import pytest
 from support import compose_config
 from viewer_scenes import balls
 
-from completesplat.commands.view import ViewNumbers, data_cameras, overrides, settings_of
+from completesplat.commands.settings import View
+from completesplat.commands.view import data_cameras, settings_of
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.schema import check_settings
-
-
-@pytest.mark.parametrize(
-    ("typed", "given"),
-    [
-        (["image=a.png", "weights=b"], ["image=a.png", "weights=b"]),
-        (["it's a,b.ply", "port=1"], ["path='it\\'s a,b.ply'", "port=1"]),
-        (["--export", "page.html", "scene.ply"], ["export='page.html'", "path='scene.ply'"]),
-        (["scene.ply", "--export=a=b.html"], ["path='scene.ply'", "export='a=b.html'"]),
-        (["--help"], ["--help"]),
-    ],
-)
-def test_a_path_and_the_flag_become_settings(typed, given):
-    assert overrides(typed) == given
 
 
 def folder(path, *names: str):
@@ -58,12 +45,10 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
             settings_of(tmp_path / path)
 
 
-def test_the_flag_without_a_file_and_settings_out_of_their_ranges_are_refused():
-    with pytest.raises(CompleteSplatError, match="--export needs a file"):
-        overrides(["scene.ply", "--export"])
+def test_settings_out_of_their_ranges_are_refused():
     for setting, said in (("samples=9", "between 1 and 8"), ("port=99999", "between 1 and 65535")):
         with pytest.raises(CompleteSplatError, match=f"{setting}: must lie {said}"):
-            check_settings(ViewNumbers, compose_config("view", setting))
+            check_settings(View, compose_config("view", setting))
 
 
 def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path):

@@ -12,6 +12,7 @@ from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import CompleteSplatError
+from completesplat.schema import Natural, Positive, Share
 
 
 class CO3DDataModule(SceneDataModule):
@@ -44,15 +45,15 @@ class CO3DDataModule(SceneDataModule):
         category: str,
         subset: str | None = "fewview_dev",
         allow_shared_sequences: bool = False,
-        val_fraction: float = 0.05,
-        test_fraction: float = 0.1,
-        split_seed: int = 0,
-        min_frames: int = 2,
+        val_fraction: Share = 0.05,
+        test_fraction: Share = 0.1,
+        split_seed: Natural = 0,
+        min_frames: Positive = 2,
         min_viewpoint_quality: float | None = None,
         min_point_cloud_quality: float | None = None,
-        most_training_sequences: int | None = None,
-        evaluation_targets: int | None = None,
-        validation_targets: int | None = None,
+        most_training_sequences: Positive | None = None,
+        evaluation_targets: Positive | None = None,
+        validation_targets: Positive | None = None,
         spread_targets: bool = False,
         depth_before: float = 1.5,
         depth_after: float = 4.0,

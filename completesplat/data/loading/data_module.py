@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +24,7 @@ from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.schema import Natural, OneOf, Positive, Share, Side
 
 MOST_WORKERS = 4  # by default
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
@@ -82,21 +83,21 @@ class SceneDataModule(LightningDataModule):
     def __init__(
         self,
         root: str,
-        image_size: int = 128,
-        batch_size: int = 8,
-        targets: int = 3,
-        evaluation_batch_size: int = 4,
-        references_per_sequence: int = 1,
+        image_size: Side = 128,
+        batch_size: Positive = 8,
+        targets: Natural = 3,
+        evaluation_batch_size: Positive = 4,
+        references_per_sequence: Positive = 1,
         mask_threshold: float | None = None,
-        background: float | None = None,
+        background: Share | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
-        workers: int | None = 0,
+        workers: Natural | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
-        on_bad: str = "skip",
-        max_bad_fraction: float = 0.1,
+        on_bad: Annotated[str, OneOf(("skip", "raise"))] = "skip",
+        max_bad_fraction: Share = 0.1,
         allow_changed: bool = False,
         seed: int = 0,
     ) -> None:

@@ -20,6 +20,7 @@ from completesplat.data.sequences import Picture, PosedSequence, SequenceSource,
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
+from completesplat.schema import Natural, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -120,7 +121,7 @@ class RE10KDataModule(SceneDataModule):
         root: str,
         min_gap: int = 1,
         max_gap: int = 30,
-        evaluation_targets: int = 3,
+        evaluation_targets: Positive = 3,
         evaluation_gap: int = 30,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
@@ -128,8 +129,8 @@ class RE10KDataModule(SceneDataModule):
         near: float = 0.7,
         far: float = 10.0,
         scale: float = 1.0,
-        val_fraction: float = 0.02,
-        val_seed: int = 0,
+        val_fraction: Share = 0.02,
+        val_seed: Natural = 0,
         **settings: Any,
     ) -> None:
         super().__init__(root, **settings)

@@ -11,6 +11,7 @@ from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
 from completesplat.data.validation import MissingFile
+from completesplat.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
 """Below it toy data are made without being asked for: `data.root` of `conf/data/toy_*.yaml` lies there."""
@@ -42,9 +43,9 @@ class ToyObjectsDataModule(CO3DDataModule):
     def __init__(
         self,
         root: str,
-        scenes: int = 400,
-        frames: int = 24,
-        data_seed: int = 0,
+        scenes: Positive = 400,
+        frames: Positive = 24,
+        data_seed: Natural = 0,
         category: str = "toy_objects",
         subset: str | None = SUBSET,
         depth_before: float = 1.0,
@@ -86,10 +87,10 @@ class ToyRoomsDataModule(RE10KDataModule):
         self,
         root: str,
         form: str = "text",
-        scenes: int = 100,
-        frames: int = 60,
-        height: int = 72,
-        data_seed: int = 0,
+        scenes: Positive = 100,
+        frames: Positive = 60,
+        height: Side = 72,
+        data_seed: Natural = 0,
         make: bool = False,
         **reading: Any,
     ) -> None:

@@ -1,0 +1,191 @@
+"""Settings of verbs and of the parts that they are made of: checked before anything is done with them."""
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, TypedDict
+
+from hydra.errors import HydraException, MissingConfigException
+from hydra.utils import get_object
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from completesplat.errors import CompleteSplatError
+from completesplat.options import meant, options
+from completesplat.schema import Positive, Range, Share, arguments_of, check_settings, check_value
+
+REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
+NOT_THERE = re.compile(r"Could not override '([^']+)'")
+HYDRAS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
+# Of a part's size: each level but the last halves the picture's sides.
+LEVELS = (
+    "model.completesplat.autoreconstructor.encoder.channels",
+    "model.completesplat.denoiser.channels",
+    "model.model.encoder.channels",
+    "model.model.channels",
+    "model.vae.encoder.channels",
+)
+
+
+class Fit(TypedDict):
+    """Of `completesplat fit`."""
+
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    ckpt_path: str | None
+    test: bool
+    optimized_metric: str | None
+
+
+class Predict(TypedDict):
+    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+
+    weights: str
+    samples: Annotated[int, Range(1, 1000)]
+    skip_weight: Share | None
+    guidance_weight: Share
+    steps: Annotated[int, Range(1, 1000)] | None
+    seed: Annotated[int, Range(0, 2**63 - 1)]
+    batch: Positive | None
+    fov: float | None
+    screen_space_dilation: bool
+    frames: Annotated[int, Range(1, 1000)]
+    background: Share | Literal["remove"]
+    maps: bool
+
+
+class View(TypedDict):
+    """Of `completesplat view`."""
+
+    weights: str
+    samples: Annotated[int, Range(1, 8)]
+    skip_weight: Share | None
+    guidance_weight: Share
+    steps: Annotated[int, Range(1, 1000)] | None
+    seed: Annotated[int, Range(0, 2**31)]
+    fov: float | None
+    port: Annotated[int, Range(1, 65535)]
+    frames: Annotated[int, Range(1, 1000)]
+    background: Share
+
+
+class Test(TypedDict):
+    """Of `completesplat test`."""
+
+    ckpt: str | None
+    weights: str | None
+    seed: Annotated[int, Range(0, 2**32 - 1)]
+    trust: bool
+
+
+OF_VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
+
+
+def check_verb(verb: str, config: Any) -> None:
+    """Hold the settings of a verb and of all parts that it has against their annotations.
+
+    Raises:
+        CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
+    """
+    if verb in OF_VERBS:
+        check_settings(OF_VERBS[verb], config)
+    check_parts(config)
+
+
+def check_parts(config: Any, place: str = "") -> None:
+    """Hold each mapping with a `_target_` against what that class or function is called with, and what is below it.
+
+    `CompleteSplatError`: as `check_verb`.
+    """
+    hints, complete = _arguments(config)
+    name: Any
+    for name in config if isinstance(config, DictConfig) else range(len(config)):
+        if OmegaConf.is_missing(config, name):
+            continue
+        try:
+            value = config[name]
+            plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+        except OmegaConfBaseException:  # it refers to something that is missing
+            continue
+        key = _origin(config, name, f"{place}.{name}".lstrip("."))
+        if complete and name not in (*hints, *HYDRAS):
+            raise CompleteSplatError(f"{config._target_} has no setting {name} ({key}){meant(name, hints)}")
+        if isinstance(plain, float) and math.isnan(plain):
+            raise CompleteSplatError(f"{key}=nan: must be a number")
+        if name in hints:
+            check_value(key, hints[name], plain)
+        if OmegaConf.is_config(value) and not OmegaConf.is_interpolation(config, name):
+            check_parts(value, key)
+
+
+def _arguments(config: Any) -> tuple[Mapping[str, Any], bool]:
+    """What a part is called with; nothing is known of one that cannot be imported, which is said where it is made."""
+    try:
+        target = None if isinstance(config, ListConfig) else config.get("_target_")
+        return ({}, False) if target is None else arguments_of(get_object(target))
+    except Exception:
+        return {}, False
+
+
+def _origin(config: Any, name: Any, place: str) -> str:
+    """The setting from which a place has its value, if it is another's."""
+    root = config._get_root()
+    raw = config._get_node(name)
+    while (found := REFERENCE.fullmatch(str(raw._value()) if raw is not None else "")) is not None:
+        place = found[1]
+        *above, last = place.split(".")
+        parent = OmegaConf.select(root, ".".join(above)) if above else root
+        raw = parent._get_node(last) if isinstance(parent, DictConfig) else None
+    return place
+
+
+def check_image_size(config: Any) -> None:
+    """`CompleteSplatError`: pictures of a training cannot be halved as often as its networks do."""
+    channels = [OmegaConf.select(config, key, throw_on_missing=False) for key in LEVELS]
+    multiple = 2 ** sum(len(widths) - 1 for widths in channels if widths is not None)
+    size = config.data.get("image_size")
+    if size is not None and size % multiple:
+        near = max(multiple, round(size / multiple) * multiple)
+        said = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
+        raise CompleteSplatError(f"data.image_size={size}: {said}")
+
+
+def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:
+    """What hydra refused, with the nearest names that there are; None for what is no wrong name.
+
+    Args:
+        compose: from a verb and its settings to its configuration.
+    """
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
+        named = [name for name in error.options or () if not name.startswith("_")]
+        kind = f"task of completesplat {verb}" if group == f"{verb}_task" else group
+        return CompleteSplatError(f"no {kind} {option!r}: there are {', '.join(named)}{meant(option, named)}")
+    if str(error).startswith("Config group override must be"):
+        empty = [one.partition("=")[0] for one in arguments if one.endswith("=null") and options(one[:-5])]
+        return CompleteSplatError(f"{empty[0]}=null: choose one of {', '.join(options(empty[0]))}") if empty else None
+    if not isinstance(error, HydraException) or (found := NOT_THERE.match(str(error))) is None:
+        return None
+    key, names = found[1], set(_keys(_composed(verb, arguments, found[1], compose)))
+    nearest = meant(key, {name for name in names if name.count(".") == key.count(".")}) or meant(key, names)
+    said = nearest or f"; completesplat {verb} --help shows those that there are, and +{key}=VALUE adds one"
+    return CompleteSplatError(f"no setting {key!r} of completesplat {verb}{said}")
+
+
+def _composed(verb: str, arguments: Sequence[str], key: str, compose: Any) -> Any:
+    """The configuration without what is wrong in the arguments."""
+    settings = [one for one in arguments if not one.startswith("-") and one.lstrip("+~").partition("=")[0] != key]
+    try:
+        return compose(verb, *settings)
+    except Exception:
+        return compose(verb)
+
+
+def _keys(config: Any, place: str = "") -> Iterator[str]:
+    """All keys of a configuration with their places; what is only referred to is named where it is."""
+    for name in config:
+        key = f"{place}{name}"
+        yield key
+        if OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name):
+            continue
+        if isinstance(config[name], DictConfig):
+            yield from _keys(config[name], f"{key}.")

@@ -1,0 +1,253 @@
+"""What can be chosen and set, as the files of `conf/` say: read line by line, comments too, without importing anything.
+
+A comment above a key or behind its value explains it; the first comment of a file is about the file. Shells that
+complete the command line call `completesplat --complete WORDS`, which is answered from here: it has to be quick.
+"""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, NamedTuple
+
+KEY = re.compile(r"( *)([\w.]+):(?:\s+(.*))?")
+CHOICE = re.compile(r"\s+- (override )?/?([\w./]+)(?:@([\w.]+))?: ([\w.]+)")
+NAMED = re.compile(r"^\| (`[^|]*`) \| ([^|]*) \|$", re.MULTILINE)
+PACKAGE = "# @package "
+TASKS = ("data", "bench", "report")
+"""Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
+LEAST_LIKE = 0.7
+
+
+BASH = r"""# eval "$(completesplat completion bash)"   in ~/.bashrc
+_completesplat() {
+    local line=${COMP_LINE:0:COMP_POINT} current
+    local -a words
+    read -ra words <<< "$line"
+    [[ $line == *[[:space:]] ]] && words+=("")
+    current=${words[${#words[@]}-1]}
+    local IFS=$'\n'
+    COMPREPLY=($("${words[0]}" --complete "${words[@]:1}" 2>/dev/null))
+    # bash completes what follows the last =.
+    if [[ $current == *=* && $COMP_WORDBREAKS == *=* ]]; then
+        COMPREPLY=("${COMPREPLY[@]#"${current%%=*}="}")
+    elif [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *= ]]; then
+        compopt -o nospace 2>/dev/null
+    fi
+}
+complete -o default -F _completesplat completesplat
+"""
+ZSH = r"""#compdef completesplat
+# eval "$(completesplat completion zsh)"   in ~/.zshrc, below compinit
+_completesplat() {
+    local -a found
+    found=("${(@f)$("${words[1]}" --complete "${(@)words[2,CURRENT]}" 2>/dev/null)}")
+    found=(${found:#})
+    if (( ${#found} )); then
+        compadd -S '' -- "${found[@]}"
+    else
+        compset -P '*='
+        _files
+    fi
+}
+compdef _completesplat completesplat
+"""
+FISH = r"""# completesplat completion fish | source   in ~/.config/fish/config.fish
+function __completesplat
+    set -l words (commandline -opc) (commandline -ct)
+    $words[1] --complete $words[2..-1] 2>/dev/null
+end
+complete -c completesplat -a '(__completesplat)'
+"""
+SCRIPTS = {"bash": BASH, "zsh": ZSH, "fish": FISH}
+SWITCHES = ("true", "false")
+
+
+class Setting(NamedTuple):
+    """A key of a file with its value as it is written there."""
+
+    key: str
+    value: str
+    comment: str
+
+
+class Choice(NamedTuple):
+    """A group in a file's list of defaults, the place of its settings, and the option that is chosen."""
+
+    group: str
+    place: str
+    option: str
+    comment: str
+
+
+class ConfFile(NamedTuple):
+    """What a file of `conf/` says. `package`: the place of its settings, if it names one."""
+
+    about: str
+    package: str | None
+    settings: list[Setting]
+    choices: list[Choice]
+    bases: list[str]
+    """Files whose settings it takes over."""
+
+
+def conf_folder() -> Path:
+    """The configuration tree: inside an installed package, or beside it in the repository."""
+    package = Path(__file__).parent
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def folders() -> list[Path]:
+    """Where settings are looked for: the package's, and those of the working folder."""
+    return [conf_folder(), *(folder for folder in [Path.cwd() / "conf"] if folder.is_dir())]
+
+
+def groups() -> list[str]:
+    """Names of all groups."""
+    return sorted({path.name for folder in folders() for path in folder.iterdir() if path.is_dir()})
+
+
+def options(group: str) -> list[str]:
+    """What can be chosen in a group; empty where there is no such group."""
+    files = [file for folder in folders() for file in (folder / group).glob("[!_]*.yaml")]
+    return sorted({file.stem for file in files})
+
+
+def about_groups() -> dict[str, str]:
+    """What each group chooses, from the table in `conf/README.md`."""
+    text = (conf_folder() / "README.md").read_text(encoding="utf-8")
+    return {name: about for names, about in NAMED.findall(text) for name in re.findall(r"`(\w+)`", names)}
+
+
+def read(name: str) -> ConfFile:
+    """A file of `conf/`, by its name without ending: `fit`, `data/toy_objects`. `FileNotFoundError`: there is none."""
+    for folder in folders():
+        if (folder / f"{name}.yaml").is_file():
+            return parse((folder / f"{name}.yaml").read_text(encoding="utf-8"))
+    raise FileNotFoundError(name)
+
+
+def parse(text: str) -> ConfFile:
+    """What a file's lines say."""
+    head: list[str] = []
+    comments: list[str] = []
+    package, above = None, [""]
+    found = ConfFile("", None, [], [], [])
+    lines = text.splitlines()
+    while lines and (lines[0].startswith("#") or not lines[0]):
+        line = lines.pop(0)
+        if not line:
+            break
+        if line.startswith(PACKAGE):
+            package = line.removeprefix(PACKAGE).strip()
+        else:
+            head.append(line[1:])
+    for line in lines:
+        said, _, remark = line.partition(" #") if not line.strip().startswith("#") else ("", "", line.strip()[1:])
+        if not said.strip():
+            comments = [*comments, remark.strip()] if remark else []
+            continue
+        comment, comments = " ".join([*comments, remark.strip()]).strip(), []
+        if above[0] == "defaults" and said.startswith(" "):
+            if chosen := CHOICE.fullmatch(said.rstrip()):
+                found.choices.append(Choice(chosen[2], chosen[3] or chosen[2], chosen[4], comment))
+            elif (base := said.strip()[2:]) != "_self_":
+                found.bases.append(base)
+        elif key := KEY.fullmatch(said.rstrip()):
+            above = [*above[: len(key[1]) // 2], key[2]]
+            found.settings.append(Setting(".".join(above), key[3] or "", comment))
+    about = "\n".join(line[1:] if line.startswith(" ") else line for line in head)
+    return found._replace(about=about, package=package)
+
+
+def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[Setting]:
+    """A file's settings that have values, in its order; not those below the keys in `without`."""
+    keys = {setting.key for setting in written.settings}
+    for setting in written.settings:
+        inner = any(key.startswith(f"{setting.key}.") for key in keys)
+        hydras = setting.key.rpartition(".")[2].startswith("_") and without
+        if not inner and not hydras and setting.key.partition(".")[0] not in (*without, "defaults"):
+            yield setting
+
+
+def settings_of_option(group: str, option: str, place: str | None = None) -> list[Setting]:
+    """All settings of an option, with those that its file takes over from others; `place`: where they belong."""
+    written = read(f"{group}/{option}")
+    found: dict[str, Setting] = {}
+    for base in written.bases:
+        for setting in settings_of_option(group, base, ""):
+            found[setting.key] = setting
+    for setting in own_settings(written):
+        earlier = found.get(setting.key, setting)
+        found[setting.key] = setting._replace(comment=setting.comment or earlier.comment)
+    where = place if place is not None else written.package or group.replace("/", ".")
+    prefix = "" if where in ("", "_global_") else f"{where}."
+    return [setting._replace(key=prefix + setting.key) for setting in found.values()]
+
+
+def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
+    """A verb's own settings: where it writes, those in its file, and those of its task."""
+    without = ("hydra", "verb", "description", "task")
+    found = [*own_settings(read("base"), without), *own_settings(read(verb), without)]
+    found += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
+    return list({setting.key: setting for setting in found}.values())
+
+
+def with_bases(group: str, option: str) -> ConfFile:
+    """An option's file with the settings and choices of those that it takes over."""
+    written = read(f"{group}/{option}")
+    inherited = [with_bases(group, base) for base in written.bases]
+    choices = [choice for one in inherited for choice in one.choices] + written.choices
+    settings = {one.key: one for base in [*inherited, written] for one in base.settings}
+    return written._replace(settings=list(settings.values()), choices=choices)
+
+
+def choices_of_verb(verb: str, task: str | None = None) -> list[Choice]:
+    """The groups that a verb is made of, with what is chosen by itself, its task left out."""
+    found = [choice for choice in read(verb).choices if choice.group != f"{verb}_task"]
+    return found + ([] if task is None else with_bases(f"{verb}_task", task).choices)
+
+
+def meant(name: str, names: Any, most: int = 3) -> str:
+    """What to add to a message on a name that is not there: the nearest of those that are, if any is near."""
+    found = get_close_matches(name, list(names), n=most, cutoff=LEAST_LIKE)
+    return f"; did you mean {' or '.join(found)}?" if found else ""
+
+
+def candidates(words: Sequence[str], verbs: Collection[str]) -> list[str]:
+    """What the last of the words behind `completesplat` may become; an empty list where that may be anything."""
+    if len(words) < 2:
+        found = [*verbs, "completion"]
+    elif words[0] == "completion":
+        found = list(SCRIPTS)
+    elif words[0] in verbs:
+        found = _behind_verb(words[0], words[1:])
+    else:
+        found = []
+    return [one for one in found if one.startswith(words[-1] if words else "")]
+
+
+def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
+    tasks = options(f"{verb}_task") if verb in TASKS else []
+    task = None
+    if tasks:
+        task = next(choice.option for choice in read(verb).choices if choice.group == f"{verb}_task")
+        task = words[0] if words[0] in tasks and len(words) > 1 else task
+    chosen = {choice.place: (choice.group, choice.option) for choice in choices_of_verb(verb, task)}
+    for word in words[:-1]:
+        place, _, option = word.partition("=")
+        if place in chosen and option in options(chosen[place][0]):
+            chosen[place] = (chosen[place][0], option)
+    settings = {setting.key: setting.value for setting in settings_of_verb(verb, task)}
+    for place, (group, option) in chosen.items():
+        if option in options(group) and group not in ("experiment", "ablation"):
+            own = settings_of_option(group, option, None if place == group else place)
+            settings |= {one.key: one.value for one in own if not one.key.rpartition(".")[2].startswith("_")}
+    key, equals, _ = words[-1].partition("=")
+    if equals:
+        values = options(chosen[key][0]) if key in chosen else SWITCHES if settings.get(key) in SWITCHES else ()
+        return [f"{key}={value}" for value in values]
+    found = [f"{name}=" for name in [*settings, *chosen]]
+    # Keys below the first point are shown when it is typed.
+    near = [name for name in found if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
+    return [*(tasks if len(words) == 1 else []), *near, "--help"]
