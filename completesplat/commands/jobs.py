@@ -102,6 +102,18 @@ def alone_in(out: Path) -> Iterator[None]:
         yield
 
 
+def at_work(out: Path) -> bool:
+    """Whether a process of this computer holds the lock of a job's directory."""
+    path = out / LOCK
+    if not path.is_file():
+        return False
+    try:
+        with FileLock(path).acquire(blocking=False):
+            return False
+    except (Timeout, OSError):
+        return True
+
+
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
     """Arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
 

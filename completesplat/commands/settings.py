@@ -65,7 +65,7 @@ class View(TypedDict):
     fov: float | None
     port: Annotated[int, Range(1, 65535)]
     frames: Annotated[int, Range(1, 1000)]
-    background: Share
+    background: Share | Literal["remove"]
 
 
 class Test(TypedDict):

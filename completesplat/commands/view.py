@@ -1,19 +1,22 @@
 """`completesplat view`: a page on which to look at scenes and to draw new ones."""
 
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
 from typing import Any
 
+from completesplat.commands.jobs import at_work
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
 from completesplat.signals import Interrupted
-from completesplat.weights import CONFIG_FILE, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
+from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
+PAUSE = 2.0  # seconds after which a run is looked at again
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 
 
@@ -31,7 +34,9 @@ def run(config: Any, out: Path) -> None:
             return export(page, Path(config.export))
         print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
-            time.sleep(3600)
+            time.sleep(PAUSE)
+            if config.watch is not None:
+                show_newest(page, Path(config.watch))
     except Interrupted as stop:
         if stop.signal != SIGINT:
             raise
@@ -40,11 +45,16 @@ def run(config: Any, out: Path) -> None:
 
 
 def settings_of(path: Path) -> dict[str, str]:
-    """The setting that a path stands for: `scene`, `image` or `weights`; `CompleteSplatError` for none of these."""
+    """The setting that a path stands for: `scene`, `image`, `weights`, or `watch`, of a run that trains just now.
+
+    `CompleteSplatError`: none of these.
+    """
     if path.is_file():
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}
     if not path.is_dir():
         raise CompleteSplatError(f"{path}: no such file or folder")
+    if (path / NEWEST).parent.is_dir() and at_work(path):
+        return {"watch": str(path)}
     for folder in (path, path / "weights"):
         if all((folder / name).is_file() for name in WEIGHT_FILES):
             return {"weights": str(folder)}
@@ -66,7 +76,9 @@ def make_page(config: Any, out: Path) -> Any:
     import torch
     from hydra.utils import instantiate
 
+    from completesplat.commands.predict import REMOVE
     from completesplat.commands.trained import open_generator
+    from completesplat.export.prediction import Wanted
     from completesplat.viewer.completion import Completion
     from completesplat.viewer.page import Page, Saver, start_server, stop_server
     from completesplat.viewer.panel import SLIDERS
@@ -74,28 +86,78 @@ def make_page(config: Any, out: Path) -> Any:
     from completesplat.viewer.stage import Stage
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = open_generator(config).to(device) if config.scene is None else None
-    samples, up = ([], tuple(model.up.tolist())) if model is not None else read_scene(Path(config.scene))
-    photograph = None if model is None or config.image is None else model.read(Path(config.image), config.fov)
+    model = None
+    if config.watch is not None:
+        samples, up = newest_scenes(Path(config.watch))
+    elif config.scene is not None:
+        samples, up = read_scene(Path(config.scene))
+    else:
+        model = open_generator(config).to(device)
+        samples, up = [], tuple(model.up.tolist())
+    remove = config.background == REMOVE
+    background = Wanted.background if remove else config.background
+    photograph = None
+    if model is not None and config.image is not None:
+        photograph = model.read(Path(config.image), config.fov, remove)
     cameras = None if config.get("data") is None else data_cameras(config.data)
-    server = start_server(0 if config.export is not None else config.port, config.background)
+    server = start_server(0 if config.export is not None else config.port, background)
     try:
         stage = Stage(server, up, cameras)
         stage.show(samples)
         rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
-        saver = Saver(out, stage, rasterizer, config.frames, config.background)
+        saver = Saver(out, stage, rasterizer, config.frames, background)
         if model is None:
-            return Page(server, stage, saver, max(sample.layers for sample in samples))
+            page = Page(server, stage, saver, max(sample.layers for sample in samples))
+            page.show(samples, step_of(samples) if config.watch is not None else "")
+            return page
         page = Page(server, stage, saver, model.parameterization.layers)
         own_steps = model.sampler.steps if model.draws_samples else 1
         steps = own_steps if config.steps is None else config.steps
-        completion = Completion(page, model, {name: config[name] for name in SLIDERS} | {"steps": steps})
+        start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
+        completion = Completion(page, model, start)
         if photograph is not None:
             completion.load(printable(Path(config.image).name), photograph)
         return page
     except BaseException:
         stop_server(server)
         raise
+
+
+def newest_scenes(run: Path) -> tuple[list[Any], tuple[float, ...]]:
+    """The newest fixed scenes of a run, and where up is; it is waited for the first of them.
+
+    `CompleteSplatError`: it is no run of `fit` that draws fixed scenes, or they cannot be read.
+    """
+    from completesplat.viewer.sample import NEWEST_FILE, read_newest
+
+    folder = run / NEWEST
+    if not folder.parent.is_dir():
+        raise CompleteSplatError(f"watch={run}: no {folder.parent.name}/ here, which fit fills (callbacks.pictures)")
+    if not (folder / NEWEST_FILE).is_file():
+        print(f"{run}: no scenes yet; waiting for them (every callbacks.pictures.every_n_steps steps)", flush=True)
+    while not (folder / NEWEST_FILE).is_file():
+        time.sleep(PAUSE)
+    _, samples, up = read_newest(folder)
+    return samples, up
+
+
+def step_of(samples: Sequence[Any]) -> str:
+    """What the page says of a run's scenes; nothing of others."""
+    steps = [sample.settings["step"] for sample in samples if "step" in sample.settings]
+    return f"step {steps[0]} of the training" if steps else ""
+
+
+def show_newest(page: Any, run: Path) -> None:
+    """Show what the run has written since the page was last drawn, if anything."""
+    from completesplat.viewer.sample import read_newest
+
+    shown = {sample.settings["step"] for sample in page.stage.samples}
+    try:
+        step, samples, _ = read_newest(run / NEWEST)
+    except CompleteSplatError:
+        return  # it is just being written, or was taken away: what is shown stays
+    if shown != {step} and samples:
+        page.show(samples, step_of(samples))
 
 
 def data_cameras(config: Any) -> Any:

@@ -244,17 +244,18 @@ def write_scene_json(
 
     `settings` are what the scene was made with, as plain values, `files` the names of those beside it, by purpose.
     """
-    camera = {
-        "world_to_camera": reference.world_to_camera.tolist(),
-        "intrinsics": reference.intrinsics.tolist(),
-        "image_size": list(reference.image_size),
-    }
     scene = {
         "format": "completesplat scene 1",
-        "reference_camera": camera,
+        "reference_camera": plain_camera(reference),
         "conventions": CONVENTIONS,
         "settings": dict(settings),
         "seed": seed,
         "files": dict(files),
     }
     write_text(path, json.dumps(scene, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def plain_camera(camera: Cameras) -> dict[str, Any]:
+    """One camera as JSON holds it."""
+    matrices = {"world_to_camera": camera.world_to_camera.tolist(), "intrinsics": camera.intrinsics.tolist()}
+    return {**matrices, "image_size": list(camera.image_size)}

@@ -1,6 +1,7 @@
 """Formats that npm's `@playcanvas/splat-transform` writes, a page with a viewer among them."""
 
 import json
+import logging
 import math
 import os
 import shutil
@@ -16,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, write_bytes
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.gaussians import Gaussians
@@ -26,6 +27,9 @@ PROGRAM = "splat-transform"
 PACKAGE = "@playcanvas/splat-transform@2.7.1"
 LIMIT_SECONDS = 600
 WIDEST_WINDOW, LARGEST_FOV = 16 / 9, 120.0
+IN_A_ROOM = b"const isObjectExperience = !bbox.containsPoint(resetCamera.position);"
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,21 @@ def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: Spla
         scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
-        converter.convert(scene, path, ["--viewer-settings", str(settings)])
+        made = Path(folder) / "page.html"
+        converter.convert(scene, made, ["--viewer-settings", str(settings)])
+        write_bytes(path, around_the_target(made.read_bytes()))
+
+
+def around_the_target(page: bytes) -> bytes:
+    """The page with a camera that turns about its target, whatever lies behind it.
+
+    Its viewer takes a camera within the bounding box of a scene for one in a room: it would turn on the spot. Our
+    scenes have far Gaussians, which reach behind the photograph's camera. The viewer has no setting for it.
+    """
+    if IN_A_ROOM not in page:
+        log.warning("this version of %s may turn the page's camera on the spot, not about the object", PROGRAM)
+    page = page.replace(IN_A_ROOM, b"const isObjectExperience = true;")
+    return page.replace(b"<title>SuperSplat Viewer</title>", b"<title>completesplat</title>")
 
 
 def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:

@@ -1,5 +1,6 @@
 """Pictures of a few fixed scenes while a model trains, and figures of its Gaussians and latents."""
 
+import json
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -15,14 +16,19 @@ from lightning.pytorch.loggers import WandbLogger
 from PIL import Image
 from torch import Tensor
 
+from completesplat.atomic import write_text
 from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.export.cleaning import storable, with_screen_space_dilation
 from completesplat.export.pictures import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.ply import write_ply
+from completesplat.export.prediction import plain_camera
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
 from completesplat.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
+from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.scene_module import SceneModule
 
@@ -112,9 +118,10 @@ class Pictures(DrawsFixedScenes):
     """What the first target of each scene looks like, and what its Gaussians are like; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/layers_000500.png` the layers of its
-    Splatter Image (`layer_maps`). All loggers get `gaussians/opacity_p10`, `_p50`, `_p90`, the same of all
-    `distributions`, what the layers hold on the object (`layer_figures`), and what the latent carries of a model that
-    has a posterior (`latent_bits`). Weights & Biases gets the pictures and histograms too.
+    Splatter Image (`layer_maps`), `folder/newest/` the scenes themselves (`write_newest`). All loggers get
+    `gaussians/opacity_p10`, `_p50`, `_p90`, the same of all `distributions`, what the layers hold on the object
+    (`layer_figures`), and what the latent carries of a model that has a posterior (`latent_bits`). Weights & Biases
+    gets the pictures and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
@@ -130,6 +137,7 @@ class Pictures(DrawsFixedScenes):
         pictures = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
         for kind, picture in pictures.items():
             write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
+        write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, up_of(module))
 
         values = distributions(gaussians)
         scalars = {f"gaussians/{name}": value for name, value in percentiles(values).items()}
@@ -138,6 +146,33 @@ class Pictures(DrawsFixedScenes):
             scalars |= latent_bits(posterior)
         shown = {"pictures": pictures["step"], "layers": pictures["layers"]}
         log_drawings(trainer, scalars, shown, {f"histograms/{name}": of for name, of in values.items()})
+
+
+def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
+    """Write the scenes [batch] as `scene_0.ply` and so on, and `scenes.json`, over those of an earlier step.
+
+    The JSON holds `step`, `up`, and for each file its name, its `scene` and its `reference_camera`. Gaussians are as in
+    predictions. A scene of which nothing can be stored is left out.
+    """
+    folder.mkdir(exist_ok=True)
+    described = []
+    for index, name in enumerate(scenes.names):
+        scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
+        kept = scene.keep(storable(scene))
+        if kept.count:
+            file = f"scene_{index}.ply"
+            write_ply(folder / file, with_screen_space_dilation(kept, camera), [f"scene {name}", f"step {step}"])
+            described.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
+    found = {"step": step, "up": up.tolist(), "scenes": described}
+    write_text(folder / "scenes.json", json.dumps(found, indent=2) + "\n")
+
+
+def up_of(module: SceneModule) -> Float[Tensor, "3"]:
+    """Where up is in the reference's frame: as measured on the training set, else above the picture."""
+    if isinstance(module, LatentDiffusion):
+        return module.completesplat.up
+    measured = module.camera if isinstance(module, ReconstructionModule) else {}
+    return torch.tensor(measured.get("up", (0.0, -1.0, 0.0)))
 
 
 def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:

@@ -19,6 +19,7 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from completesplat.errors import CompleteSplatError
+from completesplat.viewer.head import with_head
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost", "[::1]")
@@ -75,8 +76,14 @@ class GuardedServer(viser.ViserServer):
         refusal = self._refusal(request, port)
         if refusal is not None:
             return connection.respond(HTTPStatus.FORBIDDEN, refusal + "\n")
+        if "Accept-Encoding" in request.headers:
+            del request.headers["Accept-Encoding"]  # viser would compress its page, to which something is added
         response = answer(connection, request)
         if response is not None:
+            if response.headers.get("Content-Type") == "text/html":
+                response.body = with_head(response.body.decode()).encode()
+                del response.headers["Content-Length"]
+                response.headers["Content-Length"] = str(len(response.body))
             cookie = f"{cookie_name(port)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers.update({"Set-Cookie": cookie, "Referrer-Policy": "no-referrer"})
         return response

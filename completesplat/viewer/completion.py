@@ -17,7 +17,7 @@ from completesplat.generation import CompleteSplat
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import told
 from completesplat.viewer.page import Page
-from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps
+from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
 
 PAUSE = 0.2  # seconds between two pictures of a scene that forms
@@ -38,9 +38,9 @@ class Completion:
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
         """Complete this picture from now on."""
         self.photograph = name, photograph
-        preview = self.controls.preview
-        preview.image = to_bytes(photograph.image)
-        preview.label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
+        label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
+        self.controls.preview.content = preview_of(to_bytes(photograph.image), label)
+        self.page.stage.forget_view()
         self.request(client)
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
@@ -52,9 +52,9 @@ class Completion:
         self.page.worker.submit("draw", job)
 
     def _upload(self, event: viser.GuiEvent[Any]) -> None:
-        file = self.controls.upload.value
+        file, remove = self.controls.upload.value, self.controls.remove_background.value
         try:
-            self.load(file.name, read_upload(self.model, file.name, file.content), event.client)
+            self.load(file.name, read_upload(self.model, file.name, file.content, remove), event.client)
         except CompleteSplatError as error:
             self.page.tell(error, event.client)
 
@@ -102,12 +102,15 @@ class Completion:
             progress.visible = False
 
 
-def read_upload(model: SceneModel, name: str, content: bytes) -> Photograph:
-    """The picture at the model's size; `ImageError` if it is none. Its name is for refusals only, never a path."""
+def read_upload(model: SceneModel, name: str, content: bytes, remove_background: bool = False) -> Photograph:
+    """The picture at the model's size, as `SceneModel.read`; its name is for refusals only, never a path.
+
+    `ImageError`: it is none. `CompleteSplatError`: the background cannot be removed.
+    """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "upload"
         file.write_bytes(content)
         try:
-            return model.read(file)
+            return model.read(file, remove_background=remove_background)
         except ImageError as error:
             raise ImageError(str(error).replace(str(file), told(name))) from error

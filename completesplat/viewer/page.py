@@ -10,19 +10,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import viser
 
 from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError
-from completesplat.export.ply import write_ply
-from completesplat.export.video import orbit_views, write_video
+from completesplat.export.formats import CONVERTED, FORMATS, write_formats
+from completesplat.export.pictures import to_bytes
+from completesplat.export.splat_transform import PageView, find_splat_transform
+from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer
-from completesplat.viewer.panel import SIDE_BY_SIDE, add_looking, add_saving
+from completesplat.viewer.head import with_head
+from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Picture, add_looking, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample
 from completesplat.viewer.stage import Stage
 
 Job = Callable[[], None]
+
+THUMBNAIL, MOST_THUMBNAILS = 96, 24  # px
 
 log = logging.getLogger(__name__)
 
@@ -94,28 +101,46 @@ def start_server(port: int, background: float = 0.5) -> GuardedServer:
 class Saver:
     """Writes numbered files into a folder; nothing is overwritten.
 
-    `make_rasterizer` is called when the first video is wanted; it has this number of frames, and a grey background.
+    `make_rasterizer` is called when the first video or thumbnail is wanted; videos have this number of frames, and a
+    grey background.
     """
 
     def __init__(
         self, folder: Path, stage: Stage, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
     ) -> None:
         self.folder, self.stage, self.frames, self.background = folder, stage, frames, background
-        self._rasterizer = cache(make_rasterizer)
+        self.rasterizer = cache(make_rasterizer)
+        self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write these samples as `ply` or `video`, or the page as it stands as `html`."""
+        """Write these samples in one of the formats or as a video, or the page as it stands as `html`.
+
+        `CompleteSplatError`: there are none, or what `write_formats` raises.
+        """
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
             return [write_page(self.stage.server, self._next("page", ".html"))]
-        return [self._ply(sample) if kind == "ply" else self._video(sample) for sample in samples]
+        return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
 
-    def _ply(self, sample: Sample) -> Path:
+    def picture(self, sample: Sample, size: int) -> Picture:
+        """What the sample's reference camera sees, of `size` px on its longer side."""
+        camera, scene = sample.reference, sample.for_viewers()
+        factor = size / max(camera.image_size)
+        height, width = (max(1, round(side * factor)) for side in camera.image_size)
+        intrinsics = camera.intrinsics * camera.intrinsics.new_tensor([[factor], [factor], [1.0]])
+        small = Cameras(camera.world_to_camera, intrinsics, (height, width))
+        views, _ = render_views(self.rasterizer(), scene, small[None], self.background)
+        return to_bytes(views[0].nan_to_num())
+
+    def _scene(self, kind: str, sample: Sample) -> Path:
         """All layers of the sample, in its reference camera's frame."""
-        path = self._next("sample", ".ply")
-        write_ply(path, sample.for_viewers(), [f"{name} {value}" for name, value in sample.settings.items()])
+        path = self._next("sample", f".{kind}")
+        comments = [f"{name} {value}" for name, value in sample.settings.items()]
+        converter = self._converter() if kind in CONVERTED else None
+        view = PageView(sample.reference, sample.pivot(), torch.tensor(self.stage.up), self.background)
+        write_formats(self.folder, path.stem, sample.for_viewers(), [kind], view, converter, comments)
         return path
 
     def _video(self, sample: Sample) -> Path:
@@ -124,7 +149,7 @@ class Saver:
         camera = sample.reference
         up = camera.intrinsics.new_tensor(self.stage.up.tolist())
         scene, pivot = sample.gaussians, sample.pivot()
-        frames, _ = orbit_views(self._rasterizer(), scene, camera, pivot, self.frames, self.background, up)
+        frames, _ = orbit_views(self.rasterizer(), scene, camera, pivot, self.frames, self.background, up)
         write_video(path, frames)
         return path
 
@@ -142,18 +167,31 @@ class Page:
         self.status = server.gui.add_markdown("", order=0)
         self.looking = add_looking(server.gui, layers, stage.data_cameras is not None)
         self._connect_looking()
-        self.saving = add_saving(server.gui)
-        for kind, button in self.saving.items():
-            button.on_click(partial(self._save, kind))
+        self.saving = add_saving(server.gui, FORMATS)
+        self.saving.save.on_click(self._save)
+        self._pictures: list[Picture] = []
         self.show(stage.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
-        """These samples from now on, in all browsers."""
+        """These samples from now on, in all browsers; their thumbnails when they are finished."""
         self.stage.show(samples)
-        options = (SIDE_BY_SIDE, *(f"sample {i + 1}" for i in range(len(samples))))
+        options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
         self.status.content = status
+        if all(sample.finished for sample in samples):
+            self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
+
+    def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
+        """In the worker's thread. One sample needs none."""
+        few = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
+        self._pictures = [self.saver.picture(sample, THUMBNAIL) for sample in few]
+        self._mark_thumbnail()
+
+    def _mark_thumbnail(self) -> None:
+        row = thumbnail_row(self._pictures, self.stage.chosen) if self._pictures else ""
+        if self.looking.thumbnails.content != row:
+            self.looking.thumbnails.content = row
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
         """A message in one browser, or in all; faults of the program stand in the log as well."""
@@ -173,20 +211,27 @@ class Page:
         looking, stage = self.looking, self.stage
 
         def changed(_: viser.GuiEvent[Any]) -> None:
-            index = looking.chosen.options.index(looking.chosen.value)
-            stage.chosen = index - 1 if index else None
+            index, last = looking.chosen.options.index(looking.chosen.value), len(looking.chosen.options) - 1
+            stage.chosen = None if index == last else index
             stage.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
             stage.depth = looking.depth.value
             stage.cameras = {name for name, box in looking.cameras.items() if box.value}
             stage.refresh()
+            self._mark_thumbnail()
 
+        def pressed(index: int, _: viser.CommandEvent) -> None:
+            if index < len(looking.chosen.options):
+                looking.chosen.value = looking.chosen.options[index]
+
+        for digit, command in looking.keys.items():
+            command.on_trigger(partial(pressed, int(digit) - 1))
         looking.chosen.on_update(changed)
         for box in (*looking.layers, looking.depth, *looking.cameras.values()):
             box.on_update(changed)
         looking.front.on_click(lambda event: stage.look_from_the_front(event.client))
 
-    def _save(self, kind: str, event: viser.GuiEvent[Any]) -> None:
-        client = event.client
+    def _save(self, event: viser.GuiEvent[Any]) -> None:
+        client, kind = event.client, self.saving.kind.value
         if client is None:
             return
 
@@ -210,5 +255,5 @@ def stop_server(server: viser.ViserServer) -> None:
 
 def write_page(server: viser.ViserServer, path: Path) -> Path:
     """What the server shows, without the controls, as one HTML file that needs no server."""
-    write_text(path, server.get_scene_serializer().as_html())
+    write_text(path, with_head(server.get_scene_serializer().as_html()))
     return path

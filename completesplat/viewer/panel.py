@@ -1,12 +1,18 @@
 """The controls of the page: what completes a photograph, what is shown of the samples, what is saved."""
 
+import base64
+import io
+from collections.abc import Sequence
 from functools import partial
+from html import escape
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import viser
 from diffusers import DDIMScheduler
+from jaxtyping import UInt8
+from PIL import Image
 
 from completesplat.diffusion.sampling import Sampler
 from completesplat.generation import CompleteSplat
@@ -15,8 +21,14 @@ from completesplat.scene_model import SceneModel
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
+CUT_OUT = "of the next pictures: only the object, before what the weights know (needs completesplat[background])"
+KEYS = 9  # samples that a key chooses; 0 shows all
 ONE_ANSWER = "One answer for each picture: these weights draw no samples."
-KINDS = {"ply": "PLY", "html": "HTML page", "video": "Video"}
+VIDEO = "video"
+# A press of the number's key, which the page hears everywhere; viser's HTML has no callbacks.
+CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit{0}',bubbles:true}}))"
+
+Picture = UInt8[np.ndarray, "_ _ 3"]
 
 
 def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
@@ -24,13 +36,13 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
 
     Of a model that draws no samples, what is about drawing is not shown.
     """
-    blank = np.full((model.image_size, model.image_size, 3), 230, np.uint8)
     draws, most_steps, first_steps = model.draws_samples, 2, 1
     if isinstance(model, CompleteSplat):
         most_steps, first_steps = possible_steps(model.sampler)[-1], nearest_steps(model.sampler, start["steps"])
     with gui.add_folder("Photograph", order=1):
         upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
-        preview = gui.add_image(blank, label="none yet", format="png")
+        preview = gui.add_html("")
+        remove = gui.add_checkbox("Cut the object out", start["remove_background"], hint=CUT_OUT)
     with gui.add_folder("Completion", order=2):
         if not draws:
             gui.add_markdown(ONE_ANSWER)
@@ -39,6 +51,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         return SimpleNamespace(
             upload=upload,
             preview=preview,
+            remove_background=remove,
             samples=slider("Samples", 1, MOST_SAMPLES, 1, start["samples"]),
             skip_weight=slider("Skip weight", 0.0, 1.0, 0.05, start["skip_weight"], hint=free),
             guidance_weight=slider("Guidance", 0.0, 1.0, 0.05, start["guidance_weight"], hint=diverse),
@@ -53,11 +66,19 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
 
 
 def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNamespace:
-    """The folder `View`: handles of what is `chosen`, of `layers` by number and of `cameras` by name."""
+    """The folder `View`: handles of what is `chosen`, of `layers` by number and of `cameras` by name.
+
+    Above all folders: `thumbnails`, which `thumbnail_row` fills; `keys`, commands by the digit that calls them.
+    """
     names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
+    commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
+    key: Any = gui.add_command
+    thumbnails = gui.add_html("", order=0.5)
     with gui.add_folder("View", order=3):
         return SimpleNamespace(
-            chosen=gui.add_dropdown("Show", (SIDE_BY_SIDE,)),
+            thumbnails=thumbnails,
+            keys={digit: key(label, hotkey=digit) for digit, label in commands.items()},
+            chosen=gui.add_dropdown("Show", ("sample 1", SIDE_BY_SIDE), hint="keys 1 to 9 choose, 0 shows all"),
             layers=[gui.add_checkbox(f"Layer {i + 1}", True) for i in range(layers)],
             depth=gui.add_checkbox("Depth as colours", False, hint="near bright, far dark"),
             cameras={name: gui.add_checkbox(f"Cameras: {name}", False) for name in names},
@@ -65,10 +86,38 @@ def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNam
         )
 
 
-def add_saving(gui: viser.GuiApi) -> dict[str, viser.GuiButtonHandle]:
-    """The folder `Save`: buttons by the kind of file."""
+def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
+    """The folder `Save`: what `kind` of file, of the formats or a video, and the button `save`."""
     with gui.add_folder("Save", order=4):
-        return {kind: gui.add_button(name) for kind, name in KINDS.items()}
+        kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js")
+        return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
+
+
+def thumbnail_row(pictures: Sequence[Picture], chosen: int | None) -> str:
+    """HTML: pictures of samples, each with its number; those of the first nine choose it when they are clicked."""
+    cells = []
+    for i, picture in enumerate(pictures):
+        line = "#228be6" if i == chosen else "transparent"
+        press = f' onclick="{CHOOSE.format(i + 1)}"' if i < KEYS else ""
+        style = f"width:100%;display:block;border:2px solid {line};cursor:pointer"
+        cells.append(f'<div><img src="{_source(picture)}" alt="sample {i + 1}" style="{style}"{press}>{i + 1}</div>')
+    style = (
+        "display:grid;grid-template-columns:repeat(4,1fr);gap:4px;padding:0 12px 8px;font-size:12px;text-align:center"
+    )
+    return f'<div style="{style}">{"".join(cells)}</div>'
+
+
+def preview_of(picture: Picture, label: str) -> str:
+    """HTML: the picture that is completed, and a line about it (any text)."""
+    style = "padding:0 8px 8px;font-size:14px"
+    return f'<div style="{style}">{escape(label)}<img src="{_source(picture)}" alt="" style="display:block"></div>'
+
+
+def _source(picture: Picture) -> str:
+    """The picture within the HTML: viser's own images lose theirs when the panel is moved."""
+    content = io.BytesIO()
+    Image.fromarray(picture).save(content, format="PNG")
+    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def possible_steps(sampler: Sampler) -> list[int]:

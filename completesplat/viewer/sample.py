@@ -18,6 +18,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 
 UP = (0.0, -1.0, 0.0)
+NEWEST_FILE = "scenes.json"
 FRAMING_FOV, FRAMING_SIZE = 50.0, 512
 
 
@@ -76,6 +77,25 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
     return [Sample(scene, _layers(scene, reference), reference, settings) for scene in scenes], _up(settings)
 
 
+def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
+    """The fixed scenes that a run has written last (`write_newest`), with the step, and where up is.
+
+    `CompleteSplatError`: they cannot be read.
+    """
+    path = folder / NEWEST_FILE
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        step, up = int(found["step"]), _up(found)
+        described = [(str(one["file"]), str(one["scene"]), _camera(one["reference_camera"])) for one in found["scenes"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
+    samples = []
+    for file, name, camera in described:
+        scene = read_ply(folder / Path(file).name)
+        samples.append(Sample(scene, _layers(scene, camera), camera, {"scene": name, "step": step}))
+    return step, samples, up
+
+
 def framing_camera(gaussians: Gaussians) -> Cameras:
     """A camera that looks along +z at nine tenths of the Gaussians."""
     means = gaussians.means if gaussians.count else torch.zeros(1, 3)
@@ -96,17 +116,23 @@ def _layers(gaussians: Gaussians, reference: Cameras) -> int:
 
 
 def _up(settings: Mapping[str, Any]) -> tuple[float, ...]:
-    return tuple(float(x) for x in settings.get("up", UP))
+    x, y, z = settings.get("up", UP)
+    return float(x), float(y), float(z)
+
+
+def _camera(plain: Mapping[str, Any]) -> Cameras:
+    pose, intrinsics = (torch.tensor(plain[name]).float() for name in ("world_to_camera", "intrinsics"))
+    height, width = plain["image_size"]
+    if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)):
+        raise ValueError("matrices of other sizes")
+    return Cameras(pose, intrinsics, (int(height), int(width)))
 
 
 def _read_description(path: Path) -> tuple[Cameras, dict[str, Any]]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        camera, settings = found["reference_camera"], dict(found["settings"])
-        pose, intrinsics = (torch.tensor(camera[name]).float() for name in ("world_to_camera", "intrinsics"))
-        height, width = camera["image_size"]
-        if (pose.shape, intrinsics.shape) != ((4, 4), (3, 3)) or len(_up(settings)) != 3:
-            raise ValueError("matrices of other sizes")
-        return Cameras(pose, intrinsics, (int(height), int(width))), settings
+        camera, settings = _camera(found["reference_camera"]), dict(found["settings"])
+        _up(settings)
+        return camera, settings
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CompleteSplatError(f"{path}: not the description of a prediction") from error

@@ -32,7 +32,9 @@ class Arrangement:
     Attributes:
         pivots: the point that each sample turns about, before it is moved to its place.
         right, spacing: the row's direction, and between neighbours 1.25 widths of the picture at the pivot.
-        position, look_at, fov: of the page's camera, the field of view vertical and in radians.
+        position, look_at: of the page's camera.
+        fov: its vertical field of view, in radians, in windows that are not narrower than `aspect`.
+        aspect: width through height of what is to be seen.
     """
 
     pivots: list[Float[Tensor, "3"]]
@@ -41,6 +43,7 @@ class Arrangement:
     position: Float[np.ndarray, "3"]
     look_at: Float[np.ndarray, "3"]
     fov: float
+    aspect: float
 
     @property
     def distance(self) -> float:
@@ -50,6 +53,17 @@ class Arrangement:
     def shift(self, index: int) -> Float[np.ndarray, "3"]:
         """How a sample is moved: the row has its middle where the first sample was."""
         return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
+
+    def fov_in(self, aspect: float) -> float:
+        """The vertical field of view, in radians, that shows all of it in a window of this width through height."""
+        return 2 * math.atan(math.tan(self.fov / 2) * max(1.0, self.aspect / aspect))
+
+    def beside(self, index: int, part: Gaussians) -> Gaussians:
+        """What of a sample reaches no further than to the middle between it and its neighbours; all of a single one."""
+        if len(self.pivots) == 1:
+            return part
+        reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
+        return part.keep(reach <= self.spacing / 2)
 
     def looks_like(self, other: "Arrangement") -> bool:
         """Whether a camera that was put there may stay: as many samples, about as far away."""
@@ -66,25 +80,30 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
     forward, distance = pose[:3, 2], float(np.linalg.norm(pivot - eye))
     height, width = reference.image_size
     tangent = height / 2 / reference.intrinsics[1, 1].item()
-    picture = 2 * distance * width / 2 / reference.intrinsics[0, 0].item()
-    spacing = GAP * picture
+    aspect = width / 2 / reference.intrinsics[0, 0].item() / tangent
+    spacing = GAP * 2 * distance * tangent * aspect
     if len(samples) > 1:
-        distance = max(distance, len(samples) * spacing / 2 / (tangent * NARROWEST_WINDOW))
-    return Arrangement(pivots, pose[:3, 0], spacing, pivot - forward * distance, pivot, 2 * math.atan(tangent))
+        aspect = NARROWEST_WINDOW
+        distance = max(distance, len(samples) * spacing / 2 / (tangent * aspect))
+    position = pivot - forward * distance
+    return Arrangement(pivots, pose[:3, 0], spacing, position, pivot, 2 * math.atan(tangent), aspect)
 
 
 class Stage:
-    """Samples side by side or one of them, all layers or some, in their colours or those of their depths; cameras.
+    """One of the samples or all, side by side; all layers or some, in their colours or those of their depths; cameras.
 
     Everything is drawn anew from the attributes by `refresh`, under a lock: callbacks come from several threads. Where
     up is, and the cameras [view] of a data set, are in the reference camera's frame.
+
+    Side by side, of each sample only what is around its middle is shown: scenes reach further than a picture's width,
+    and would hide each other.
     """
 
     def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
         self.server = server
         self.data_cameras = data_cameras
         self.samples: list[Sample] = []
-        self.chosen: int | None = None
+        self.chosen: int | None = 0
         self.hidden_layers: set[int] = set()
         self.depth = False
         self.cameras: set[str] = set()
@@ -94,15 +113,16 @@ class Stage:
         self._lock = threading.RLock()
         self.up = np.asarray(up, float)
         server.scene.set_up_direction(self.up)
+        server.on_client_connect(self._welcome)
 
     @property
     def shown(self) -> list[Sample]:
-        """All samples, or the chosen one."""
+        """The chosen sample, the first if there is none with its number; or all."""
         samples, chosen = self.samples, self.chosen
-        return samples if chosen is None or chosen >= len(samples) else [samples[chosen]]
+        return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
 
     def show(self, samples: Sequence[Sample]) -> None:
-        """These samples from now on, and all of them if there is none with the chosen number."""
+        """These samples from now on."""
         with self._lock:
             self.samples = list(samples)
             self.refresh()
@@ -120,6 +140,11 @@ class Stage:
                 self._arrangement = arrangement
                 self.look_from_the_front()
 
+    def forget_view(self) -> None:
+        """Another picture comes: what is drawn next is looked at from the front, wherever people look from now."""
+        with self._lock:
+            self._arrangement = None
+
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
         """Put a browser's camera (all browsers', and those of browsers to come) where the photograph was taken."""
         with self._lock:
@@ -131,17 +156,34 @@ class Stage:
                 with one.atomic():
                     camera = one.camera
                     camera.up_direction = self.up
-                    camera.position, camera.look_at, camera.fov = view.position, view.look_at, view.fov
+                    camera.position, camera.look_at = view.position, view.look_at
+                    camera.fov = view.fov_in(camera.image_width / camera.image_height)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """From now on, narrow windows of this browser (a phone's, upright) show the whole picture as wide ones do."""
+        seen: float | None = None
+
+        def fit(camera: viser.CameraHandle) -> None:
+            nonlocal seen
+            aspect, view = camera.image_width / max(camera.image_height, 1), self._arrangement
+            if view is not None and aspect > 0 and aspect != seen:
+                seen = aspect
+                camera.fov = view.fov_in(aspect)
+
+        client.camera.on_update(fit)
+        fit(client.camera)
 
     def _draw_splats(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
         scenes = [sample.for_viewers() for sample in shown]
         if self.depth:
             scenes = depth_colored(scenes)
         wanted = {
-            f"/sample_{i}/layer_{layer}": (layer_of(scene, layer, sample.layers), arrangement.shift(i), layer)
+            f"/sample_{i}/layer_{layer}": (
+                arrangement.beside(i, layer_of(scene, layer, sample.layers)), arrangement.shift(i), layer
+            )
             for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True))
             for layer in range(sample.layers)
-        }
+        }  # fmt: skip
         for name in self._splats.keys() - wanted.keys():
             self._splats.pop(name).remove()
         for name, (gaussians, shift, layer) in wanted.items():

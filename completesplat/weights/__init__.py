@@ -18,6 +18,7 @@ BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
 # Of a training run: its weights, which are written in the end, its settings, its newest checkpoint, fitted scenes.
 RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml", "checkpoints/last.ckpt", "scenes"
+NEWEST = "pictures/newest"  # of a training run, too: its fixed scenes as they are now, with `scenes.json`
 CAMERA = "camera"  # in stage 1's checkpoints, what was measured of the training set
 LARGEST_TEXT = 1_000_000
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")

@@ -1,15 +1,23 @@
+import os
 import re
 import sys
+from types import SimpleNamespace
 
 import pytest
+import torch
+from scenes_for_training import scene_batch
 from support import compose_config
 from viewer_scenes import balls
 
+from completesplat.commands.jobs import alone_in
 from completesplat.commands.settings import View
-from completesplat.commands.view import data_cameras, settings_of
+from completesplat.commands.view import data_cameras, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
+from completesplat.scene_model import SceneModel
 from completesplat.schema import check_settings
+from completesplat.training.fixed_scenes import write_newest
+from completesplat.viewer.sample import UP
 
 
 def folder(path, *names: str):
@@ -43,6 +51,67 @@ def test_what_cannot_be_shown_is_refused(tmp_path):
     ):
         with pytest.raises(CompleteSplatError, match=re.escape(said)):
             settings_of(tmp_path / path)
+
+
+def run_in_training(path, step: int = 2):
+    """A run's folder as far as it is watched."""
+    newest = path / "pictures/newest"
+    newest.mkdir(parents=True, exist_ok=True)
+    scenes = scene_batch(batch=2)
+    gaussians = balls(points=5)
+    write_newest(newest, step, gaussians.map(lambda values: torch.stack([values] * 2)), scenes, torch.tensor(UP))
+    return path
+
+
+def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
+    run = run_in_training(folder(tmp_path / "run", "checkpoints/last.ckpt", "config.yaml"))
+    assert settings_of(run) == {"weights": str(run)}
+    (run / ".lock").touch()
+    assert settings_of(run) == {"weights": str(run)}
+    with alone_in(run):
+        assert settings_of(run) == {"watch": str(run)}
+        assert (run / ".lock").read_text().split()[0] == str(os.getpid())  # as it was
+    assert settings_of(run) == {"weights": str(run)}
+
+
+def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
+    run, shown = run_in_training(tmp_path / "run"), []
+    stage = SimpleNamespace(samples=newest_scenes(run)[0])
+    page = SimpleNamespace(
+        stage=stage, show=lambda samples, said: (shown.append(said), setattr(stage, "samples", samples))
+    )
+    show_newest(page, run)
+    assert shown == []
+    for step in (4, 4, 6):
+        run_in_training(run, step)
+        show_newest(page, run)
+    assert shown == ["step 4 of the training", "step 6 of the training"]
+    (run / "pictures/newest/scenes.json").write_text("{")
+    show_newest(page, run)
+    assert len(shown) == 2
+    with pytest.raises(CompleteSplatError, match=r"no pictures/ here, which fit fills"):
+        newest_scenes(tmp_path)
+
+
+def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
+    (tmp_path / "run/pictures").mkdir(parents=True)
+    monkeypatch.setattr("completesplat.commands.view.time.sleep", lambda _: run_in_training(tmp_path / "run"))
+    samples, up = newest_scenes(tmp_path / "run")
+    assert (len(samples), up) == (2, UP)
+    assert "no scenes yet; waiting" in capsys.readouterr().out
+
+
+def test_the_background_is_removed_from_the_picture_that_is_given(command, pipeline, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    seen, read = [], SceneModel.read
+    monkeypatch.setattr(
+        SceneModel, "read", lambda self, file, fov, remove: seen.append(remove) or read(self, file, fov)
+    )
+    given = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=1", "steps=2", "export=drawn.html"]
+    for setting in ("background=remove", "background=0.25"):
+        finished = command("view", *given, setting, f"out={tmp_path / 'out'}")
+        assert finished.status == 0, finished.err
+    assert seen == [True, False]
 
 
 def test_settings_out_of_their_ranges_are_refused():

@@ -11,6 +11,7 @@ from PIL import Image
 from scenes_for_training import SIZE, scene_batch
 
 from completesplat.autoreconstructor.posterior import Posterior
+from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
 from completesplat.rasterizers.reference import ReferenceRasterizer
@@ -23,7 +24,9 @@ from completesplat.training.fixed_scenes import (
     layer_maps,
     percentiles,
     scene_panels,
+    write_newest,
 )
+from completesplat.viewer.sample import read_newest
 
 
 def layer(scenes: SceneBatch, depth: float, opacity: float, colors: torch.Tensor) -> Gaussians:
@@ -121,6 +124,35 @@ def test_the_bits_of_the_channels_are_those_of_the_posterior():
     assert logged["latent/active_channels"] == 2
 
 
+def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their_cameras(tmp_path):
+    up = torch.tensor([0.0, -0.8, -0.6])
+    scenes = scene_batch(batch=2)
+    gaussians = two_layers(scenes)
+    for step in (500, 1000):
+        write_newest(tmp_path / "newest", step, gaussians, scenes, up)
+        found, samples, said = read_newest(tmp_path / "newest")
+        assert (found, said) == (step, pytest.approx(up.tolist()))
+    assert [sample.settings for sample in samples] == [{"scene": name, "step": 1000} for name in scenes.names]
+    for index, sample in enumerate(samples):
+        assert sample.layers == 2
+        assert not sample.exact
+        torch.testing.assert_close(sample.gaussians.means, gaussians.means[index])
+        assert (sample.gaussians.scales > gaussians.scales[index]).all()  # as wide as the rasterizer's blur
+        assert torch.equal(sample.reference.intrinsics, scenes.reference.cameras.intrinsics[index])
+    broken = replace(gaussians, means=gaussians.means * torch.tensor([1.0, torch.nan])[:, None, None])
+    write_newest(tmp_path / "newest", 1500, broken, scenes, up)  # training goes on
+    assert len(read_newest(tmp_path / "newest")[1]) == 1
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"step": 1, "scenes": [{"file": "../a.ply"}]}'])
+def test_newest_scenes_that_are_not_there_are_refused(tmp_path, text):
+    with pytest.raises(CompleteSplatError, match="not the newest scenes"):
+        read_newest(tmp_path)
+    (tmp_path / "scenes.json").write_text(text)
+    with pytest.raises(CompleteSplatError, match="not the newest scenes"):
+        read_newest(tmp_path)
+
+
 def test_scenes_are_the_first_of_validation():
     several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
     data = SimpleNamespace(val_dataloader=lambda: several)
@@ -140,7 +172,7 @@ def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
 def test_a_run_leaves_pictures_and_rows(pipeline, stage):
     run = getattr(pipeline, stage)
-    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "layers_000002.png"}
+    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "layers_000002.png", "newest"}
     # One validation scene in eight panels, and its picture with three maps of either layer.
     assert cells(Image.open(run / "pictures/step_000002.png"), 32, 32).shape[:2] == (1, 8)
     assert cells(Image.open(run / "pictures/layers_000002.png"), 32, 32).shape[:2] == (1, 7)

@@ -33,7 +33,7 @@ pytestmark = [
 ]
 SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WINDOW = {"width": 700, "height": 360}
-START = {"samples": 1, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+START = {"samples": 1, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0, "remove_background": False}
 SECONDS = 90
 GREY = 128
 
@@ -59,8 +59,11 @@ def page(tmp_path_factory):
     made.close()
 
 
-def open_tab(chromium, address: str):
-    tab = chromium.new_page(viewport=WINDOW)
+def open_tab(chromium, address: str, window: dict[str, int] = WINDOW):
+    tab = chromium.new_page(viewport=window)
+    tab.errors = []
+    tab.on("console", lambda message: message.type == "error" and tab.errors.append(message.text))
+    tab.on("pageerror", lambda error: tab.errors.append(str(error)))
     tab.goto(address)
     until(lambda: abs(settled(tab)[-5, 5] - GREY).max() < 3, "the page does not appear")
     # The notices (that there is no graphics card, and others) would cover the scene.
@@ -104,9 +107,19 @@ def changed(tab, before: np.ndarray) -> np.ndarray:
     return settled(tab)
 
 
+def turn(tab, before: np.ndarray) -> np.ndarray:
+    """Drag the scene to the side."""
+    x, y = before.shape[1] / 2, before.shape[0] / 2
+    tab.mouse.move(x, y)
+    tab.mouse.down()
+    tab.mouse.move(x + 60, y, steps=5)
+    tab.mouse.up()
+    return changed(tab, before)
+
+
 def ours(height: int, width: int, shrink: int) -> np.ndarray:
-    """The balls by our own rasterizer, as the reference camera would see them in a window of this size."""
-    focal = height / 2 / np.tan(np.radians(25))
+    """The balls by our own rasterizer, as the reference camera would see them in a window of this size, all of them."""
+    focal = min(height, width) / 2 / np.tan(np.radians(25))
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]) / shrink
     intrinsics[2, 2] = 1
     camera = Cameras(torch.eye(4), intrinsics.float(), (height // shrink, width // shrink))
@@ -144,17 +157,73 @@ def test_a_layer_disappears_when_it_is_switched_off(tab):
     place(changed(tab, without), BALLS["red"][1])
 
 
+def test_the_page_has_our_title_and_icon_and_no_errors(tab):
+    settled(tab)
+    assert tab.title() == "completesplat"
+    assert "1971c2" in tab.locator("link[rel=icon]").get_attribute("href")
+    assert tab.errors == []
+
+
+def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium, page):
+    phone = open_tab(chromium, page.server.address, {"width": 390, "height": 700})
+    button = phone.get_by_role("button", name="Load a picture")
+    assert not button.is_visible()
+    seen = settled(phone)
+    assert seen.shape[:2] == (700, 390)
+    expected = ours(700, 390, shrink=3)
+    for _, color in BALLS.values():
+        assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1.5)
+    phone.get_by_text("completesplat", exact=True).click()
+    button.wait_for(timeout=1000 * SECONDS)
+    assert phone.errors == []
+    phone.close()
+
+
+def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
+    first, second = balls_sample(), balls_sample()
+    second.gaussians.colors[:] = torch.tensor(BALLS["yellow"][1])
+    before = settled(tab)
+    page.show([first, second])
+    tab.get_by_alt_text("sample 2", exact=True).click(timeout=1000 * SECONDS)
+    one = changed(tab, before)
+    assert page.stage.chosen == 1
+    assert not (abs(one - 255 * np.array(BALLS["red"][1])).max(-1) < 40).any()
+    tab.locator("canvas").first.press("0")
+    both = changed(tab, one)
+    assert place(both, BALLS["red"][1])[1] < both.shape[1] / 2  # of the first sample, on the left
+    tab.locator("canvas").first.press("1")
+    changed(tab, both)
+    assert page.looking.chosen.value == "sample 1"
+    page.show([first])
+
+
+def test_too_large_a_file_is_refused_and_the_page_says_so(tab, page, tmp_path):
+    file = tmp_path / "large.png"
+    file.write_bytes(bytes(33 * 2**20))
+    with tab.expect_file_chooser() as chooser:
+        tab.get_by_role("button", name="Load a picture").click()
+    chooser.value.set_files(file)
+    told = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
+    told.wait_for(state="attached", timeout=1000 * SECONDS)
+    assert page.server.gui._current_file_upload_states == {}
+
+
 def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     file = tmp_path / "photo.png"
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (4, 4, 3), np.uint8)).resize((64, 64)).save(file)
     before = settled(tab)
+    turned = turn(tab, before)
+    client = page.server.get_clients()[min(page.server.get_clients())]  # the tab, which came first
+    assert abs(client.camera.position).max() > 0.3
     with tab.expect_file_chooser() as chooser:
         tab.get_by_role("button", name="Load a picture").click()
     chooser.value.set_files(file)
     tab.get_by_text("1 drawn in").wait_for(timeout=1000 * SECONDS)
-    first = changed(tab, before)
+    first = changed(tab, turned)
     assert page.stage.samples[0].settings["image"] == "photo.png"
+    assert client.camera.position == pytest.approx(np.zeros(3), abs=0.02)  # it comes back to the front
+    assert client.camera.look_at[:2] == pytest.approx(np.zeros(2), abs=0.02)
     seed = tab.locator(".mantine-NumberInput-input").nth(4)  # behind the fifth slider
     seed.fill("9")
     seed.press("Enter")
@@ -175,10 +244,15 @@ def test_a_browser_needs_the_whole_address_once(chromium, page):
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
     page.show([balls_sample()])
     write_page(page.server, tmp_path / "page.html")
-    seen = settled(open_tab(chromium, f"file://{tmp_path / 'page.html'}"))
+    offline = open_tab(chromium, f"file://{tmp_path / 'page.html'}")
+    seen = settled(offline)
     expected = ours(*seen.shape[:2], shrink=3)
     for _, color in BALLS.values():
         assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1)
+    assert offline.errors == []
+    around = turn(offline, seen)  # about the red ball
+    assert place(around, BALLS["red"][1]) == pytest.approx(place(seen, BALLS["red"][1]), abs=8)
+    assert abs(place(around, BALLS["yellow"][1])[1] - place(seen, BALLS["yellow"][1])[1]) > 8
 
 
 @pytest.fixture

@@ -2,10 +2,12 @@
 
 import io
 import logging
+import os
 import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
+import fake_converter
 import numpy as np
 import pytest
 import torch
@@ -14,6 +16,7 @@ from support import tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
+from completesplat.export.pictures import to_bytes
 from completesplat.export.ply import read_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -22,9 +25,11 @@ viser = pytest.importorskip("viser", reason="the viewer's extra is not installed
 from completesplat.viewer import page as page_module  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, start_server  # noqa: E402
+from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
 from completesplat.viewer.stage import Stage  # noqa: E402
 
-START = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
+START = SETTINGS | {"remove_background": False}
 SECONDS = 30
 
 
@@ -98,7 +103,9 @@ def nodes(page: Page) -> dict[str, object]:
 def test_layers_of_samples_are_switched_and_samples_picked_and_put_where_they_were_drawn(page):
     page.show([balls_sample(layers=4), balls_sample(layers=2)])
     first, second = ({f"/sample_{i}/layer_{j}": 600 // of for j in range(of)} for i, of in enumerate((4, 2)))
-    assert {name: len(node.centers) for name, node in nodes(page).items()} == first | second
+    assert {name: len(node.centers) for name, node in nodes(page).items()} == dict.fromkeys(list(first), 150)
+    page.looking.chosen.value = SIDE_BY_SIDE
+    assert nodes(page).keys() == (first | second).keys()
     page.looking.layers[1].value = False
     hidden = {name for name, node in nodes(page).items() if not node.visible}
     assert hidden == {"/sample_0/layer_1", "/sample_1/layer_1"}
@@ -108,6 +115,34 @@ def test_layers_of_samples_are_switched_and_samples_picked_and_put_where_they_we
     page.looking.chosen.value = "sample 2"
     assert {name: len(node.centers) for name, node in nodes(page).items()} == dict.fromkeys(list(first)[:2], 300)
     assert {tuple(node.position) for node in nodes(page).values()} == {(0.0, 0.0, 0.0)}
+
+
+def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
+    page.show([balls_sample()] * 3)
+    assert page.worker.wait(SECONDS)
+    thumbnails = page.looking.thumbnails
+    assert thumbnails.content.count("<img") == 3
+    assert "key:'3'" in thumbnails.content
+    first = thumbnails.content
+    for digit, chosen, value in (("2", 1, "sample 2"), ("9", 1, "sample 2"), ("0", None, SIDE_BY_SIDE)):
+        for callback in page.looking.keys[digit]._impl.trigger_cb:
+            callback(viser.CommandEvent(client=Browser(), client_id=0, target=page.looking.keys[digit]))
+        assert (page.stage.chosen, page.looking.chosen.value) == (chosen, value)
+    assert len({tuple(node.position) for node in nodes(page).values()}) == 3
+    assert thumbnails.content != first  # none is marked
+    page.show([balls_sample()])
+    assert page.worker.wait(SECONDS)
+    assert thumbnails.content == ""
+
+
+def test_a_thumbnail_is_what_the_reference_camera_sees(page):
+    sample = balls_sample()
+    wide = replace(sample.reference, image_size=(64, 96))
+    picture = page.saver.picture(replace(sample, reference=wide), 48)
+    assert picture.shape == (32, 48, 3)
+    rendering = ReferenceRasterizer()(sample.gaussians[None], sample.reference[None][None]).over(0.5)
+    ours = to_bytes(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
+    assert abs(picture[:, :32] - ours).mean() < 6
 
 
 def test_depth_takes_the_place_of_the_colours_and_frusta_stand_where_the_cameras_are(page):
@@ -130,11 +165,11 @@ def test_a_picture_that_is_loaded_is_completed_in_sight_as_the_model_does(comple
     seen, show = [], completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
     shown = upload(completion)
-    for sample, expected in zip(shown, model(completion.photograph[1], **START), strict=True):
+    for sample, expected in zip(shown, model(completion.photograph[1], **SETTINGS), strict=True):
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
-    assert "photo.png" in completion.controls.preview.label
-    assert completion.page.looking.chosen.options == ("all, side by side", "sample 1", "sample 2")
+    assert "photo.png" in completion.controls.preview.content
+    assert completion.page.looking.chosen.options == ("sample 1", "sample 2", "all, side by side")
     assert [sample.finished for sample in seen] == [False, False, True]
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
@@ -169,7 +204,7 @@ def test_a_refusal_is_told_to_who_caused_it_and_changes_nothing(completion, monk
     press(completion.controls.draw, browser)
     assert upload(completion, "notes.txt", b"no picture", browser) is before
     completion.page.show([])
-    press(completion.page.saving["ply"], browser)
+    press(completion.page.saving.save, browser)
     finish(completion)
     for message, start in zip(browser.messages, ("load a", "notes.txt: not an", "there is nothing"), strict=True):
         assert message.startswith(start)
@@ -201,11 +236,21 @@ def test_a_fault_is_told_and_the_page_goes_on(completion, model, monkeypatch, ca
     assert len(upload(completion)) == 2
 
 
-@pytest.mark.parametrize(("kind", "count"), [("ply", 2), ("video", 2), ("html", 1)])
-def test_files_are_written_and_sent_to_who_asked(page, kind, count):
-    browser, name = Browser(), {"ply": "sample_0{}.ply", "video": "orbit_0{}.mp4", "html": "page_0{}.html"}[kind]
+KINDS = [(kind, 2, f"sample_0{{}}.{kind}") for kind in ("ply", "splat", "glb", "spz", "sog")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "name"), [*KINDS, ("video", 2, "orbit_0{}.mp4"), ("html", 1, "page_0{}.html")]
+)
+def test_files_are_written_and_sent_to_who_asked(page, kind, count, name, tmp_path, monkeypatch):
+    browser = Browser()
+    monkeypatch.setenv(
+        "PATH", str(fake_converter.install(tmp_path / "bin", "splat-transform").parent), prepend=os.pathsep
+    )
     page.show([balls_sample(), balls_sample()])
-    press(page.saving[kind], browser)
+    page.looking.chosen.value = SIDE_BY_SIDE
+    page.saving.kind.value = kind
+    press(page.saving.save, browser)
     assert page.worker.wait(SECONDS)
     assert sorted(browser.files) == [name.format(i) for i in range(count)]
     for file, content in browser.files.items():
@@ -216,7 +261,7 @@ def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(pag
     page.show([balls_sample(), balls_sample()])
     page.looking.chosen.value = "sample 2"
     for _ in range(2):
-        press(page.saving["ply"], Browser())
+        press(page.saving.save, Browser())
         assert page.worker.wait(SECONDS)
     assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
 
@@ -239,3 +284,37 @@ def test_a_port_that_is_taken_leads_to_the_next_one(server):
     assert second.get_port() > server.get_port()
     assert second.get_host() == "127.0.0.1"
     second.stop()
+
+
+def test_names_of_pictures_are_text_in_the_panels_html():
+    html = preview_of(np.zeros((2, 2, 3), np.uint8), "<img src=x onerror=alert(1)>")
+    assert html.count("<img") == 1
+    assert "&lt;img src=x" in html
+
+
+def test_thumbnails_that_have_no_key_choose_nothing():
+    row = thumbnail_row([np.zeros((2, 2, 3), np.uint8)] * 11, chosen=None)
+    assert (row.count("<img"), row.count("onclick")) == (11, 9)
+
+
+def test_without_nodejs_the_formats_that_need_it_are_refused(page, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    browser = Browser()
+    page.saving.kind.value = "spz"
+    press(page.saving.save, browser)
+    assert page.worker.wait(SECONDS)
+    assert "need Node.js" in browser.messages[0]
+
+
+def test_the_object_is_cut_out_of_pictures_when_that_is_switched_on(completion, model, monkeypatch):
+    seen, read = [], type(model).read
+
+    def reading(self, file, *given, remove_background=False):
+        seen.append(remove_background)
+        return read(self, file)
+
+    monkeypatch.setattr(type(model), "read", reading)
+    upload(completion)
+    completion.controls.remove_background.value = True
+    upload(completion)
+    assert seen == [False, True]

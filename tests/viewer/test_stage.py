@@ -35,6 +35,29 @@ def test_all_of_a_row_are_in_view_and_none_overlap(count):
     assert abs(shifts[:, 0]).max() + picture / 2 < half_width
 
 
+def test_side_by_side_samples_reach_no_further_than_to_the_middle_between_them():
+    """A scene's floor and walls are far larger than the picture of its object: whole ones would hide each other."""
+    sample, wall = balls_sample(), balls()
+    wall = replace(wall, means=wall.means * torch.tensor([30.0, 30, 1]))
+    large = replace(wall[:4], means=sample.pivot().expand(4, 3), scales=torch.full((4, 3), 3.0))
+    scene = concatenate([sample.gaussians, wall, large])
+    both = arrangement_of([replace(sample, gaussians=scene)] * 2)
+    kept = both.beside(1, scene)
+    assert kept.count >= sample.gaussians.count - 60  # the yellow ball's far side is outside
+    reach = (kept.means - both.pivots[1]).norm(dim=-1) + 2 * kept.scales.amax(-1)
+    assert reach.max() <= both.spacing / 2
+    alone = arrangement_of([replace(sample, gaussians=scene)])
+    assert alone.beside(0, scene).count == scene.count
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_narrow_windows_show_as_much_to_the_sides_as_wide_ones(count):
+    arrangement = arrangement_of([balls_sample()] * count)
+    assert arrangement.fov_in(2.0) == arrangement.fov
+    sides = [np.tan(arrangement.fov_in(aspect) / 2) * aspect for aspect in (0.3, 390 / 844, arrangement.aspect)]
+    assert sides == pytest.approx([sides[0]] * 3)
+
+
 def test_a_camera_stays_while_the_scene_changes_a_little():
     sample = balls_sample()
     one = arrangement_of([sample])
