@@ -168,17 +168,18 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | N
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
     first = is_first()
-    if first:
-        with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
-            OmegaConf.save(resolved, temporary)
-        _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
-    for key in ("checkpoint", "autoreconstructor_checkpoint"):
-        # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
-        if OmegaConf.select(config, f"model.{key}") is not None:
-            config.model[key] = resolved["model"][key]
     try:
-        with ended_by_signals(), _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
-            start(verb, config, out)
+        with ended_by_signals():
+            if first:
+                with atomic_path(out / CONFIG) as temporary:  # other processes may be reading it
+                    OmegaConf.save(resolved, temporary)
+                _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
+            for key in ("checkpoint", "autoreconstructor_checkpoint"):
+                # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
+                if OmegaConf.select(config, f"model.{key}") is not None:
+                    config.model[key] = resolved["model"][key]
+            with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
+                start(verb, config, out)
     except Interrupted as stop:
         if first:
             print(_said(stop, verb, given, out), file=sys.stderr)

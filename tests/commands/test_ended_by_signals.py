@@ -125,3 +125,16 @@ def test_lightning_starts_processes_that_know_which_one_started_them(command, to
     monkeypatch.setattr("completesplat.commands.fit.run", lambda config, out: started.append(out))
     assert command("fit", given[2]).status == 0
     assert (ended, started) == ([os.getpid()], [tmp_path / "run"])
+
+
+def test_a_signal_while_the_run_s_own_files_are_written_leaves_none_of_them_half(
+    command, toy_root, tmp_path, monkeypatch
+):
+    def record(*_):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("completesplat.commands.jobs._record", record)
+    finished = command("fit", *FIT, f"data.root={toy_root}", f"out={tmp_path / 'run'}")
+    assert finished.status == 143
+    assert said(finished, signal.SIGTERM)[0] == ""
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"config.yaml", ".lock", "commands.log", "fit.log"}
