@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import islice
@@ -29,7 +29,7 @@ from completesplat.data.latent_cache import (
     write_manifest,
 )
 from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered, processes
+from completesplat.data.loading.distributed import gathered, is_first, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.source import PackedSource
@@ -181,14 +181,9 @@ def encode_training_set(
     blank = encode(stack([load(next(_references(source, 1, [], False))).scene]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
-    first = processes()[0] == 0
-    batches = _encoded_batches(_references(source, frames, sequences, progress and first), load, encode, batch_size)
-    if first:
-        arrays, moments = _write_arrays(out, blank, batches)
-        write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
-    else:
-        deque(batches, maxlen=0)
-    gathered(None)  # which waits for the first process
+    progress = progress and is_first()
+    batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
+    _write_store(out, origin, blank, batches, sequences)
     return LatentCache(out)
 
 
@@ -257,6 +252,18 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
     total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
     contents = f"{total:,} frames of {len(source.names):,} sequences"
     require_space(total * bytes_per_frame, contents, out, "; frames=N takes fewer frames of a sequence")
+
+
+def _write_store(
+    out: Path, origin: Origin, blank: Rows, batches: Iterator[Rows], sequences: Sequence[CachedSequence]
+) -> None:
+    """The first process writes what all encode; the others wait for it. `sequences` are there when `batches` end."""
+    if is_first():
+        arrays, moments = _write_arrays(out, blank, batches)
+        write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
+    else:
+        deque(batches, maxlen=0)
+    gathered(None)
 
 
 def _write_arrays(out: Path, blank: Rows, batches: Iterator[Rows]) -> tuple[dict[str, Array], Moments]:

@@ -1,11 +1,13 @@
 """Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is read."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
+from completesplat.data.packed.remote import address_of, fetched
 from completesplat.data.packed.rows import features, from_row
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
@@ -36,10 +38,13 @@ class PackedSource(SequenceSource):
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
         }
         self._opened: dict[int, Any] = {}
+        self.address = address_of(root)
         with at(file=root / MANIFEST):
             for shard in self.shards:
-                path = require_file(inside(root, shard.file))
-                size = path.stat().st_size
+                path = inside(root, shard.file)
+                if self.address is not None and not path.is_file():
+                    continue
+                size = require_file(path).stat().st_size
                 if size != shard.bytes:
                     reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
                     raise ChangedFile(reason, str(path))
@@ -51,8 +56,19 @@ class PackedSource(SequenceSource):
         path = self.root / shard.file
         if number not in self._opened:
             with at(sequence=name):
+                if self.address is not None:
+                    fetched(self.address, shard, path)
                 self._opened[number] = open_shard(path, shard)
         return from_row(self._opened[number][row], str(path), name)
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """Shard by shard where they have to be fetched: training starts with the first one. Else in any order."""
+        if self.address is None:
+            return super().groups(names)
+        groups: dict[int, list[int]] = {}
+        for index, name in enumerate(names):
+            groups.setdefault(self._places[name][0], []).append(index)
+        return list(groups.values())
 
     def fingerprint(self) -> str:
         """That of the source which the store was made from."""
