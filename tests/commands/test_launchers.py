@@ -5,13 +5,17 @@ import os
 import stat
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from support import SMALL, script, strict_json
 
 PYTHON = f"#!{sys.executable}\n"
-SBATCH = '''"""Start all jobs of an array, or the one job, of the script of the last argument, and print the number."""
+SBATCH = '''"""Start all jobs of an array, or the one job, of the script of the last argument, and print the number.
+
+They wait, as in a queue, until whoever submits them has put everything in its place.
+"""
 import os, re, subprocess, sys
 script = sys.argv[-1]
 options = dict(re.findall(r"^#SBATCH --([\\w-]+)=(\\S+)", open(script).read(), re.M))
@@ -23,7 +27,8 @@ for task in range(int(first), int(last) + 1):
     told |= {"SLURM_NTASKS_PER_NODE": tasks, "SLURM_NNODES": options["nodes"], "SLURM_JOB_NUM_NODES": "1"}
     if "array" in options:
         told |= {"SLURM_ARRAY_JOB_ID": number, "SLURM_ARRAY_TASK_ID": str(task)}
-    subprocess.Popen(["bash", script], env=os.environ | told, stdout=subprocess.DEVNULL, start_new_session=True)
+    run = ["bash", "-c", f"sleep 5; exec bash {script}"]
+    subprocess.Popen(run, env=os.environ | told, stdout=subprocess.DEVNULL, start_new_session=True)
 print("Submitted batch job", number)
 '''
 SRUN = '''"""Run a program once for each task, as srun does on one node."""
@@ -31,10 +36,13 @@ import os, subprocess, sys
 count = int(os.environ["SLURM_NTASKS"])
 program = sys.argv[next(i for i, argument in enumerate(sys.argv) if "/python" in argument) :]
 shared = {"SLURM_STEP_NUM_TASKS": str(count), "SLURM_NODEID": "0", "SLURM_NODELIST": "localhost"}
+log = sys.argv[sys.argv.index("--error") + 1]
+job, task = (os.environ.get(f"SLURM_ARRAY_{name}_ID", "0") for name in ("JOB", "TASK"))
 processes = []
 for rank in range(count):
     told = shared | {"SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)}
-    processes.append(subprocess.Popen(program, env=os.environ | told))
+    with open(log.replace("%A", job).replace("%a", task).replace("%t", str(rank)), "w") as file:
+        processes.append(subprocess.Popen(program, env=os.environ | told, stdout=file, stderr=file))
 sys.exit(max(process.wait() for process in processes))
 '''
 
@@ -73,7 +81,6 @@ def assert_finished(folder: Path, *jobs: str) -> None:
 
 @pytest.mark.slow
 def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_path, cluster):
-    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     launched = ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "trainer=slurm", "seed=0,1"]
     out = sweep(toy_root, tmp_path, *launched, "hydra.launcher.tasks_per_node=2", "trainer.precision=32-true")
     assert_finished(out, "seed-0", "seed-1")
@@ -85,6 +92,7 @@ def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_pa
 
 @pytest.mark.slow
 def test_joblib_runs_the_jobs_of_a_sweep_at_once(toy_root, tmp_path):
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:  # no extra of this package has it
+        pytest.skip("hydra-joblib-launcher is not installed")
     out = sweep(toy_root, tmp_path, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1")
     assert_finished(out, "seed-0", "seed-1")

@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 import torch
+from hydra.utils import instantiate
 from safetensors.torch import load_file, save_file
-from support import SMALL, script, strict_json
+from support import SMALL, compose_config, script, strict_json
 
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.training.checkpoints import CheckpointFiles, newest_whole
-from completesplat.training.sharding import remove_unused_shards
+from completesplat.training.sharding import _refuse_undivided, remove_unused_shards
 from completesplat.weights import sha256_of
 from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, check_whole, read_checkpoint
 
@@ -149,3 +150,30 @@ def test_a_checkpoint_cannot_name_files_elsewhere(tmp_path):
     CheckpointFiles().save_checkpoint(held, tmp_path / "run/last.ckpt")
     with pytest.raises(WeightsError):
         read_checkpoint(tmp_path / "run/last.ckpt")
+
+
+@pytest.mark.parametrize("option", ["ddp", "fsdp"])
+def test_launchers_say_how_many_processes_there_are(monkeypatch, option):
+    for name in ("LOCAL_WORLD_SIZE", "GROUP_WORLD_SIZE", "SLURM_NTASKS_PER_NODE", "SLURM_NNODES"):
+        monkeypatch.delenv(name, raising=False)
+    trainer = compose_config("fit", f"trainer={option}").trainer
+    assert (trainer.devices, trainer.num_nodes) == ("auto", 1)
+    monkeypatch.setenv("SLURM_NTASKS_PER_NODE", "8")
+    monkeypatch.setenv("SLURM_NNODES", "3")
+    slurm = compose_config("fit", "trainer=slurm").trainer
+    assert (trainer.devices, trainer.num_nodes) == (slurm.devices, slurm.num_nodes) == (8, 3)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    monkeypatch.setenv("GROUP_WORLD_SIZE", "2")
+    assert (trainer.devices, trainer.num_nodes) == (4, 2)
+
+
+def test_what_cannot_be_divided_is_refused():
+    config = compose_config("fit", "experiment=toy_var", *SMALL, "model.channels_last=true")
+    module = instantiate(config.model, _convert_="all")
+    with pytest.raises(CompleteSplatError, match=r"set model\.channels_last=false"):
+        _refuse_undivided(module)
+    module = instantiate(compose_config("fit", "experiment=toy_var", *SMALL).model, _convert_="all")
+    _refuse_undivided(module)
+    module.more = torch.nn.Linear(1, 1)
+    with pytest.raises(CompleteSplatError, match=r"more\.weight of ReconstructionModule is not divided"):
+        _refuse_undivided(module)
