@@ -28,7 +28,8 @@ for task in range(int(first), int(last) + 1):
     if "array" in options:
         told |= {"SLURM_ARRAY_JOB_ID": number, "SLURM_ARRAY_TASK_ID": str(task)}
     run = ["bash", "-c", f"sleep 5; exec bash {script}"]
-    subprocess.Popen(run, env=os.environ | told, stdout=subprocess.DEVNULL, start_new_session=True)
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.Popen(run, env=os.environ | told, start_new_session=True, **silent)
 print("Submitted batch job", number)
 '''
 SRUN = '''"""Run a program once for each task, as srun does on one node."""
@@ -67,7 +68,7 @@ def sweep(root: Path, folder: Path, *settings: str) -> Path:
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     program = [sys.executable, str(script(folder)), "fit", "-m", *given]
     done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=900, cwd=folder)
-    logs = "".join(path.read_text()[-2000:] for path in folder.glob("sweep/.submitit/*/*.err"))
+    logs = "".join(path.read_text()[-2000:] for path in folder.glob("sweep/.submitit/*/*_log.err"))
     assert done.returncode == 0, done.stderr[-3000:] + logs
     return folder / "sweep"
 
