@@ -129,6 +129,12 @@ class Moments:
         self.total = self.total + mean.sum((0, 2, 3))
         self.squares = self.squares + (np.square(mean) + variance).sum((0, 2, 3))
 
+    def join(self, other: "Moments") -> None:
+        """What another one has added up, too."""
+        self.count += other.count
+        self.total = self.total + other.total
+        self.squares = self.squares + other.squares
+
     def results(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Mean and deviation, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
         mean = np.asarray(self.total) / self.count
@@ -226,24 +232,30 @@ def _encoded_batches(
     load: Callable[[tuple[PosedSequence, int]], FrameToEncode],
     encode: Callable[[SceneBatch], Rows],
     batch_size: int,
-) -> Iterator[Rows]:
-    """The rows of all batches, in order, of which each process encodes its share; all of them have to ask for them."""
+) -> Iterator[tuple[Rows, Moments]]:
+    """The rows of all batches, in order, and the moments of each batch.
+
+    Each process encodes its share; all of them have to ask for them. (Rows that were sent lie in another order in
+    memory, and their sums are rounded otherwise.)
+    """
     rank, count = processes()
     while group := list(islice(references, count * batch_size)):
         own = group[rank * batch_size : (rank + 1) * batch_size]
-        found: Rows | DataError | None = None
+        found: tuple[Rows, Moments] | DataError | None = None
         if own:
             try:
                 batch = list(map(load, own))
-                found = encode(stack([one.scene for one in batch]))
-                _refuse_not_finite(found, batch)
+                rows, moments = encode(stack([one.scene for one in batch])), Moments()
+                _refuse_not_finite(rows, batch)
+                moments.add(rows["mean"], rows["log_variance"])
+                found = rows, moments
             except DataError as error:  # which is every process's
                 found = error
-        for rows in gathered(found):
-            if isinstance(rows, DataError):
-                raise rows
-            if rows is not None:
-                yield rows
+        for encoded_there in gathered(found):
+            if isinstance(encoded_there, DataError):
+                raise encoded_there
+            if encoded_there is not None:
+                yield encoded_there
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
@@ -255,7 +267,7 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 
 
 def _write_store(
-    out: Path, origin: Origin, blank: Rows, batches: Iterator[Rows], sequences: Sequence[CachedSequence]
+    out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Moments]], sequences: Sequence[CachedSequence]
 ) -> None:
     """The first process writes what all encode; the others wait for it. `sequences` are there when `batches` end."""
     if is_first():
@@ -266,7 +278,7 @@ def _write_store(
     gathered(None)
 
 
-def _write_arrays(out: Path, blank: Rows, batches: Iterator[Rows]) -> tuple[dict[str, Array], Moments]:
+def _write_arrays(out: Path, blank: Rows, batches: Iterator[tuple[Rows, Moments]]) -> tuple[dict[str, Array], Moments]:
     """Rows like those of `blank`; what was written, and its moments."""
     moments = Moments()
     with ExitStack() as files:
@@ -274,8 +286,8 @@ def _write_arrays(out: Path, blank: Rows, batches: Iterator[Rows]) -> tuple[dict
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in blank.items()
         }
-        for rows in batches:
-            moments.add(rows["mean"], rows["log_variance"])
+        for rows, of_batch in batches:
+            moments.join(of_batch)
             for name, writer in writers.items():
                 writer.append(rows[name])
     return {name: writer.described() for name, writer in writers.items()}, moments
