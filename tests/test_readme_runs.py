@@ -24,7 +24,7 @@ BRIEF = {
     **{f"report {study}": ["scenes=1", "samples=2"] for study in ("samplers", "controls", "masked", "depth")},
 }
 # What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one).
-NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1")
+NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1", "TABLE_OF_A")
 TAKES_MINUTES = ("completesplat bench",)
 
 

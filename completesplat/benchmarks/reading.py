@@ -101,8 +101,8 @@ def opening_figures(make: MakeData, epochs: int) -> dict[str, Any]:
 
     Returns:
         `seconds` to open it (train and val); `added_mb`, resident then above the imports; `growth_mb` of anonymous
-        memory from the first epoch's end to the last one's; `steps` with resident memory after each. No memory is given
-        where the system does not tell.
+        memory from the first epoch's end to the last one's; `steps` with resident memory after each, and of what takes
+        time the processor's share (`cpu_seconds`), too. No memory is given where the system does not tell.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         steps = pool.submit(_steps, make, epochs).result()
@@ -122,14 +122,17 @@ def _steps(make: MakeData, epochs: int) -> list[dict[str, Any]]:
     import datasets  # noqa: F401  which the store itself imports with its first sequence
 
     steps = [_step("imports")]
-    start = time.perf_counter()
+    start, busy = time.perf_counter(), time.process_time()
     data = make(workers=0)
     data.setup("fit")
-    steps.append(_step("opening", seconds=time.perf_counter() - start))
+    seconds = {"seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - busy}
+    steps.append(_step("opening", **seconds))
     loader = data.train_dataloader()
     for number in range(epochs):
+        busy = time.process_time()
         epoch = read_epoch(loader, number)
-        steps.append(_step(f"epoch {number + 1}", seconds=epoch.seconds, scenes=epoch.scenes))
+        seconds = {"seconds": epoch.seconds, "cpu_seconds": time.process_time() - busy}
+        steps.append(_step(f"epoch {number + 1}", **seconds, scenes=epoch.scenes))
     return steps
 
 

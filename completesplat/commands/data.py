@@ -89,14 +89,17 @@ def latents(
     views: Positive,
     precision: Literal["float32", "float16"],
     batch_size: Positive,
+    devices: Positive,
+    num_nodes: Positive,
 ) -> None:
     """Encode the training set of stage 1's run into `out`; see `completesplat.training.encoding`."""
-    import torch
     from hydra.utils import instantiate
+    from lightning import Fabric
 
     from completesplat.autoreconstructor.model import VariationalAutoReconstructor
     from completesplat.commands.trained import config_of_run
     from completesplat.training.encoding import encode_training_set
+    from completesplat.training.stopping import stopped_together
     from completesplat.weights.checkpoint_reading import load_part
 
     run_config = config_of_run(Path(ckpt), list(overrides), trust)
@@ -106,10 +109,12 @@ def latents(
     load_part(autoreconstructor, ckpt, prefix="model.")
     data = instantiate(run_config.data, _convert_="all")
     data.prepare_data()
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    store = encode_training_set(
-        autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, device
-    )
+    fabric = Fabric(devices=devices, num_nodes=num_nodes)
+    with stopped_together():
+        fabric.launch()
+        store = encode_training_set(
+            autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, fabric.device
+        )
     logger.info("deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 

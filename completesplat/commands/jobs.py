@@ -40,6 +40,11 @@ CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
 PROCESS_OF_JOB = "--process-of"
+MAY_CHANGE = (
+    *("ckpt_path", "data.allow_changed", "optimized_metric"),
+    *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
+)
+"""Settings that a run may go on without; the last one with all below it."""
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
@@ -241,7 +246,7 @@ def is_finished(out: Path, config: Any) -> bool:
     if config["ckpt_path"] != "last":
         raise CompleteSplatError(f"{out} holds a run: continue it with ckpt_path=last, or choose another out=DIR")
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
-    different -= {"ckpt_path", "data.allow_changed", "optimized_metric"}
+    different = {key for key in different if key not in MAY_CHANGE and not key.startswith(f"{MAY_CHANGE[-1]}.")}
     if different:
         first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
         raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")

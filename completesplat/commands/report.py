@@ -1,13 +1,16 @@
-"""`completesplat report`: the paper's tables with our results beside them, and a page with all results."""
+"""`completesplat report`: the paper's tables with our results beside them, a page with all, summaries of sweeps."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, TypedDict
 
 from completesplat.atomic import atomic_path
+from completesplat.errors import CompleteSplatError
 from completesplat.results.html_page import page
 from completesplat.results.published import tables as published_tables
 from completesplat.results.runs import find, origin
+from completesplat.results.sweeps import show_summary, write_summary
 from completesplat.results.tables import show, write_tables
 from completesplat.schema import Positive, Range
 
@@ -33,6 +36,18 @@ def tables(runs: str | None, out: Path) -> None:
     show(*made, width=240)
     for warning in tree.warnings if tree else []:
         logger.warning(warning)
+
+
+def summary(sweeps: Sequence[str], out: Path) -> None:
+    """Write the summary of one sweep whose jobs lie in several folders, as `fit -m` writes that of one; print it.
+
+    `CompleteSplatError` where there is no such folder.
+    """
+    folders = [Path(sweep) for sweep in sweeps]
+    for folder in folders:
+        if not folder.is_dir():
+            raise CompleteSplatError(f"sweeps={folder}: no such folder")
+    show_summary(write_summary(out, *folders))
 
 
 def html(runs: str, most: Most, out: Path) -> None:

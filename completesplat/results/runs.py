@@ -158,8 +158,42 @@ class Job:
 SEED = "seed"
 
 
-def collect(folder: Path) -> list[Job]:
-    """All jobs of a sweep's folder; those without a folder of their own, which have not started, at the end."""
+def collect(*folders: Path) -> list[Job]:
+    """All jobs of a sweep's folder; those without a folder of their own, which have not started, at the end.
+
+    Several folders are parts of one sweep, of several machines: settings that only say where a machine has its files
+    do not count, and of a job that is in several parts the one is taken that came furthest.
+    """
+    parts = [_jobs(folder) for folder in folders]
+    return _labelled(parts[0] if len(parts) == 1 else _joined(parts))
+
+
+def _joined(parts: Sequence[list[Job]]) -> list[Job]:
+    """The jobs of several machines, each once."""
+    values: dict[str, list[set[str]]] = {}
+    for number, jobs in enumerate(parts):
+        for key, value in (pair for job in jobs for pair in job.overrides.items()):
+            values.setdefault(key, [set() for _ in parts])[number].add(value)
+    # The same path everywhere in a part, and others in other parts.
+    local = {
+        key
+        for key, found in values.items()
+        if max(map(len, found)) == 1 and len(set.union(*found)) > 1 and all("/" in v for v in set.union(*found))
+    }
+    best: dict[Any, Job] = {}
+    for job in (job for jobs in parts for job in jobs):
+        overrides = {key: value for key, value in job.overrides.items() if key not in local}
+        identity = frozenset(overrides.items()) or job.name
+        if identity not in best or _progress(job) > _progress(best[identity]):
+            best[identity] = replace(job, overrides=overrides)
+    return list(best.values())
+
+
+def _progress(job: Job) -> tuple[bool, bool]:
+    return job.metrics is not None, bool(job.record)
+
+
+def _jobs(folder: Path) -> list[Job]:
     folders = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
     # `seed=10` stands behind `seed=9`.
     split = {path: re.split(r"(\d+)", path.name) for path in folders}
@@ -170,7 +204,7 @@ def collect(folder: Path) -> list[Job]:
     waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
     # A job that ended before it could write its record is one of those that the plan misses.
     silent = [job for job in found if not job.record][len(waiting) :]
-    return _labelled([*recorded, *silent, *waiting])
+    return [*recorded, *silent, *waiting]
 
 
 def planned(folder: Path) -> list[list[str]]:

@@ -85,11 +85,11 @@ class Summary:
     commands: list[str]
 
 
-def summarize(folder: Path) -> Summary:
-    """Read all jobs of a sweep's folder, finished or not."""
+def summarize(*folders: Path) -> Summary:
+    """Read all jobs of a sweep's folder, or of its parts on several machines, finished or not."""
     from completesplat.results.scores import rows
 
-    jobs = collect(folder)
+    jobs = collect(*folders)
     found = rows([job for job in jobs if job.metrics is not None])
     commands = dict.fromkeys(FOLDERS.sub(".../", typed(job.record["command"])) for job in jobs if job.record)
     return Summary(found, _table(found, _remarks(jobs, found)), list(commands))
@@ -137,11 +137,14 @@ def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
     return [*said, f"Summary of {here['date']}, made on {hardware}, {software}."]
 
 
-def write_summary(folder: Path) -> Summary:
-    """Write `summary.csv` (all metrics), `summary.md`, `summary.tex` and `summary.png` into a sweep's folder."""
+def write_summary(folder: Path, *parts: Path) -> Summary:
+    """Write `summary.csv` (all metrics), `summary.md`, `summary.tex` and `summary.png` into a sweep's folder.
+
+    With `parts`, the folders of one sweep on several machines, they are of all of these.
+    """
     from completesplat.results.scores import IDENTITY
 
-    summary = summarize(folder)
+    summary = summarize(*(parts or [folder]))
     header = list(summary.rows[0]) if summary.rows else IDENTITY
     write_csv(folder / "summary.csv", header, ([row.get(key) for key in header] for row in summary.rows))
     write_text(folder / "summary.md", _markdown(summary))

@@ -18,6 +18,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError
 from completesplat.schema import Positive, Share
+from completesplat.training.sharding import own_part, whole
 
 BAD_STEPS = "train/bad_steps"
 
@@ -73,7 +74,7 @@ class BadSteps(Callback):
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-        norm = torch.nn.utils.get_total_norm(gradients).to(pl_module.device)
+        norm = whole(torch.nn.utils.get_total_norm(gradients)).to(pl_module.device)
         finite = torch.stack([*self.losses, norm]).isfinite().all()
         self.losses = []
         # Processes have losses of their own, and the same gradients.
@@ -93,7 +94,7 @@ def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
     logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
     terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
-    layers = [n for n, p in module.named_parameters() if p.grad is not None and not p.grad.isfinite().all()]
+    layers = [n for n, p in module.named_parameters() if p.grad is not None and not own_part(p.grad).isfinite().all()]
     found = gathered((terms, layers))
     term = next((f"loss term {terms[0]}" for terms, _ in found if terms), "the last losses are finite")
     layer = next((f"that of {layers[0]} is the first" for _, layers in found if layers), "their norm is too large")
@@ -112,7 +113,12 @@ class ExponentialMovingAverage(WeightAveraging):
 
     def __init__(self, decay: Share) -> None:
         averages: Callable[[float], Any] = get_ema_multi_avg_fn
-        super().__init__(multi_avg_fn=averages(decay))
+        average = averages(decay)
+
+        def update(averaged: list[Tensor], weights: list[Tensor], steps: Tensor | int) -> None:
+            average([own_part(value) for value in averaged], [own_part(value) for value in weights], steps)
+
+        super().__init__(multi_avg_fn=update)
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:

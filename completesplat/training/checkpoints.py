@@ -18,10 +18,12 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from completesplat.atomic import atomic_path
+from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
 from completesplat.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
+from completesplat.training.sharding import own_part, remove_unused_shards
 from completesplat.training.stopping import agreed, end_training
 from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
 
@@ -128,6 +130,7 @@ class Checkpoints(Checkpoint):
             self._save(trainer, pl_module)
         if trainer.is_global_zero:
             (self.folder / PREVIOUS).unlink(missing_ok=True)
+            remove_unused_shards(self.folder)
         keep_signals(False)
         if (asked := agreed(trainer)) is not None:
             end_training(trainer, asked)
@@ -156,7 +159,8 @@ class Checkpoints(Checkpoint):
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        if (name := not_finite(module.state_dict())) is not None:
+        own = not_finite({name: own_part(value) for name, value in module.state_dict().items()})
+        if (name := next(filter(None, gathered(own)), None)) is not None:
             said = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
             raise DivergenceError(f"step {trainer.global_step}: {said}")
         self.due = False

@@ -2,7 +2,8 @@
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from itertools import islice
@@ -28,11 +29,12 @@ from completesplat.data.latent_cache import (
     write_manifest,
 )
 from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.distributed import gathered, is_first, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
-from completesplat.data.sequences import SequenceSource, spread_places
+from completesplat.data.sequences import PosedSequence, SequenceSource, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
@@ -127,6 +129,12 @@ class Moments:
         self.total = self.total + mean.sum((0, 2, 3))
         self.squares = self.squares + (np.square(mean) + variance).sum((0, 2, 3))
 
+    def join(self, other: "Moments") -> None:
+        """What another one has added up, too."""
+        self.count += other.count
+        self.total = self.total + other.total
+        self.squares = self.squares + other.squares
+
     def results(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Mean and deviation, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
         mean = np.asarray(self.total) / self.count
@@ -149,6 +157,7 @@ def encode_training_set(
     """Encode every frame of every sequence of a packed training set, as it is without augmentation.
 
     A finished store of the same is left as it is. Nothing that opens is left behind by a run that was interrupted.
+    Several processes share the batches, and the first one writes what all have encoded: the store of one process.
 
     Args:
         frames: the largest number of frames of a sequence, evenly spaced; None: all.
@@ -174,13 +183,13 @@ def encode_training_set(
     encode = partial(
         encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
-    first = next(_scenes(source, 1, views, [], False)).scene
-    blank = encode(stack([first]))
+    load = partial(_loaded, SceneStore(source, source.names, cache=False), views)
+    blank = encode(stack([load(next(_references(source, 1, [], False))).scene]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
-    scenes = _scenes(source, frames, views, sequences, progress)
-    arrays, moments = _write_arrays(out, encode, blank, scenes, batch_size)
-    write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
+    progress = progress and is_first()
+    batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
+    _write_store(out, origin, blank, batches, sequences)
     return LatentCache(out)
 
 
@@ -199,19 +208,54 @@ class FrameToEncode(NamedTuple):
     number: int
 
 
-def _scenes(
-    source: PackedSource, frames: int | None, views: int, sequences: list[CachedSequence], progress: bool
-) -> Iterator[FrameToEncode]:
-    """All references in the order of their rows; `sequences` gets an entry for each sequence that they are of."""
-    rows, store = 0, SceneStore(source, source.names, cache=False)
+def _references(
+    source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
+) -> Iterator[tuple[PosedSequence, int]]:
+    """Sequence and place of all references, by row; `sequences` gets an entry for each sequence that they are of."""
+    rows = 0
     for name in track(source.names, "encoding sequences", disable=not progress):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
         sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))
         rows += len(places)
-        for place in places:
-            scene = store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
-            yield FrameToEncode(scene, sequence.frames[place])
+        yield from ((sequence, place) for place in places)
+
+
+def _loaded(store: SceneStore, views: int, reference: tuple[PosedSequence, int]) -> FrameToEncode:
+    sequence, place = reference
+    scene = store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
+    return FrameToEncode(scene, sequence.frames[place])
+
+
+def _encoded_batches(
+    references: Iterator[tuple[PosedSequence, int]],
+    load: Callable[[tuple[PosedSequence, int]], FrameToEncode],
+    encode: Callable[[SceneBatch], Rows],
+    batch_size: int,
+) -> Iterator[tuple[Rows, Moments]]:
+    """The rows of all batches, in order, and the moments of each batch.
+
+    Each process encodes its share; all of them have to ask for them. (Rows that were sent lie in another order in
+    memory, and their sums are rounded otherwise.)
+    """
+    rank, count = processes()
+    while group := list(islice(references, count * batch_size)):
+        own = group[rank * batch_size : (rank + 1) * batch_size]
+        found: tuple[Rows, Moments] | DataError | None = None
+        if own:
+            try:
+                batch = list(map(load, own))
+                rows, moments = encode(stack([one.scene for one in batch])), Moments()
+                _refuse_not_finite(rows, batch)
+                moments.add(rows["mean"], rows["log_variance"])
+                found = rows, moments
+            except DataError as error:  # which is every process's
+                found = error
+        for encoded_there in gathered(found):
+            if isinstance(encoded_there, DataError):
+                raise encoded_there
+            if encoded_there is not None:
+                yield encoded_there
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
@@ -222,20 +266,28 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
     require_space(total * bytes_per_frame, contents, out, "; frames=N takes fewer frames of a sequence")
 
 
-def _write_arrays(
-    out: Path, encode: Callable[[SceneBatch], Rows], blank: Rows, scenes: Iterator[FrameToEncode], batch_size: int
-) -> tuple[dict[str, Array], Moments]:
-    """Rows like those of `blank` for all scenes; what was written, and its moments."""
+def _write_store(
+    out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Moments]], sequences: Sequence[CachedSequence]
+) -> None:
+    """The first process writes what all encode; the others wait for it. `sequences` are there when `batches` end."""
+    if is_first():
+        arrays, moments = _write_arrays(out, blank, batches)
+        write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
+    else:
+        deque(batches, maxlen=0)
+    gathered(None)
+
+
+def _write_arrays(out: Path, blank: Rows, batches: Iterator[tuple[Rows, Moments]]) -> tuple[dict[str, Array], Moments]:
+    """Rows like those of `blank`; what was written, and its moments."""
     moments = Moments()
     with ExitStack() as files:
         writers = {
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in blank.items()
         }
-        while batch := list(islice(scenes, batch_size)):
-            rows = encode(stack([one.scene for one in batch]))
-            _refuse_not_finite(rows, batch)
-            moments.add(rows["mean"], rows["log_variance"])
+        for rows, of_batch in batches:
+            moments.join(of_batch)
             for name, writer in writers.items():
                 writer.append(rows[name])
     return {name: writer.described() for name, writer in writers.items()}, moments

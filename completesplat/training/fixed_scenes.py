@@ -31,6 +31,7 @@ from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.scene_module import SceneModule
+from completesplat.training.sharding import whole_networks
 
 ERROR_GAIN = 4
 PERCENTILES = (10, 50, 90)
@@ -73,11 +74,13 @@ class DrawsFixedScenes(Callback):
         self._draw_once(trainer, pl_module)
 
     def _draw_once(self, trainer: Trainer, module: LightningModule) -> None:
-        if trainer.global_step == self.drawn or not trainer.is_global_zero:
+        if trainer.global_step == self.drawn:
             return
         assert isinstance(module, SceneModule)
         self.drawn = trainer.global_step
         with untouched(trainer, module):
+            if not trainer.is_global_zero:
+                return
             if not self.scenes:
                 self.scenes = fixed_scenes(trainer.datamodule, self.count, self.views)  # type: ignore[attr-defined]
             self.draw(trainer, module, self.scenes)
@@ -85,13 +88,17 @@ class DrawsFixedScenes(Callback):
 
 @contextmanager
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Evaluation with averaged weights if there are any; afterwards all is as it was, random numbers too."""
+    """Evaluation with averaged weights if there are any; afterwards all is as it was, random numbers too.
+
+    All processes have to enter it: where networks are divided over them, they are whole inside.
+    """
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices), ExitStack() as contexts:
         for callback in trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, ExponentialMovingAverage):
                 contexts.enter_context(callback.in_place(module))
+        contexts.enter_context(whole_networks(module))
         module.eval()
         try:
             yield

@@ -50,6 +50,7 @@ class LatentDiffusion(SceneModule):
     """
 
     draws_samples = True
+    networks = ("completesplat.denoiser", "completesplat.conditioning")
 
     def __init__(
         self,
@@ -134,7 +135,8 @@ class LatentDiffusion(SceneModule):
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
             drawn.append(latent.double().cpu())
-        latents = torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)
+        own = torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)
+        latents = torch.cat(gathered(own))
         mean, deviation = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
         if not (deviation > 0).all():
             raise CompleteSplatError("the latents do not vary: no training pictures, or an encoder that ignores them")

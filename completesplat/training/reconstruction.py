@@ -31,6 +31,8 @@ class ReconstructionModule(SceneModule):
         **rendering_and_optimization: see `SceneModule`.
     """
 
+    networks = ("model",)
+
     def __init__(
         self,
         model: nn.Module,

@@ -14,8 +14,9 @@ from typing import Any, cast
 import torch
 from lightning import Trainer
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.strategies.launchers import subprocess_script as launcher_of_fabric
 from lightning.fabric.strategies.launchers.subprocess_script import _ChildProcessObserver
-from lightning.pytorch.strategies.launchers import subprocess_script
+from lightning.pytorch.strategies.launchers import subprocess_script as launcher_of_trainers
 from lightning.pytorch.trainer.connectors.signal_connector import _SignalConnector
 
 from completesplat import signals
@@ -31,6 +32,8 @@ logger = logging.getLogger(__name__)
 def stopped_together() -> Iterator[None]:
     """Trainers inside leave signals to `completesplat.signals`, and the processes that they start end with this one.
 
+    So do those of Lightning's `Fabric`.
+
     Lightning's own handlers wait for other processes in the middle of a step, for ever if these are not there; they end
     `fit` and `test` with exit status 0, and its observer kills the first process when another one has got a signal.
     """
@@ -40,9 +43,11 @@ def stopped_together() -> Iterator[None]:
         started.extend(processes)
         _Observer(os.getpid(), processes).start()
 
-    connector, launcher = cast(Any, _SignalConnector), cast(Any, subprocess_script)
-    before = connector.register_signal_handlers, launcher._launch_process_observer
-    connector.register_signal_handlers, launcher._launch_process_observer = lambda self: None, observe
+    connector, launchers = cast(Any, _SignalConnector), (launcher_of_fabric, launcher_of_trainers)
+    before = connector.register_signal_handlers, launchers[0]._launch_process_observer
+    connector.register_signal_handlers = lambda self: None
+    for launcher in launchers:
+        launcher._launch_process_observer = observe  # type: ignore[attr-defined]
     try:
         yield
     except (Interrupted, RuntimeError) as error:
@@ -53,7 +58,9 @@ def stopped_together() -> Iterator[None]:
             _end(process, number)
         raise Interrupted(number) from error  # other processes may have gone before, for which this one waited
     finally:
-        connector.register_signal_handlers, launcher._launch_process_observer = before
+        connector.register_signal_handlers = before[0]
+        for launcher in launchers:
+            launcher._launch_process_observer = before[1]  # type: ignore[attr-defined]
         if started:
             signal.set_wakeup_fd(-1)
 

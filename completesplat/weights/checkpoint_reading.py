@@ -10,14 +10,23 @@ import torch
 from torch import Tensor, nn
 
 from completesplat.errors import WeightsError
+from completesplat.weights import sha256_of
 
 END, END_BYTES = b"PK\5\6", 22
 """How the last record of a zip archive begins, and its length without the comment behind it."""
 CHECKSUM, DIGEST_BYTES = b"sha256:", 64
+SHARDS, SHARDS_SUFFIX = "shards", ".shards"
+"""The entry of a checkpoint that several processes wrote: the folder beside it with the files of their divided tensors,
+and the SHA-256 of each."""
+DIVIDED = "divided:"
+"""How the name begins that stands in the place of such a tensor."""
 
 
 def check_whole(path: Path) -> None:
-    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end."""
+    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end.
+
+    The shards of one that several processes wrote belong to it.
+    """
     bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
     with path.open("rb") as file:
         size = file.seek(0, os.SEEK_END)
@@ -34,6 +43,48 @@ def check_whole(path: Path) -> None:
             left -= len(part)
     if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
         raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
+    shards = shards_of(path)
+    for name, checksum in shards.get("files", {}).items():
+        shard = path.parent / Path(shards["folder"]).name / Path(name).name
+        if not shard.is_file() or sha256_of(shard) != checksum:
+            raise WeightsError(f"{path}: not a readable checkpoint (damaged: {shard} is missing or another)")
+
+
+def shards_of(path: Path) -> dict[str, Any]:
+    """The folder and the files of a checkpoint's divided tensors; an empty mapping if it has none, or is unreadable."""
+    if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
+        return {}
+    try:
+        found: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True).get(SHARDS, {})
+    except Exception:
+        return {}
+    return found
+
+
+def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint's contents with its divided tensors in their places, as one process would have written it.
+
+    They are safetensors: reading them runs nothing.
+    """
+    if (shards := contents.pop(SHARDS, None)) is None:
+        return contents
+    from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # takes its time
+    from torch.distributed.checkpoint.state_dict_loader import load
+
+    reader = HuggingFaceStorageReader(str(path.parent / Path(shards["folder"]).name))
+    entries: dict[str, Any] = reader.read_metadata().state_dict_metadata
+    tensors = {name: torch.empty(entry.size, dtype=entry.properties.dtype) for name, entry in entries.items()}
+    load(tensors, storage_reader=reader, no_dist=True)
+
+    def filled(value: Any) -> Any:
+        if isinstance(value, str) and value.startswith(DIVIDED):
+            return tensors[value.removeprefix(DIVIDED)]
+        if isinstance(value, dict):
+            return {key: filled(part) for key, part in value.items()}
+        return type(value)(map(filled, value)) if isinstance(value, list | tuple) else value
+
+    whole: dict[str, Any] = filled(contents)
+    return whole
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -46,6 +97,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     check_whole(Path(path))
     try:
         contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+        contents = _put_together(Path(path), contents)
         name = not_finite(contents["state_dict"])
     except Exception as error:
         raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error

@@ -1,5 +1,10 @@
 """`completesplat data latents`: stage 1's run to a cache, and training from it."""
 
+import os
+import subprocess
+import sys
+
+import numpy as np
 import pytest
 from support import SMALL, refused, strict_json
 
@@ -20,6 +25,22 @@ def test_a_run_is_encoded_as_asked_and_trained_from(command, pipeline, packed_to
     stage2 += [f"model.autoreconstructor_checkpoint={checkpoint}", f"data.latent_cache={cache}"]
     assert command("fit", *stage2, f"out={tmp_path / 'run'}").status == 0
     assert strict_json(tmp_path / "run/metrics.json")["steps"] == 2
+
+
+@pytest.mark.slow
+def test_two_processes_write_what_one_writes(command, pipeline, packed_toys, tmp_path):
+    """Three batches: the last one has half of a batch, and no counterpart."""
+    given = [f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", f"overrides=['data.root={packed_toys}']", "batch_size=3"]
+    assert command("data", "latents", *given, f"out={tmp_path / 'one'}").status == 0
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--standalone"]
+    program = [*torchrun, "-m", "completesplat", "data", "latents", *given, f"out={tmp_path / 'two'}"]
+    subprocess.run(program, check=True, timeout=600, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    one, two = (LatentCache(tmp_path / name) for name in ("one", "two"))
+    assert (one.origin, one.mean, one.std, one.sequences) == (two.origin, two.mean, two.std, two.sequences)
+    for name in ("mean", "log_variance", "condition"):
+        arrays = [np.load(tmp_path / folder / f"{name}.npy") for folder in ("one", "two")]
+        np.testing.assert_array_equal(*arrays)
+        assert len(arrays[0]) == 8
 
 
 @pytest.mark.parametrize(

@@ -166,3 +166,13 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
         assert any(not torch.equal(value, first[0][name]) for name, value in trained.items())
     assert any(not torch.equal(value, second[1][name]) for name, value in second[0].items())
     assert len((two / "summary.csv").read_text().splitlines()) >= 3
+
+
+def test_a_run_goes_on_with_another_number_of_processes(whole, tmp_path):
+    job = whole / "seed-0"
+    config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
+    sharded = {"_target_": "completesplat.training.sharding.FullyShardedStrategy"}
+    others = {"devices": 2, "num_nodes": 3, "strategy": sharded}
+    assert is_finished(job, config | {"trainer": config["trainer"] | others})
+    with pytest.raises(CompleteSplatError, match=r"with another trainer\.precision"):
+        is_finished(job, config | {"trainer": config["trainer"] | {"precision": "64-true"}})

@@ -223,3 +223,26 @@ def test_the_hook_is_loaded_without_the_heavy_libraries() -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == []
+
+
+def test_jobs_on_several_machines_make_one_summary(sweep, tmp_path, command) -> None:
+    """Their data lie elsewhere; a job that both have counts once, as far as it came."""
+    other = type(sweep)(tmp_path / "other")
+    for machine_of, seeds in ((sweep, "01"), (other, "12")):
+        for seed in seeds:
+            for ablation, psnr in {"full": 22.0, "m1": 20.0}.items():
+                machine_of.scored(f"ablation={ablation}", f"seed={seed}", psnr=psnr + int(seed))
+    sweep.add("ablation=m1", "seed=3")
+    other.add("ablation=m1", "seed=4")
+    other.scored("ablation=m1", "seed=3", psnr=23.0)
+    for record in other.folder.glob("*/run.json"):
+        record.write_text(record.read_text().replace("/home/someone/data/set", "/scratch/data"))
+    done = command("report", "summary", f"sweeps=[{sweep.folder},{other.folder}]", "out=ALL")
+    assert done.status == 0, done.err
+    found = pd.read_csv("ALL/summary.csv").set_index("ablation")
+    assert found.loc[["full", "m1"], "seeds"].tolist() == [3, 4]
+    assert found.loc["full", "full_novel_psnr_mean"] == 23.0
+    assert "7 of 8 jobs have finished." in done.out
+    assert sorted(path.name for path in Path("ALL").glob("summary.*")) == FILES
+    refused = command("report", "summary", f"sweeps=[{sweep.folder},nowhere]", "out=NONE")
+    assert (refused.status, refused.err) == (2, "error: sweeps=nowhere: no such folder\n")

@@ -20,6 +20,7 @@ from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
 from completesplat.data.packed.manifest import is_packed, settings_must_match
+from completesplat.data.packed.remote import local_root
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import at
@@ -62,7 +63,7 @@ class SceneDataModule(LightningDataModule):
     What training draws depends on the seed, the epoch and the item only.
 
     Args:
-        root: folder of the data set, or of its prepared form.
+        root: folder of the data set or of its prepared form, or the address of the latter (`packed.remote`).
         batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
         targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which needs none.
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
@@ -104,7 +105,7 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip
         _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad)
-        self.root = Path(root)
+        self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
         self.targets = targets

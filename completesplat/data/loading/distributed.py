@@ -16,6 +16,11 @@ def processes() -> tuple[int, int]:
     return 0, 1
 
 
+def is_first() -> bool:
+    """Whether this is the first process, or the only one."""
+    return processes()[0] == 0
+
+
 def gathered(value: Any) -> list[Any]:
     """The values of all processes, in their order; each of them must call it."""
     count = processes()[1]

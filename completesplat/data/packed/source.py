@@ -1,11 +1,13 @@
 """Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is read."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
+from completesplat.data.packed.remote import address_of, fetched
 from completesplat.data.packed.rows import features, from_row
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
@@ -35,11 +37,14 @@ class PackedSource(SequenceSource):
         self._places = {
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
         }
-        self._opened: dict[int, Any] = {}
+        self._opened: dict[int, OpenShard] = {}
+        self.address = address_of(root)
         with at(file=root / MANIFEST):
             for shard in self.shards:
-                path = require_file(inside(root, shard.file))
-                size = path.stat().st_size
+                path = inside(root, shard.file)
+                if self.address is not None and not path.is_file():
+                    continue
+                size = require_file(path).stat().st_size
                 if size != shard.bytes:
                     reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
                     raise ChangedFile(reason, str(path))
@@ -51,8 +56,24 @@ class PackedSource(SequenceSource):
         path = self.root / shard.file
         if number not in self._opened:
             with at(sequence=name):
+                if self.address is not None:
+                    fetched(self.address, shard, path)
                 self._opened[number] = open_shard(path, shard)
-        return from_row(self._opened[number][row], str(path), name)
+        with at(file=path, sequence=name):
+            try:
+                found = self._opened[number][row]
+            except (pa.ArrowException, OSError, ValueError) as error:
+                raise UnreadableFile(f"damaged ({error})") from None
+        return from_row(found, str(path), name)
+
+    def groups(self, names: Sequence[str]) -> list[list[int]]:
+        """Shard by shard where they have to be fetched: training starts with the first one. Else in any order."""
+        if self.address is None:
+            return super().groups(names)
+        groups: dict[int, list[int]] = {}
+        for index, name in enumerate(names):
+            groups.setdefault(self._places[name][0], []).append(index)
+        return list(groups.values())
 
     def fingerprint(self) -> str:
         """That of the source which the store was made from."""
@@ -69,18 +90,47 @@ class PackedSource(SequenceSource):
         return {**self.__dict__, "_opened": {}}
 
 
-def open_shard(path: Path, shard: Shard) -> Any:
-    """A memory-mapped `datasets.Dataset`, one row a sequence; `DataError` if missing, damaged or not as expected."""
-    from datasets import Dataset  # See `features`.
+class OpenShard:
+    """A memory-mapped shard: its rows, one record batch each, are looked up when they are read.
 
+    What Arrow knows of a batch takes 8 kB, which for all clips of RealEstate10K were half a gigabyte in every process.
+
+    Raises:
+        ArrowException, OSError: it is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with pa.memory_map(str(path)) as file:
+            self._content = file.read_buffer()  # not a copy; the file itself need not stay open
+        stream = pa.BufferReader(self._content)
+        self.schema = pa.ipc.read_schema(stream)
+        self._places: list[int] = []
+        while (place := stream.tell()) < self._content.size:
+            try:
+                pa.ipc.read_message(stream)
+            except EOFError:  # the mark at the end
+                break
+            self._places.append(place)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, row: int) -> pa.Table:
+        """A table of one row."""
+        stream = pa.BufferReader(self._content)
+        stream.seek(self._places[row])
+        return pa.Table.from_batches([pa.ipc.read_record_batch(pa.ipc.read_message(stream), self.schema)])
+
+
+def open_shard(path: Path, shard: Shard) -> OpenShard:
+    """A shard, one row a sequence; `DataError` if missing, damaged or not as expected."""
     with at(file=path):
         try:
-            dataset = Dataset.from_file(str(require_file(path)))
-        # A damaged header may fail in the library's own reading of it too: KeyError, TypeError, JSON errors, ...
-        except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            opened = OpenShard(require_file(path))
+        except (pa.ArrowException, OSError, ValueError) as error:
             raise UnreadableFile(f"not a readable Arrow file ({error})") from None
-        if dataset.features != features() or dataset.data.schema.types != features().arrow_schema.types:
+        if not opened.schema.equals(features().arrow_schema):
             raise UnreadableFile("its columns are not those of a packed store")
-        if len(dataset) != len(shard.sequences):
-            raise BadAnnotation(f"{len(dataset)} sequences, the manifest says {len(shard.sequences)}")
-        return dataset.with_format("arrow")
+        if len(opened) != len(shard.sequences):
+            raise BadAnnotation(f"{len(opened)} sequences, the manifest says {len(shard.sequences)}")
+        return opened

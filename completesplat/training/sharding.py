@@ -1,0 +1,171 @@
+"""FSDP2: the trained networks, their gradients, averages and the optimizer's state divided over processes."""
+
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from lightning.pytorch.callbacks import WeightAveraging
+from lightning.pytorch.strategies import DDPStrategy
+from torch import Tensor, nn
+from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
+from torch.distributed.checkpoint.state_dict_saver import save
+from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.fsdp import FSDPModule, fully_shard
+from torch.distributed.tensor import DTensor, distribute_tensor
+
+from completesplat.atomic import writing
+from completesplat.errors import CompleteSplatError
+from completesplat.training.scene_module import SceneModule
+from completesplat.weights import sha256_of
+from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUFFIX, shards_of
+
+
+class FullyShardedStrategy(DDPStrategy):
+    """Every process trains on its share of a batch, as with DDP, and keeps its share of the trained networks.
+
+    They are whole while they compute. Each of `SceneModule.networks` is one unit of torch's `fully_shard`, and so is
+    its average. Outside of training all is as with DDP: processes that test have different numbers of scenes, and
+    cannot wait for each other in every layer.
+
+    A checkpoint has two parts: `last.ckpt` holds what all processes know, and the names and checksums of the files
+    beside it, one for each process, in which `torch.distributed.checkpoint` writes the divided tensors as safetensors.
+    `read_checkpoint` puts them together, so that any number of processes reads what any other number wrote.
+    """
+
+    def configure_ddp(self) -> None:
+        """Divide the networks, in the place of wrapping the module."""
+        module: Any = self.lightning_module
+        _refuse_undivided(module)
+        mesh = init_device_mesh(self.root_device.type, (self.world_size,))
+        self.whole: list[tuple[nn.Module, str, nn.Module]] = []
+        for each in (module, *_averages(module)):
+            for place in module.networks:
+                network = each.get_submodule(place)
+                self.whole.append((each, place, _without_weights(network)))
+                # Outside of their passes networks are always divided, also behind those of validation.
+                fully_shard(network, mesh=mesh, reshard_after_forward=True)
+
+    def load_optimizer_state_dict(self, checkpoint: Mapping[str, Any]) -> None:
+        """Take this process's share of a state that is whole."""
+        for optimizer, state in zip(self.optimizers, checkpoint["optimizer_states"], strict=True):
+            trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+            for index, entries in state["state"].items():
+                entries |= {name: _divided_as(trained[index], value) for name, value in entries.items()}
+        super().load_optimizer_state_dict(checkpoint)
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], filepath: str | Path, storage_options: Any = None) -> None:
+        """Each process writes its share, then the first one the rest. `DiskError` where the disk refuses."""
+        path, divided = Path(filepath), dict[str, Tensor]()
+        contents = _taken_apart(checkpoint, "", divided)
+        folder = path.parent / self.broadcast(f"{secrets.token_hex(6)}{SHARDS_SUFFIX}")
+        if self.is_global_zero:
+            remove_unused_shards(path.parent)
+            with writing(folder):
+                folder.mkdir()
+        self.barrier()
+        with writing(folder / "shards"):
+            save(divided, storage_writer=HuggingFaceStorageWriter(str(folder), save_distributed=True))
+        self.barrier()
+        if self.is_global_zero:
+            files = {file.name: sha256_of(file) for file in sorted(folder.iterdir())}
+            contents[SHARDS] = {"folder": folder.name, "files": files}
+        super().save_checkpoint(contents, filepath, storage_options)
+
+    def on_exception(self, exception: BaseException) -> None:
+        """Other processes may be gone, and the networks cannot be put together."""
+        self.whole = []
+        super().on_exception(exception)
+
+    def teardown(self) -> None:
+        """Every process gets the whole networks, which are saved and tested next."""
+        for module, place, network in getattr(self, "whole", []):
+            divided = module.get_submodule(place)
+            weights = {name: whole(value) for name, value in divided.state_dict().items()}
+            network.load_state_dict(weights, assign=True)
+            module.set_submodule(place, network.train(divided.training))
+        self.whole = []
+        super().teardown()
+
+
+def whole(value: Tensor) -> Tensor:
+    """A tensor that may be divided over processes, all of which must call this then, as each has it alone."""
+    return value.full_tensor() if isinstance(value, DTensor) else value
+
+
+def own_part(value: Tensor) -> Tensor:
+    """This process's part of a tensor that may be divided over processes: the same memory."""
+    return value.to_local() if isinstance(value, DTensor) else value
+
+
+@contextmanager
+def whole_networks(module: nn.Module) -> Iterator[None]:
+    """Divided networks are whole inside, where one process alone may compute with them. All have to enter and leave."""
+    networks = [part for part in module.modules() if isinstance(part, FSDPModule)]
+    for network in networks:
+        network.set_reshard_after_forward(False)
+        network.unshard()
+    try:
+        yield
+    finally:
+        for network in networks:
+            network.reshard()
+            network.set_reshard_after_forward(True)
+
+
+def remove_unused_shards(folder: Path) -> None:
+    """Remove the shards of checkpoints that are no longer there; those of damaged ones stay with all others."""
+    used = {shards_of(path).get("folder") for path in folder.glob("*.ckpt")}
+    for shards in folder.glob(f"*{SHARDS_SUFFIX}"):
+        if shards.name not in used:
+            shutil.rmtree(shards)
+
+
+def _averages(module: LightningModule) -> list[nn.Module]:
+    callbacks: list[Any] = module.trainer.callbacks  # type: ignore[attr-defined]
+    averages: list[Any] = [callback._average_model for callback in callbacks if isinstance(callback, WeightAveraging)]
+    return [average.module for average in averages]
+
+
+def _refuse_undivided(module: SceneModule) -> None:
+    """`CompleteSplatError` if something is trained that is in none of the networks, or whose memory has gaps."""
+    inside = {parameter for place in module.networks for parameter in module.get_submodule(place).parameters()}
+    for name, parameter in module.named_parameters():
+        if parameter.requires_grad and parameter not in inside:
+            raise CompleteSplatError(f"trainer=fsdp: {name} of {type(module).__name__} is not divided: use trainer=ddp")
+        if parameter in inside and not parameter.is_contiguous():
+            raise CompleteSplatError("trainer=fsdp: set model.channels_last=false, or use trainer=ddp")
+
+
+def _without_weights(network: nn.Module) -> nn.Module:
+    """A copy whose parameters take no memory."""
+    empty = {
+        id(parameter): nn.Parameter(torch.empty_like(parameter, device="meta"), parameter.requires_grad)
+        for parameter in network.parameters()
+    }
+    return deepcopy(network, empty)
+
+
+def _divided_as(parameter: Tensor, value: Any) -> Any:
+    """A value of the optimizer's state of a parameter, divided as that is if it has its shape."""
+    if not isinstance(parameter, DTensor) or not isinstance(value, Tensor) or value.shape != parameter.shape:
+        return value
+    mesh, placements = parameter.device_mesh, parameter.placements
+    return distribute_tensor(value.to(parameter.device), mesh, placements, src_data_rank=None)
+
+
+def _taken_apart(contents: Any, name: str, divided: dict[str, Tensor]) -> Any:
+    """Nested containers with names in the place of the divided tensors, which `divided` gets by these names."""
+    if isinstance(contents, DTensor):
+        divided[name] = contents
+        return DIVIDED + name
+    if isinstance(contents, Mapping):
+        return {key: _taken_apart(value, f"{name}.{key}".lstrip("."), divided) for key, value in contents.items()}
+    if isinstance(contents, list | tuple):
+        return type(contents)(_taken_apart(value, f"{name}.{i}", divided) for i, value in enumerate(contents))
+    return contents

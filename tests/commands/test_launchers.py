@@ -1,0 +1,99 @@
+"""Sweeps whose jobs other programs start: SLURM's (a `sbatch` that runs what it is given), joblib's."""
+
+import csv
+import os
+import stat
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from support import SMALL, script, strict_json
+
+PYTHON = f"#!{sys.executable}\n"
+SBATCH = '''"""Start all jobs of an array, or the one job, of the script of the last argument, and print the number.
+
+They wait, as in a queue, until whoever submits them has put everything in its place.
+"""
+import os, re, subprocess, sys
+script = sys.argv[-1]
+options = dict(re.findall(r"^#SBATCH --([\\w-]+)=(\\S+)", open(script).read(), re.M))
+first, last = re.match(r"(\\d+)-(\\d+)", options.get("array", "0-0")).groups()
+number = str(os.getpid())
+for task in range(int(first), int(last) + 1):
+    tasks = options.get("ntasks-per-node", "1")
+    told = {"SLURM_JOB_ID": f"{number}{task}", "SLURM_JOB_NAME": options["job-name"], "SLURM_NTASKS": tasks}
+    told |= {"SLURM_NTASKS_PER_NODE": tasks, "SLURM_NNODES": options["nodes"], "SLURM_JOB_NUM_NODES": "1"}
+    if "array" in options:
+        told |= {"SLURM_ARRAY_JOB_ID": number, "SLURM_ARRAY_TASK_ID": str(task)}
+    run = ["bash", "-c", f"sleep 5; exec bash {script}"]
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    subprocess.Popen(run, env=os.environ | told, start_new_session=True, **silent)
+print("Submitted batch job", number)
+'''
+SRUN = '''"""Run a program once for each task, as srun does on one node."""
+import os, subprocess, sys
+count = int(os.environ["SLURM_NTASKS"])
+program = sys.argv[next(i for i, argument in enumerate(sys.argv) if "/python" in argument) :]
+shared = {"SLURM_STEP_NUM_TASKS": str(count), "SLURM_NODEID": "0", "SLURM_NODELIST": "localhost"}
+log = sys.argv[sys.argv.index("--error") + 1]
+job, task = (os.environ.get(f"SLURM_ARRAY_{name}_ID", "0") for name in ("JOB", "TASK"))
+processes = []
+for rank in range(count):
+    told = shared | {"SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)}
+    with open(log.replace("%A", job).replace("%a", task).replace("%t", str(rank)), "w") as file:
+        processes.append(subprocess.Popen(program, env=os.environ | told, stdout=file, stderr=file))
+sys.exit(max(process.wait() for process in processes))
+'''
+
+
+@pytest.fixture
+def cluster(tmp_path, monkeypatch):
+    """SLURM's programs, first in the PATH."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name, text in {"sbatch": SBATCH, "srun": SRUN, "sacct": "", "scontrol": "", "scancel": ""}.items():
+        (folder / name).write_text(PYTHON + text)
+        (folder / name).chmod(stat.S_IRWXU)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")  # asked of `scontrol` by Lightning otherwise
+    return folder
+
+
+def sweep(root: Path, folder: Path, *settings: str) -> Path:
+    """Two jobs, started as by a shell."""
+    given = [f"data.root={root}", *SMALL, "data.workers=0", "trainer.max_steps=1", "callbacks.pictures=null"]
+    given += ["experiment=toy_var", "rasterizer=reference", f"out={folder / 'sweep'}", *settings]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    program = [sys.executable, str(script(folder)), "fit", "-m", *given]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=900, cwd=folder)
+    logs = "".join(path.read_text()[-2000:] for path in folder.glob("sweep/.submitit/*/*_log.err"))
+    assert done.returncode == 0, done.stderr[-3000:] + logs
+    return folder / "sweep"
+
+
+def assert_finished(folder: Path, *jobs: str) -> None:
+    assert sorted(path.parent.name for path in folder.glob("*/metrics.json")) == sorted(jobs)
+    with (folder / "summary.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["seeds"]]
+    assert [row["seeds"] for row in rows] == [str(len(jobs))]
+
+
+@pytest.mark.slow
+def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_path, cluster):
+    launched = ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "trainer=slurm", "seed=0,1"]
+    out = sweep(toy_root, tmp_path, *launched, "hydra.launcher.tasks_per_node=2", "trainer.precision=32-true")
+    assert_finished(out, "seed-0", "seed-1")
+    for seed in (0, 1):
+        found = strict_json(out / f"seed-{seed}/metrics.json")
+        assert (found["steps"], found["data.batch_per_process"]) == (1, 1)
+    assert len(list(out.glob(".submitit/*/*_result.pkl"))) == 4
+
+
+@pytest.mark.slow
+def test_joblib_runs_the_jobs_of_a_sweep_at_once(toy_root, tmp_path):
+    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:  # no extra of this package has it
+        pytest.skip("hydra-joblib-launcher is not installed")
+    out = sweep(toy_root, tmp_path, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1")
+    assert_finished(out, "seed-0", "seed-1")
