@@ -14,9 +14,8 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 
-from completesplat.autoreconstructor.skips import allowed_skip_weight
-from completesplat.diffusion.sampling import draw_noise, with_forward_process
-from completesplat.diffusion.splitting import in_parts
+from completesplat.diffusion.guidance import allowed_skip_weight
+from completesplat.diffusion.sampling import draw_noise, in_parts, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras

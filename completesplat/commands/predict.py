@@ -17,10 +17,10 @@ from rich.markup import escape
 from rich.progress import Progress
 from torch import Tensor
 
-from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.commands.trained import open_generator
 from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
+from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted, write_prediction

@@ -18,10 +18,8 @@ from completesplat.scene import SceneBatch
 from completesplat.schema import Filled, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
-from completesplat.studies import layers as layers_study
-from completesplat.studies import masked as masked_study
 from completesplat.studies import samplers as samplers_study
-from completesplat.studies import views as views_study
+from completesplat.studies import stage1 as stage1_study
 from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
@@ -104,11 +102,11 @@ def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float,
     explains the rest.
     """
     for box in boxes:
-        masked_study.check_box(box)
+        controls_study.check_box(box)
     renderer, scenes, _ = _open(run)
     with _status() as tick:
         tick("completions")
-        pictures = masked_study.strips(renderer, scenes, boxes, views, guidance_weight)
+        pictures = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
     draw_strips(*pictures, out / "masked.png", "Completions of partly hidden inputs, without skips")
 
 
@@ -146,28 +144,30 @@ def views(
 ) -> None:
     """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings.
 
-    Refused as by `Trained.open`, `first_scenes` and `views.rows`.
+    Refused as by `Trained.open`, `first_scenes` and `rows_of_views`.
     """
     quieten()
     module, data = Trained(ckpt, overrides, trust).open()
     module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    found = [scene.to(module.device) for scene in first_scenes(data, scenes)]
     with _status() as tick:
-        rows = views_study.rows(module, counts, [scene.to(module.device) for scene in first_scenes(data, scenes)], tick)
+        rows = stage1_study.rows_of_views(module, counts, found, tick)
     write_json(out / "views.json", {"settings": {"scenes": scenes}, "rows": rows})
-    views_study.plot_views(rows, out / "views.png", f"{scenes} scenes, posterior's mean")
+    stage1_study.plot_views(rows, out / "views.png", f"{scenes} scenes, posterior's mean")
     Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
 
 
 def layers(ckpt: str, overrides: Sequence[str], trust: bool, scenes: Positive, out: Path) -> None:
     """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings.
 
-    Refused as by `Trained.open`, `first_scenes` and `layers.rows`.
+    Refused as by `Trained.open`, `first_scenes` and `rows_of_layers`.
     """
     quieten()
     module, data = Trained(ckpt, overrides, trust).open()
     module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    found = [scene.to(module.device) for scene in first_scenes(data, scenes)]
     with _status() as tick:
-        rows = layers_study.rows(module, [scene.to(module.device) for scene in first_scenes(data, scenes)], tick)
+        rows = stage1_study.rows_of_layers(module, found, tick)
     write_json(out / "layers.json", {"settings": {"scenes": scenes}, "rows": rows})
     Console(width=120).print(table("Layers on the object, behind what the picture shows (scene units)", LAYERS, rows))
 

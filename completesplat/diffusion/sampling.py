@@ -1,8 +1,9 @@
-"""Drawing latents: a denoiser, a diffusers scheduler, nothing else."""
+"""Drawing latents: a denoiser, a diffusers scheduler, nothing else; many of them in parts that fit into memory."""
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
@@ -14,6 +15,9 @@ from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
 from completesplat.schema import Range
+
+Part = TypeVar("Part")
+logger = logging.getLogger(__name__)
 
 OnStep = Callable[[int, int, Tensor], None]
 """(number of the denoiser call, timestep, estimate of the clean latent)."""
@@ -175,3 +179,27 @@ def draw_noise(
     if len(drawn) != images:
         raise ValueError(f"{images} images, but {len(drawn)} seeds")
     return torch.cat(drawn)
+
+
+def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:
+    """`draw` for all of `count` samples, at most `most` at a time (None: all at once), in their order.
+
+    Where a GPU's memory does not suffice, a part is drawn again by halves, with a warning.
+    `torch.cuda.OutOfMemoryError`: a single sample does not fit.
+    """
+    parts: list[Part] = []
+    start, size = 0, min(count if most is None else most, count)
+    while start < count:
+        try:
+            parts.append(draw(slice(start, min(start + size, count))))
+        except torch.cuda.OutOfMemoryError:
+            if size == 1:
+                raise
+        else:
+            start += size
+            continue
+        # Not in the handler, where the error still holds what was computed.
+        torch.cuda.empty_cache()
+        logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)
+        size = (size + 1) // 2
+    return parts

@@ -28,7 +28,7 @@ from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
-from completesplat.geometry.normals import normals_from_depth
+from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.geometry.trajectories import PATHS
 from completesplat.rasterizers import Rasterizer
 

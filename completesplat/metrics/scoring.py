@@ -13,7 +13,7 @@ from torch import Tensor
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.visibility import hidden_from
+from completesplat.geometry.surfaces import hidden_from
 from completesplat.metrics.image_sets import ImageSets, SetMetric
 from completesplat.metrics.images import Missing, object_only, psnr, ssim
 from completesplat.metrics.proper_scores import crps, energy_score, rank_histogram

@@ -8,10 +8,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.autoreconstructor.skips import allowed_skip_weight
 from completesplat.data.latent_cache import LatentCache
 from completesplat.data.loading.distributed import gathered
-from completesplat.diffusion.guidance import check_guidance_weight
+from completesplat.diffusion.guidance import allowed_skip_weight, check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from completesplat.geometry.cameras import Cameras, look_at, pixel_rays
-from completesplat.geometry.normals import normals_from_depth
+from completesplat.geometry.surfaces import normals_from_depth
 
 
 def camera(height: int = 12, width: int = 16) -> Cameras:

@@ -1,7 +1,7 @@
 import torch
 
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
-from completesplat.geometry.visibility import hidden_from
+from completesplat.geometry.surfaces import hidden_from
 
 SIZE = 32
 

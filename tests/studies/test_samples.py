@@ -12,9 +12,8 @@ from support import tiny_generator
 from completesplat.data.pictures.photograph import Photograph
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
-from completesplat.studies.controls import PAPER, grid, plot_controls
+from completesplat.studies.controls import PAPER, box_visibility, grid, plot_controls
 from completesplat.studies.figures import Strip, draw_strips
-from completesplat.studies.masked import box_visibility
 from completesplat.studies.samplers import Watch, fewest, plot_samplers
 from completesplat.studies.samples import near, object_psnr
 

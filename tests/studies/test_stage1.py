@@ -4,7 +4,7 @@ import torch
 
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.scene import Views
-from completesplat.studies.layers import true_thickness
+from completesplat.studies.stage1 import true_thickness
 from completesplat.tensors import concatenate
 
 SIZE = 16

@@ -5,7 +5,7 @@ from itertools import chain
 import pytest
 import torch
 
-from completesplat.diffusion.splitting import in_parts
+from completesplat.diffusion.sampling import in_parts
 
 
 @pytest.mark.parametrize(("most", "sizes"), [(None, [7]), (7, [7]), (3, [3, 3, 1]), (1, [1] * 7), (100, [7])])
