@@ -83,7 +83,9 @@ def launch(verb: str, arguments: list[str]) -> None:
     try:
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
     except (HydraException, ValueError) as error:
-        raise misspelt(error, verb, arguments, jobs.composed) or error from error
+        if (clearer := misspelt(error, verb, arguments, jobs.composed)) is None:
+            raise
+        raise clearer from error
     if failures:
         raise failures[0]
 
