@@ -151,8 +151,8 @@ def refused(annotation: Any, value: Any) -> list[Refused]:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
-        reasons = [rule.refusal(value) for rule in rules] if not refused(kind, value) else []
-        return refused(kind, value) + [Refused("", value, reason) for reason in reasons if reason]
+        unfit = refused(kind, value)
+        return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
     if origin in (Union, UnionType):
         literals = [one for member in arguments for one in get_args(member) if get_origin(member) is Literal]
         if literals and all(get_origin(member) is Literal or member is NoneType for member in arguments):

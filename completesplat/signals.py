@@ -10,7 +10,8 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import parent_process
+from multiprocessing import active_children, parent_process
+from multiprocessing.util import Finalize
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
 """Sent by `kill`, systems and clusters, Ctrl-C, a terminal that closes, and SLURM before a job's time is up."""
@@ -81,6 +82,16 @@ def _first(number: int, frame: object) -> None:
             signal.signal(one, signal.SIG_DFL)
     if not _kept:
         raise Interrupted(number)
+
+
+def _end_workers() -> None:
+    for process in active_children():
+        if process.daemon:
+            process.kill()
+
+
+# When Python ends, before it waits for them: they ignore the signal by which it would end them (`leave_to_parent`).
+Finalize(None, _end_workers, exitpriority=0)
 
 
 def leave_to_parent(_: int = 0) -> None:

@@ -55,7 +55,8 @@ def imported(folder: str) -> dict[str, set[str]]:
     if folder == "completesplat":
         texts = [path.read_text() for path in (ROOT / "conf").rglob("*.yaml")]
         names |= {name for text in texts for name in re.findall(r"_target_: (\w+)\.", text)}
-    own = {"completesplat", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
+    # All of hydra's plugins share a namespace, and hydra finds them by itself.
+    own = {"completesplat", "hydra_plugins", *(path.stem for path in (ROOT / "tests").glob("*.py"))}
     others = names - own - set(sys.stdlib_module_names)
     return {name: {canonicalize_name(found) for found in DISTRIBUTIONS.get(name, [name])} for name in others}
 

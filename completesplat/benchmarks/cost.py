@@ -14,7 +14,7 @@ from completesplat.schema import Filled, Positive
 DAY_MS = 24 * 3600 * 1000
 
 
-class Training(TypedDict):
+class WholeTraining(TypedDict):
     """A training: which of the measured steps it repeats, and how often."""
 
     step: Literal["stage1_step", "stage2_step"]
@@ -22,7 +22,7 @@ class Training(TypedDict):
 
 
 def run(
-    measured: str, trainings: Mapping[str, Training], gpus: Annotated[Sequence[Positive], Filled()], out: Path
+    measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Filled()], out: Path
 ) -> None:
     """Write `cost.json`, and print the days that each training takes on so many GPUs.
 
@@ -44,7 +44,7 @@ def run(
 
 
 def bill(
-    rows: Sequence[Mapping[str, Any]], trainings: Mapping[str, Training], gpus: Sequence[int]
+    rows: Sequence[Mapping[str, Any]], trainings: Mapping[str, WholeTraining], gpus: Sequence[int]
 ) -> list[dict[str, Any]]:
     """A row for each training and each way in which its step was measured."""
     return [

@@ -98,7 +98,7 @@ def whole(value: Tensor) -> Tensor:
     return value.full_tensor() if isinstance(value, DTensor) else value
 
 
-def own_part(value: Tensor) -> Tensor:
+def own_part(value: Any) -> Any:
     """This process's part of a tensor that may be divided over processes: the same memory."""
     return value.to_local() if isinstance(value, DTensor) else value
 

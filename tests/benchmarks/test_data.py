@@ -78,6 +78,7 @@ def test_nothing_is_left_behind_when_it_fails(command, tmp_path):
         assert not list((tmp_path / "out").glob("*data*"))
 
 
+@pytest.mark.slow
 def test_many_clips_are_opened_and_read(command, tmp_path):
     quick = ["write.scenes=20", "write.frames=3", "clips=[30,60]", "epochs=1", f"out={tmp_path / 'out'}"]
     finished = command("bench", "clips", *quick)

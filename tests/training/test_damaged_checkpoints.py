@@ -29,13 +29,13 @@ def flip(path, bit: int) -> None:
 def test_every_flipped_bit_and_every_cut_is_noticed(checkpoint):
     whole, chance = checkpoint.read_bytes(), random.Random(0)
     check_whole(checkpoint)
-    for bit in [*chance.sample(range(8 * len(whole)), 1000), *range(8 * len(whole) - 8 * 100, 8 * len(whole), 3)]:
+    for bit in [*chance.sample(range(8 * len(whole)), 300), *range(8 * len(whole) - 8 * 100, 8 * len(whole), 7)]:
         flip(checkpoint, bit)
         with pytest.raises(WeightsError, match=r"last\.ckpt: not a readable checkpoint"):
             check_whole(checkpoint)
         flip(checkpoint, bit)
     assert checkpoint.read_bytes() == whole
-    for size in [*chance.sample(range(len(whole)), 200), *range(len(whole) - 100, len(whole))]:
+    for size in [*chance.sample(range(len(whole)), 100), *range(len(whole) - 100, len(whole), 2)]:
         checkpoint.write_bytes(whole[:size])
         with pytest.raises(WeightsError, match=r"last\.ckpt: not a readable checkpoint"):
             check_whole(checkpoint)

@@ -136,3 +136,13 @@ def test_what_fails_after_a_signal_because_another_process_has_gone_ends_as_the_
     with pytest.raises(Interrupted) as stop, stopped_together():
         raise RuntimeError("Connection reset by peer")
     assert stop.value.signal == signal.SIGTERM
+
+
+def test_a_program_ends_whose_workers_nobody_has_ended():
+    """Python's own way would be SIGTERM, which they ignore, and then to wait for them."""
+    lines = ("import multiprocessing, time", "from completesplat.signals import leave_to_parent")
+    lines += ("def work():", "    leave_to_parent()", "    print('ready', flush=True)", "    time.sleep(60)")
+    lines += ("multiprocessing.get_context('fork').Process(target=work, daemon=True).start()", "time.sleep(1)")
+    assert (
+        subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=40, capture_output=True).stdout == b"ready\n"
+    )
