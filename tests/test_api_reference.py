@@ -14,14 +14,16 @@ PDOC = [sys.executable, "-m", "pdoc", "--docformat", "google", "completesplat", 
 @pytest.mark.slow
 def test_every_module_has_a_page_whose_links_lead_somewhere(tmp_path: Path) -> None:
     made = subprocess.run([*PDOC, tmp_path], capture_output=True, text=True)
-    assert (made.returncode, made.stderr) == (0, "")
+    # Before Python 3.12 a TypedDict does not tell which one it comes from.
+    said = [line for line in made.stderr.splitlines() if not line.startswith("Warn: Cannot determine where")]
+    assert (made.returncode, said) == (0, [])
     pages = {path.resolve(): path.read_text() for path in tmp_path.rglob("*.html")}
     model = pages[(tmp_path / "completesplat/generation.html").resolve()]
     assert 'id="CompleteSplat.from_pretrained"' in model
     dead, links = [], 0
     for path, text in pages.items():
         for link in re.findall(r'href="([^"]+)"', text):
-            if not re.match(r"[a-z]+:|\$", link):  # a script fills in the rest
+            if not re.match(r"[a-z]+:|\$|\[", link):  # a script fills in the rest; an expression in a source
                 file, _, name = unquote(link).partition("#")
                 target = (path.parent / file).resolve() if file else path
                 there = target in pages and (not name or f'id="{name}"' in pages[target])

@@ -23,7 +23,7 @@ class Sizes(TypedDict, total=False):
     gradient_checkpointing: bool
 
 
-class _UNet(nn.Module):
+class ConditionalUNet(nn.Module):
     """What both denoisers share: a UNet of diffusers on [conditioning, noisy latent].
 
     Args:
@@ -71,7 +71,7 @@ class _UNet(nn.Module):
         return {}
 
 
-class TextlessStableDiffusion(_UNet):
+class TextlessStableDiffusion(ConditionalUNet):
     """Stable Diffusion 1's UNet, cross-attention included: 859.5 M parameters with 8 input channels.
 
     The paper follows Stable Diffusion's denoiser, trained from scratch, and does not say what takes the place of the
@@ -102,7 +102,7 @@ class TextlessStableDiffusion(_UNet):
         return {"encoder_hidden_states": self.context.expand(batch, -1, -1)}
 
 
-class Denoiser(_UNet):
+class Denoiser(ConditionalUNet):
     """UNet built from Stable Diffusion's blocks, without text: its attention is self-attention only.
 
     The other reading of a denoiser without text, and the smaller one: blocks without cross-attention (and without the

@@ -226,9 +226,11 @@ class SceneDataModule(LightningDataModule):
         return TrainingScenes(*drawing, self.augment, *counting)
 
     def val_dataloader(self) -> SceneLoader:
+        """The same views of all validation sequences each time."""
         return self._evaluation_loader("val")
 
     def test_dataloader(self) -> SceneLoader:
+        """The same views of all test sequences each time."""
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
