@@ -56,7 +56,7 @@ demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, co
 
 # Threads that wait at full speed, as GNU OpenMP's do by default, would keep the other test process off the cores; and
 # where an environment forbids Python to keep compiled modules, rewriting every assertion takes ten seconds each time.
-test: check ## Lint, types and the tests (CPU, 4 minutes on two cores)
+test: check ## Lint, types and the tests (CPU, 5 minutes on two cores)
 	GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
