@@ -40,11 +40,12 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     _check_complete(model)
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
+        numbers = list(reconstruction.reg_image_ids())
     except Exception as error:  # Among them are ValueError, IndexError and RuntimeError.
         raise UnreadableFile(f"not a COLMAP model ({' '.join(str(error).split())})", str(model)) from None
     frames = []
     with at(model):
-        for number in reconstruction.reg_image_ids():
+        for number in numbers:
             with at(frame=number):
                 frames.append(_read_frame(reconstruction, number, images, masks))
         ordered = in_order(frames)

@@ -173,7 +173,7 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
 def _read_lens(values: dict[str, Any], image: Path) -> Lens:
     model = values.get("camera_model", "OPENCV")
     others = [key for key in OTHER_LENSES if values.get(key)]
-    if model not in USED or others:
+    if not isinstance(model, str) or model not in USED or others:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
     number = partial(_number, values)
     stored = None if {"w", "h"} <= values.keys() else picture_size(image, str(image))

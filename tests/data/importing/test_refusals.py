@@ -49,6 +49,7 @@ TRANSFORMS = {
     "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
     "another size": (lambda c: c.update(h=151), BadPicture, r"r_0\.png, in, frame 0: has 150 x 210 .* says 151 x 210"),
     "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
+    "no name of a lens": (lambda c: c.update(camera_model=["OPENCV"]), BadCamera, "camera model .* is not supported"),
     "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
     "a fourth coefficient": (lambda c: c.update(k4=0.1), BadCamera, "k4 = 0.1 has no meaning for camera model OPENCV"),
     "a folded picture": (lambda c: c.update(k1=-4.0), BadCamera, r"r_0\.png, in, frame 0: distortion .* usable"),
