@@ -146,10 +146,7 @@ def views(
 
     Refused as by `Trained.open`, `first_scenes` and `rows_of_views`.
     """
-    quieten()
-    module, data = Trained(ckpt, overrides, trust).open()
-    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    found = [scene.to(module.device) for scene in first_scenes(data, scenes)]
+    module, found = _open_stage1(ckpt, overrides, trust, scenes)
     with _status() as tick:
         rows = stage1_study.rows_of_views(module, counts, found, tick)
     write_json(out / "views.json", {"settings": {"scenes": scenes}, "rows": rows})
@@ -162,14 +159,19 @@ def layers(ckpt: str, overrides: Sequence[str], trust: bool, scenes: Positive, o
 
     Refused as by `Trained.open`, `first_scenes` and `rows_of_layers`.
     """
-    quieten()
-    module, data = Trained(ckpt, overrides, trust).open()
-    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    found = [scene.to(module.device) for scene in first_scenes(data, scenes)]
+    module, found = _open_stage1(ckpt, overrides, trust, scenes)
     with _status() as tick:
         rows = stage1_study.rows_of_layers(module, found, tick)
     write_json(out / "layers.json", {"settings": {"scenes": scenes}, "rows": rows})
     Console(width=120).print(table("Layers on the object, behind what the picture shows (scene units)", LAYERS, rows))
+
+
+def _open_stage1(ckpt: str, overrides: Sequence[str], trust: bool, scenes: int) -> tuple[Any, list[SceneBatch]]:
+    """A run's module and its first test scenes, on a GPU where there is one."""
+    quieten()
+    module, data = Trained(ckpt, overrides, trust).open()
+    module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
+    return module, [scene.to(module.device) for scene in first_scenes(data, scenes)]
 
 
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
