@@ -20,7 +20,7 @@ def test_verbs_tasks_groups_options_and_settings_are_completed():
     assert completed("data", "ch") == ["check"]
     assert completed("fit", "experiment=toy_v")[0] == "experiment=toy_var"
     assert completed("fit", "optimizer.l") == ["optimizer.lr="]
-    assert completed("fit", "opt") == ["optimized_metric=", "optimizer.lr=", "optimizer="]
+    assert completed("fit", "opt") == ["optimized_metric=", "optimizer.lr=", "optimizer.fused=", "optimizer="]
     assert "data.root=" in completed("fit", "data.")
     assert "data.category=" not in completed("fit", "data=toy_rooms", "data.")
     assert completed("predict", "sam") == ["samples=", "sampler="]

@@ -12,6 +12,8 @@ from typing import Any, TypeVar
 import torch
 from jaxtyping import Float
 from lightning import LightningModule
+from lightning.pytorch.plugins import Precision
+from lightning.pytorch.utilities.enums import GradClipAlgorithmType
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -215,6 +217,15 @@ class SceneModule(LightningModule):
         results = self.evaluation.results()
         results["model"] |= {"upper_bound": self.upper_bound, "seconds": self.timings.results()}
         return results
+
+    def configure_gradient_clipping(
+        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        """As Lightning, but for fused optimizers in bfloat16, too: it refuses them for what only loss scaling needs."""
+        precision: Any = self.trainer.precision_plugin
+        scaled = getattr(precision, "scaler", None) is not None
+        clip = precision.clip_gradients if scaled else partial(Precision.clip_gradients, precision)
+        clip(optimizer, gradient_clip_val or 0.0, GradClipAlgorithmType(gradient_clip_algorithm or "norm"))
 
     def configure_optimizers(self) -> Any:
         """The schedule spans the run, whether its length is given in steps or epochs."""

@@ -1,9 +1,12 @@
 import pytest
 import torch
 from hydra.utils import instantiate
+from lightning import Trainer
 from scenes_for_training import scene_batch
 from support import NETWORKS, compose_config
+from torch.utils.data import DataLoader
 
+from completesplat.benchmarks.training_step import Repeated
 from completesplat.training.scene_module import copy_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
@@ -38,6 +41,20 @@ def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
     assert torch.equal(seen[0], images * scenes.visible if masked else images)
     assert torch.equal(compared[0], scenes.all_views().images)
     assert (compared[0][:, 0][..., 4:12, 2:9] > 0).any()
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_gradients_are_clipped_for_fused_optimizers(precision):
+    trained = module("optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=1", "schedule=constant")
+    before = [p.detach().clone() for p in trained.parameters()]
+    trainer = Trainer(
+        max_steps=1, precision=precision, gradient_clip_val=1e-3, accelerator="cpu", logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
+    trainer.fit(trained, DataLoader(Repeated(scene_batch(), 1), batch_size=None))
+    moved = torch.cat([(p - b).flatten() for p, b in zip(trained.parameters(), before, strict=True)])
+    assert trainer.optimizers[0].defaults["fused"]
+    assert moved.norm().item() == pytest.approx(1e-3, rel=1e-2)  # as far as gradients of this norm go
 
 
 def test_naive_predictions_are_the_reference_and_one_image():

@@ -1,12 +1,42 @@
-"""Learning-rate schedules, stepped once per optimizer step. `total_steps` is the length of the run."""
+"""Muon, and learning-rate schedules, stepped once per optimizer step. `total_steps` is the length of the run."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Annotated
 
+from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.schema import Natural, Share
+from completesplat.schema import Natural, Positive, Range, Share
+
+
+def muon(
+    parameters: Iterable[Tensor],
+    lr: Annotated[float, Range(0)],
+    adam_lr: Annotated[float, Range(0)],
+    adam_betas: tuple[Share, Share] = (0.9, 0.99),
+    momentum: Share = 0.95,
+    newton_schulz_steps: Positive = 5,
+) -> Optimizer:
+    """Muon (Jordan 2024, of the library pytorch_optimizer) for matrices and kernels; Adam for biases and norms.
+
+    A convolution's kernel is taken as the matrix [out in*height*width]. A step of it has about the same length in all
+    directions, which takes fewer steps than Adam and, on a CPU, a third more time for each.
+
+    Args:
+        lr: of matrices and kernels; how large their gradients are makes no difference.
+        adam_lr, adam_betas: of the rest.
+        newton_schulz_steps: iterations that make a step orthogonal.
+    """
+    from pytorch_optimizer import Muon  # which imports a hundred others
+
+    given = list(parameters)
+    matrices = {"params": [p for p in given if p.ndim > 1], "lr": lr, "use_muon": True}
+    others = {"params": [p for p in given if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
+    groups = [group for group in (matrices, others) if group["params"]]
+    optimizer: Optimizer = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
+    return optimizer
 
 
 def exponential(

@@ -6,7 +6,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LambdaCallback
 from support import SMALL, compose_config
 
-from completesplat.training.schedules import constant, cosine, exponential
+from completesplat.training.optimization import constant, cosine, exponential, muon
 
 
 def factors(schedule, steps: int, **settings) -> list[float]:
@@ -34,10 +34,24 @@ def test_cosine_ends_at_the_final_ratio_and_constant_stays():
     assert set(factors(constant, 5, total_steps=3)) == {1.0}
 
 
+def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the_rest():
+    kernel, bias = torch.zeros(4, 2, 3, 3, requires_grad=True), torch.zeros(4, requires_grad=True)
+    optimizer = muon([kernel, bias], lr=0.5, adam_lr=0.01)
+    left, right = torch.linalg.qr(torch.randn(4, 4)).Q, torch.linalg.qr(torch.randn(18, 4)).Q
+    kernel.grad = ((left * torch.tensor([1, 3, 10, 30])) @ right.T).view(4, 2, 3, 3)  # singular values
+    bias.grad = torch.tensor([1.0, -2.0, 30.0, -400.0])
+    optimizer.step()
+    directions = -(left.T @ kernel.detach().flatten(1) @ right)
+    assert directions.diagonal().tolist() == pytest.approx([0.5] * 4, rel=0.4)  # Newton and Schulz, stopped early
+    assert (directions - directions.diagonal().diag()).abs().max() < 0.05
+    assert bias.detach() == pytest.approx(-0.01 * torch.tensor([1.0, -1.0, 1.0, -1.0]))
+    assert [len(group["params"]) for group in muon([bias], lr=0.5, adam_lr=0.01).param_groups] == [1]
+
+
 @pytest.mark.parametrize("length", [["trainer.max_steps=6"], ["trainer.max_steps=-1", "+trainer.max_epochs=6"]])
 def test_the_schedule_ends_with_the_run_whether_steps_or_epochs_are_given(length, toy_root, tmp_path):
     settings = [*SMALL, *length, "schedule.warmup_steps=0", "optimizer.lr=1.0e-3", "data.references_per_sequence=1"]
-    settings += ["trainer.limit_val_batches=0", "trainer.val_check_interval=null", f"out={tmp_path}"]
+    settings += ["optimizer=adam", "trainer.limit_val_batches=0", "trainer.val_check_interval=null", f"out={tmp_path}"]
     config = compose_config("fit", "experiment=toy_var", f"data.root={toy_root}", *settings)
     rates = []
     noted = LambdaCallback(on_train_batch_start=lambda one, *_: rates.append(one.optimizers[0].param_groups[0]["lr"]))
