@@ -1,6 +1,5 @@
 """`completesplat bench rasterizers`: the backends side by side, in speed, growth and agreement."""
 
-import json
 import logging
 import statistics
 import time
@@ -14,8 +13,11 @@ from hydra.utils import instantiate
 from lightning import LightningModule
 from rich.console import Console
 
+from completesplat.atomic import atomic_path
+from completesplat.benchmarks import thread_scaling
 from completesplat.benchmarks.agreement import agreement_rows
 from completesplat.benchmarks.printing import device_of, print_results
+from completesplat.benchmarks.thread_scaling import scaling_rows
 from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     DEFAULTS,
@@ -27,6 +29,7 @@ from completesplat.benchmarks.workloads import (
     splatter_scene,
 )
 from completesplat.commands import quieten
+from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -56,17 +59,10 @@ class TrainingStep(TypedDict):
 
 
 def run(
-    scene: str | None,
-    backends: Sequence[str],
-    sizes: Sequence[Positive],
-    views: Sequence[Positive],
-    repeats: Positive,
-    growth: Growth | Literal[False],
-    training_step: TrainingStep | Literal[False],
-    model: Mapping[str, Any],
-    constants: Mapping[str, Any],
-    out: Path,
-) -> None:
+    scene: str | None, backends: Sequence[str], sizes: Sequence[Positive], views: Sequence[Positive], repeats: Positive,
+    threads: Sequence[Positive], growth: Growth | Literal[False], training_step: TrainingStep | Literal[False],
+    model: Mapping[str, Any], constants: Mapping[str, Any], out: Path,
+) -> None:  # fmt: skip
     """Time the rasterizers, or compare them on a scene; write `rasterizers.json` and a plot, print tables.
 
     Args:
@@ -74,6 +70,7 @@ def run(
         backends: keys of `CLASSES`; those that do not work here are left out, with the reason.
         sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
         repeats: timed calls of each.
+        threads: numbers of threads to compare on the same pairs, where the machine has the cores; [] leaves it out.
         growth, training_step: False leaves them out.
         model: configuration of the module whose steps are timed.
         constants: configuration of the `RenderingConstants` that all backends share.
@@ -94,13 +91,16 @@ def run(
         else:
             quieten()
             figures = {"rows": speed_rows(working, sizes, views, repeats, tick)}
+            tiled = [backend for backend in working if backend.name == "tiled"]
+            if threads and tiled:
+                figures["threads"] = scaling_rows(tiled[0], threads, sizes, views, repeats, tick)
             if growth:
                 chosen = [backend for backend in working if backend.name in growth["backends"]]
                 figures["growth"] = growth_rows(chosen, tick, growth["most_gaussians"])
             if training_step:
                 figures["training_step"] = _step_rows(working, training_step, model, tick)
     results = {"machine": machine(), "not_measured": absent, **figures}
-    (out / "rasterizers.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_json(out / "rasterizers.json", results)
     if results.get("growth"):
         plot(results["growth"], out / "rasterizers.png")
     show(results)
@@ -292,7 +292,8 @@ def plot(growth: list[dict[str, Any]], path: Path) -> None:
         panel.grid(alpha=0.3)
     figure.axes[0].set_ylabel("forward + backward, ms")
     figure.axes[-1].legend(loc="upper left")  # its first workload is the smallest of all, which every backend takes
-    figure.savefig(path, dpi=120)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=120)
 
 
 SPEED: list[Column] = [
@@ -328,6 +329,7 @@ AGREEMENT: list[Column] = [
 # Key in the results, title, columns.
 SECTIONS = [
     ("rows", "Speed", SPEED),
+    ("threads", "Threads of tiled", thread_scaling.COLUMNS),
     ("growth", "Growth", GROWTH),
     ("training_step", "Share of a training step", STEP),
     (

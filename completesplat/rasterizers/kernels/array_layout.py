@@ -1,6 +1,7 @@
 """Columns of the arrays that travel between kernels.
 
-prepared   [gaussian 12] float32: what does not depend on the view
+prepared   [17 lane] float32: what does not depend on the view, with Gaussians beyond the last one, which are left out,
+           up to a multiple of 16
 records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
 gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's own row
 camera     [20] float64
@@ -11,10 +12,11 @@ rounding, and whose row bounds follow directly. Alpha is then 2^(LOG2_OPACITY - 
 """
 
 # prepared
-ROOT = 0  # 9 columns, row-major: R(quaternion) diag(scales), whose square is the covariance
-LOG2_OPACITY_PREPARED = 9
-REACH = 10  # the largest u^2 + v^2 at which alpha is not below min_alpha; negative if the Gaussian is left out
-PREPARED_WIDTH = 12
+MEAN = 0  # 3
+ROOT = 3  # 9, row-major: R(quaternion) diag(scales), whose square is the covariance
+LOG2_OPACITY_AND_COLOR = 12  # 4, as in the records
+REACH = 16  # the largest u^2 + v^2 at which alpha is not below min_alpha; negative if the Gaussian is left out
+PREPARED_WIDTH = 17
 
 # records
 CENTER_X, CENTER_Y, U, SHEAR, V, LOG2_OPACITY = 0, 1, 2, 3, 4, 5

@@ -4,12 +4,22 @@
 blocks of a row to the word.
 """
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba.core import types
 
 from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.compilation import helper, kernel
 from completesplat.rasterizers.kernels.simd import (
+    F32,
+    I32,
+    I64,
+    INTEGERS_IR,
     LANES,
+    VECTOR,
+    address,
     any_lane,
     exp2,
     keep,
@@ -20,7 +30,7 @@ from completesplat.rasterizers.kernels.simd import (
     splat,
     square_root,
     store,
-    store_blocks,
+    vector_function,
 )  # fmt: skip
 
 Array = np.ndarray
@@ -164,29 +174,75 @@ def begin(first_row, end_row, columns, height, width, state):
 @helper
 def write_images(first_row, end_row, columns, state, color, depth, alpha):
     height, width = alpha.shape
-    for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
-        for x in range(width):
-            block = (y // BLOCK - first_row) * columns + x // BLOCK
-            pixel = block * (STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
-            for channel in range(3):
-                color[channel, y, x] = state[pixel + (1 + channel) * LANES]
-            depth[y, x] = state[pixel + 4 * LANES]
-            alpha[y, x] = state[pixel + 5 * LANES]
+    plane = height * width
+    flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
+    for row in range(first_row, end_row):
+        for column in range(columns):
+            block = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+            corner = (row * width + column) * BLOCK
+            if is_whole(row, column, height, width):
+                for channel in range(3):
+                    store_block(flat_color, channel * plane + corner, width, state_vector(state, block, 1 + channel))
+                store_block(flat_depth, corner, width, state_vector(state, block, 4))
+                store_block(flat_alpha, corner, width, state_vector(state, block, 5))
+                continue
+            for lane in range(LANES):
+                if is_inside(row, column, lane, height, width):
+                    pixel = corner + lane // BLOCK * width + lane % BLOCK
+                    for channel in range(3):
+                        flat_color[channel * plane + pixel] = state[block + (1 + channel) * LANES + lane]
+                    flat_depth[pixel], flat_alpha[pixel] = (
+                        state[block + 4 * LANES + lane],
+                        state[block + 5 * LANES + lane],
+                    )
 
 
 @helper
 def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha):
     """Put the gradients of the images, and the total sum, into the state."""
     height, width = alpha.shape
-    for y in range(first_row * BLOCK, min(end_row * BLOCK, height)):
-        for x in range(width):
-            block = (y // BLOCK - first_row) * columns + x // BLOCK
-            pixel = block * (STATE_VECTORS * LANES) + (y % BLOCK) * BLOCK + x % BLOCK
-            red, green, blue = grad_color[0, y, x], grad_color[1, y, x], grad_color[2, y, x]
-            state[pixel + 2 * LANES], state[pixel + 3 * LANES], state[pixel + 4 * LANES] = red, green, blue
-            state[pixel + 5 * LANES] = grad_depth[y, x]
-            total = red * color[0, y, x] + green * color[1, y, x] + blue * color[2, y, x]
-            state[pixel + LANES] = total + grad_depth[y, x] * depth[y, x] - grad_alpha[y, x] * (ONE - alpha[y, x])
+    plane = height * width
+    flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
+    colors, depths, alphas = grad_color.reshape(-1), grad_depth.reshape(-1), grad_alpha.reshape(-1)
+    for row in range(first_row, end_row):
+        for column in range(columns):
+            block = ((row - first_row) * columns + column) * (STATE_VECTORS * LANES)
+            corner = (row * width + column) * BLOCK
+            if is_whole(row, column, height, width):
+                red, green = load_block(colors, corner, width), load_block(colors, plane + corner, width)
+                blue, z = load_block(colors, 2 * plane + corner, width), load_block(depths, corner, width)
+                total = red * load_block(flat_color, corner, width)
+                total = total + green * load_block(flat_color, plane + corner, width)
+                total = total + blue * load_block(flat_color, 2 * plane + corner, width)
+                total = total + z * load_block(flat_depth, corner, width)
+                through = ONE - load_block(flat_alpha, corner, width)
+                store(state, block + LANES, total - load_block(alphas, corner, width) * through)
+                store(state, block + 2 * LANES, red)
+                store(state, block + 3 * LANES, green)
+                store(state, block + 4 * LANES, blue)
+                store(state, block + 5 * LANES, z)
+                continue
+            for lane in range(LANES):
+                if is_inside(row, column, lane, height, width):
+                    pixel = corner + lane // BLOCK * width + lane % BLOCK
+                    red, green, blue = colors[pixel], colors[plane + pixel], colors[2 * plane + pixel]
+                    total = red * flat_color[pixel] + green * flat_color[plane + pixel]
+                    total = total + blue * flat_color[2 * plane + pixel] + depths[pixel] * flat_depth[pixel]
+                    state[block + LANES + lane] = total - alphas[pixel] * (ONE - flat_alpha[pixel])
+                    state[block + 2 * LANES + lane], state[block + 3 * LANES + lane] = red, green
+                    state[block + 4 * LANES + lane], state[block + 5 * LANES + lane] = blue, depths[pixel]
+
+
+@helper
+def is_whole(row, column, height, width):
+    """Whether all pixels of a block are inside the image."""
+    return (row + 1) * BLOCK <= height and (column + 1) * BLOCK <= width
+
+
+@helper
+def is_inside(row, column, lane, height, width):
+    """Whether this pixel of a block is inside the image."""
+    return row * BLOCK + lane // BLOCK < height and column * BLOCK + lane % BLOCK < width
 
 
 @helper
@@ -277,14 +333,46 @@ def attenuate(transmittance, alpha, min_transmittance):
 @helper
 def open_pixels(row, column, height, width, state, offset):
     """Transmittances of a fresh block: 1, but 0 for the lanes outside the image, which must not keep it open."""
-    if (row + 1) * BLOCK <= height and (column + 1) * BLOCK <= width:
+    if is_whole(row, column, height, width):
         store(state, offset, splat(ONE))
         return
     for lane in range(LANES):
-        inside = row * BLOCK + lane // BLOCK < height and column * BLOCK + lane % BLOCK < width
-        state[offset + lane] = ONE if inside else ZERO
+        state[offset + lane] = ONE if is_inside(row, column, lane, height, width) else ZERO
 
 
 @helper
 def state_vector(state, offset, channel):
     return load(state, offset + channel * LANES)
+
+
+@vector_function(types.void)
+def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
+    """Pixels, truncated to integers, as the numbers of their blocks, to a flat int32 array."""
+    places = ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)
+    blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
+    builder.store(blocks, address(builder, array, offset, INTEGERS_IR), align=4)
+
+
+@vector_function(VECTOR)
+def load_block(builder: Any, array: Any, corner: Any, width: Any) -> Any:
+    """4 x 4 pixels, row-major, of a flat image of this width, from the one at `corner` on."""
+    rows = [builder.load(row, align=4) for row in _block_rows(builder, array, corner, width)]
+    return _joined(builder, _joined(builder, *rows[:2]), _joined(builder, *rows[2:]))
+
+
+@vector_function(types.void)
+def store_block(builder: Any, array: Any, corner: Any, width: Any, vector: Any) -> None:
+    """The reverse of `load_block`."""
+    for y, row in enumerate(_block_rows(builder, array, corner, width)):
+        lanes = ir.Constant(ir.VectorType(I32, BLOCK), [y * BLOCK + x for x in range(BLOCK)])
+        builder.store(builder.shuffle_vector(vector, vector, lanes), row, align=4)
+
+
+def _block_rows(builder: Any, array: Any, corner: Any, width: Any) -> list[Any]:
+    firsts = [builder.add(corner, builder.mul(width, ir.Constant(I64, y))) for y in range(BLOCK)]
+    return [address(builder, array, first, ir.VectorType(F32, BLOCK)) for first in firsts]
+
+
+def _joined(builder: Any, a: Any, b: Any) -> Any:
+    lanes = list(range(2 * a.type.count))
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))

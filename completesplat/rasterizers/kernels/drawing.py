@@ -161,10 +161,11 @@ class Drawing:
             np.float32(constants.min_transmittance),
         )
         self.buffers = Buffers()
-        self.prepared = self.buffers.empty((self.scenes, self.count, layout.PREPARED_WIDTH))
+        lanes = -(-self.count // LANES) * LANES
+        self.prepared = self.buffers.empty((self.scenes, layout.PREPARED_WIDTH, lanes))
         self.held = self.scenes * self.views if keep else min(self.scenes * self.views, VIEWS_AT_ONCE)
         self.records = self.buffers.empty((self.held, self.count, layout.RECORD_WIDTH))
-        self.visible = self.buffers.empty((self.held, self.count))
+        self.visible = self.buffers.empty((self.held, lanes))
         self.visible_counts = np.zeros(self.held, np.int64)
         rows = -(-self.height // layout.BLOCK)
         count = min(rows, -(-FEWEST_TASKS // max(1, self.scenes * self.views)))
@@ -206,11 +207,11 @@ class Drawing:
     def _project(self, start: int, slot: int) -> None:
         buffers = Buffers()
         scene, camera = divmod(start + slot, self.views)
-        unsorted = buffers.empty((self.count, layout.RECORD_WIDTH))
-        keys, order = buffers.empty((2, self.count), np.int64), buffers.empty((2, self.count), np.int32)
+        room = self.count + 1
+        unsorted = buffers.empty((room, layout.RECORD_WIDTH))
+        keys, order = buffers.empty((2, room), np.int64), buffers.empty((2, room), np.int32)
         self.visible_counts[slot] = project(
-            self.parameters.means[scene], self.parameters.colors[scene], self.prepared[scene],
-            self.cameras[scene, camera], self.height, self.width,
+            self.prepared[scene], self.cameras[scene, camera], self.height, self.width,
             float(self.constants.blur), float(self.constants.near_plane),
             unsorted, keys, order, self.records[slot], self.visible[slot],
         )  # fmt: skip
@@ -238,7 +239,7 @@ class Drawing:
         scene, chunk = divmod(task, -(-self.count // CHUNK))
         visible = self.visible[scene * self.views : (scene + 1) * self.views]
         project_backward(
-            *(x[scene] for x in self.parameters[:4]), self.prepared[scene], self.cameras[scene],
+            *(x[scene] for x in self.parameters[1:4]), self.prepared[scene], self.cameras[scene],
             float(self.constants.blur), visible, sums[scene], chunk * CHUNK, min((chunk + 1) * CHUNK, self.count),
             *(x[scene] for x in result),
         )  # fmt: skip
@@ -246,6 +247,6 @@ class Drawing:
     def _camera_backward(self, grad_cameras: np.ndarray, sums: np.ndarray, task: int) -> None:
         scene, view = divmod(task, self.views)
         camera_backward(
-            self.parameters.means[scene], self.prepared[scene], self.cameras[scene, view],
+            self.prepared[scene], self.cameras[scene, view],
             float(self.constants.blur), self.visible[task], sums[scene, view], grad_cameras[scene, view],
         )  # fmt: skip

@@ -1,8 +1,11 @@
 """Scene parameters to the visible Gaussians of one view, packed in depth order, and the backward pass."""
 
 import math
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba.core import types
 
 from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.compilation import helper, kernel
@@ -25,10 +28,40 @@ from completesplat.rasterizers.kernels.projection import (
     slopes,
     unit_quaternion,
 )  # fmt: skip
-from completesplat.rasterizers.kernels.simd import LANES, add_each, any_lane, keep_each, load, store, zeros
+from completesplat.rasterizers.kernels.simd import (
+    I32,
+    I64,
+    INTEGERS_IR,
+    LANES,
+    VECTOR,
+    VECTOR_IR,
+    add_each,
+    address,
+    all_within,
+    any_lane,
+    choose,
+    columns,
+    gather,
+    in_every_lane,
+    keep,
+    keep_each,
+    load,
+    narrow,
+    scatter,
+    splat,
+    square_root,
+    store,
+    store_columns,
+    transposed,
+    unpack,
+    vector_function,
+    widen,
+    zeros,
+)  # fmt: skip
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 HALF = np.float64(0.5)
+VISIBLE = np.float32(1)
 LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
 RADIX_BITS = 11
 BUCKETS = 1 << RADIX_BITS
@@ -40,14 +73,8 @@ DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
 # What is summed over views, before the rest of the chain rule, which is each Gaussian's own.
 COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
 no_totals = zeros(TOTALS)
-
-
-@helper
-def all_finite(row):
-    finite = True
-    for entry in range(row.shape[0]):
-        finite &= abs(row[entry]) <= LARGEST_FLOAT32
-    return finite
+gather_one, gather_three, gather_four = gather(1), gather(3), gather(4)
+one_column, four_columns = columns(1), columns(4)
 
 
 @kernel
@@ -56,83 +83,95 @@ def prepare(
     prepared: Array,
 ) -> None:  # fmt: skip
     """Fill `prepared`; Gaussians with a value that is not finite, or too transparent ever to be seen, are marked."""
-    for i in range(means.shape[0]):
-        finite = all_finite(means[i]) and all_finite(quaternions[i]) and all_finite(scales[i]) and all_finite(colors[i])
-        if not (finite and opacities[i] > 0 and opacities[i] <= LARGEST_FLOAT32):
-            prepared[i, layout.REACH] = -1
-            continue
-        w, x, y, z, _ = unit_quaternion(quaternions, i)
-        rotation = rotation_matrix(w, x, y, z)
-        for entry in range(9):
-            prepared[i, layout.ROOT + entry] = rotation[entry] * scales[i, entry % 3]
+    count = means.shape[0]
+    flat, stride = prepared.reshape(-1), prepared.shape[1]
+    prepared[layout.REACH, count:] = -ONE
+    for i in range(count):
         log2_opacity = math.log2(np.float64(opacities[i]))
-        prepared[i, layout.LOG2_OPACITY_PREPARED] = log2_opacity
-        visible = log2_opacity >= log2_min_alpha
-        prepared[i, layout.REACH] = log2_opacity - log2_min_alpha + layout.SLACK if visible else -ONE
+        visible = log2_opacity >= log2_min_alpha and opacities[i] <= LARGEST_FLOAT32
+        prepared[layout.LOG2_OPACITY_AND_COLOR, i] = log2_opacity
+        prepared[layout.REACH, i] = log2_opacity - log2_min_alpha + layout.SLACK if visible else -ONE
+    for start in range(0, count, LANES):
+        mean = gather_three(means.reshape(-1), 3, 0, start, count)
+        quaternion, scale = lane_shapes(quaternions, scales, start, count)
+        color = gather_three(colors.reshape(-1), 3, 0, start, count)
+        w, x, y, z, _ = unit_quaternion(widen(quaternion))
+        root = narrow(scaled_columns(rotation_matrix(w, x, y, z), widen(scale)))
+        store_columns(flat, stride, layout.MEAN * stride + start, mean + root)
+        store_columns(flat, stride, (layout.LOG2_OPACITY_AND_COLOR + 1) * stride + start, color)
+        finite = all_within(mean + quaternion + scale + color, LARGEST_FLOAT32)
+        place = layout.REACH * stride + start
+        store(flat, place, choose(finite, load(flat, place), -ONE))
+
+
+@helper
+def lane_shapes(quaternions, scales, start, last):
+    """Quaternions and scales of the Gaussians start..start + 15; the last one stands again where there are no more."""
+    quaternion = gather_four(quaternions.reshape(-1), 4, 0, start, last)
+    return quaternion, gather_three(scales.reshape(-1), 3, 0, start, last)
+
+
+@helper
+def scaled_columns(m, a):
+    """M diag(a), row-major."""
+    return (
+        m[0] * a[0], m[1] * a[1], m[2] * a[2],
+        m[3] * a[0], m[4] * a[1], m[5] * a[2],
+        m[6] * a[0], m[7] * a[1], m[8] * a[2],
+    )  # fmt: skip
 
 
 @kernel
 def project(
-    means: Array, colors: Array, prepared: Array, camera: Array, height: int, width: int, blur: float,
-    near_plane: float, unsorted: Array, keys: Array, order: Array, records: Array, visible: Array,
+    prepared: Array, camera: Array, height: int, width: int, blur: float, near_plane: float,
+    unsorted: Array, keys: Array, order: Array, records: Array, visible: Array,
 ) -> int:  # fmt: skip
     """Project, cull and sort the Gaussians of one scene for one camera.
 
     Args:
-        unsorted: scratch like `records`.
-        keys, order: scratch [2 gaussian], int64 and int32.
+        unsorted: scratch [gaussian + 1 16] float32.
+        keys, order: scratch [2 gaussian + 1], int64 and int32.
         records: receives the visible Gaussians, front to back.
-        visible: [gaussian] float32, receives 1 for these, 0 for the others.
+        visible: [lane] float32, receives 1 for these, 0 for the others.
 
     Returns:
         How many are visible.
     """
     count = 0
     rotation = nine(camera, layout.ROTATION)
-    integers = unsorted.view(np.int32)
-    for i in range(means.shape[0]):
-        visible[i] = 0
-        reach = np.float64(prepared[i, layout.REACH])
-        if not reach > 0:
-            continue
-        mean = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        x, y, z = camera_point(camera, rotation, mean)
-        if not (z > near_plane and z <= LARGEST_FLOAT32):
+    flat, stride = prepared.reshape(-1), prepared.shape[1]
+    unsorted_flat, depths = unsorted.reshape(-1), keys[0].view(np.float64)
+    for start in range(0, stride, LANES):
+        mean, root = lane_gaussians(prepared, start)
+        (reach,) = widen(one_column(flat, stride, layout.REACH * stride + start))
+        x, y, z = camera_point(camera, rotation, widen(mean))
+        inside = (reach > ZERO) & (z > near_plane) & (z <= LARGEST_FLOAT32)
+        if not any_lane(inside):
+            store(visible, start, splat(ZERO))
             continue
         inverse_z = ONE / z
         slope_x, slope_y = x * inverse_z, y * inverse_z
         center_x = camera[layout.FOCAL_X] * slope_x + camera[layout.PRINCIPAL_X]
         center_y = camera[layout.FOCAL_Y] * slope_y + camera[layout.PRINCIPAL_Y]
         row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
-        root = nine(prepared[i], layout.ROOT)
-        xx, xy, yy, determinant = covariance_2d(row_times_matrix(row_x, root), row_times_matrix(row_y, root), blur)
+        wide = widen(root)
+        xx, xy, yy, determinant = covariance_2d(row_times_matrix(row_x, wide), row_times_matrix(row_y, wide), blur)
         # sigma = ln(2) * reach is an ellipse with these half extents.
-        extent_x, extent_y = math.sqrt(2 * LN2 * reach * xx), math.sqrt(2 * LN2 * reach * yy)
+        extent_x, extent_y = square_root(TWO * LN2 * reach * xx), square_root(TWO * LN2 * reach * yy)
         top, bottom = max(center_y - extent_y + HALF, 0.0), min(center_y + extent_y - HALF, height - ONE)
-        # Written so that a NaN culls as well.
-        bounded = max(abs(center_x), abs(center_y), xx, yy) <= LARGEST_PROJECTION
-        inside = center_x + extent_x >= HALF and center_x - extent_x <= width - HALF and top < bottom + ONE
-        if not (bounded and inside):
-            continue
+        inside = inside & all_within((center_x, center_y, xx, yy), LARGEST_PROJECTION) & (top < bottom + ONE)
+        inside = inside & (center_x + extent_x >= HALF) & (center_x - extent_x <= width - HALF)
+        store(visible, start, keep(inside, splat(VISIBLE)))
         inverse_yy = ONE / yy
-        inverse_u = math.sqrt(2 * LN2 * determinant * inverse_yy)
-        unsorted[count, layout.CENTER_X], unsorted[count, layout.CENTER_Y] = center_x, center_y
-        unsorted[count, layout.U], unsorted[count, layout.INVERSE_U] = ONE / inverse_u, inverse_u
-        unsorted[count, layout.SHEAR] = xy * inverse_yy
-        unsorted[count, layout.V] = math.sqrt(reach) / extent_y
-        unsorted[count, layout.LOG2_OPACITY] = prepared[i, layout.LOG2_OPACITY_PREPARED]
-        for channel in range(3):
-            unsorted[count, layout.RED + channel] = colors[i, channel]
-        unsorted[count, layout.DEPTH] = z
-        unsorted[count, layout.RIGHTMOST_Y] = xy / xx * extent_x
-        unsorted[count, layout.EXTENT_Y] = extent_y
-        integers[count, layout.ROWS] = (int(top) >> layout.BLOCK_SHIFT) | (int(bottom) >> layout.BLOCK_SHIFT << 16)
-        integers[count, layout.INDEX] = i
-        keys[0, count] = depth_key(z)
-        visible[i] = 1
-        count += 1
-    radix_sort(keys, order, count)
-    unsorted_flat, records_flat = unsorted.reshape(-1), records.reshape(-1)
+        inverse_u = square_root(TWO * LN2 * determinant * inverse_yy)
+        # In the order of the records' columns.
+        shape = narrow((center_x, center_y, ONE / inverse_u, xy * inverse_yy, square_root(reach) / extent_y))
+        look = four_columns(flat, stride, layout.LOG2_OPACITY_AND_COLOR * stride + start)
+        extents = narrow((z, inverse_u, xy / xx * extent_x, extent_y))
+        rest = (packed_blocks(top, bottom), index_bits(start), splat(ZERO))
+        count = append(inside, shape + look + extents + rest, unsorted_flat, z, depths, count)
+    radix_sort(depths, keys, order, count)
+    records_flat = records.reshape(-1)
     for j in range(count):
         source = np.int64(order[PASSES % 2, j]) * layout.RECORD_WIDTH
         store(records_flat, j * layout.RECORD_WIDTH, load(unsorted_flat, source))
@@ -146,11 +185,12 @@ def depth_key(z):
 
 
 @helper
-def radix_sort(keys, order, count):
-    """Stable sort of keys[0, :count]; order[PASSES % 2] is the result."""
+def radix_sort(depths, keys, order, count):
+    """Stable sort of depths[:count], which are the memory of keys[0]; order[PASSES % 2] is the result."""
     starts = np.zeros((PASSES, BUCKETS), np.int32)
     for i in range(count):
         order[0, i] = i
+        keys[0, i] = depth_key(depths[i])
         for digit in range(PASSES):
             starts[digit, (keys[0, i] >> (RADIX_BITS * digit)) & (BUCKETS - 1)] += 1
     for digit in range(PASSES):
@@ -169,9 +209,38 @@ def radix_sort(keys, order, count):
             order[target, position] = order[source, i]
 
 
+@vector_function(VECTOR)
+def packed_blocks(builder: Any, first: Any, last: Any) -> Any:
+    """Pixels as the bits of int32: the numbers of the first ones' blocks, and those of the last ones' shifted up."""
+    low, high = (builder.fptosi(pixel, INTEGERS_IR) for pixel in (first, last))
+    low, high = (builder.ashr(pixel, ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)) for pixel in (low, high))
+    return builder.bitcast(builder.or_(low, builder.shl(high, ir.Constant(INTEGERS_IR, [16] * LANES))), VECTOR_IR)
+
+
+@vector_function(VECTOR)
+def index_bits(builder: Any, start: Any) -> Any:
+    """start, ..., start + 15 as the bits of int32."""
+    first = in_every_lane(builder, builder.trunc(start, I32))
+    return builder.bitcast(builder.add(first, ir.Constant(INTEGERS_IR, list(range(LANES)))), VECTOR_IR)
+
+
+@vector_function(types.int64)
+def append(builder: Any, mask: Any, vectors: Any, rows: Any, vector: Any, numbers: Any, count: Any) -> Any:
+    """Lane i of 16 vectors becomes a row of a flat array, and that of one more a number of another, for i in the mask.
+
+    Returns the new number of rows. One row beyond them is overwritten.
+    """
+    for lane, row in enumerate(transposed(builder, unpack(builder, vectors))):
+        place = ir.Constant(I32, lane)
+        builder.store(row, address(builder, rows, builder.mul(count, ir.Constant(I64, LANES)), VECTOR_IR), align=4)
+        builder.store(builder.extract_element(vector, place), builder.gep(numbers, [count], inbounds=True))
+        count = builder.add(count, builder.zext(builder.extract_element(mask, place), I64))
+    return count
+
+
 @kernel
 def project_backward(
-    means: Array, quaternions: Array, scales: Array, opacities: Array, prepared: Array, cameras: Array, blur: float,
+    quaternions: Array, scales: Array, opacities: Array, prepared: Array, cameras: Array, blur: float,
     visible: Array, gradients: Array, first: int, last: int,
     grad_means: Array, grad_quaternions: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
 ) -> None:  # fmt: skip
@@ -179,30 +248,29 @@ def project_backward(
 
     Args:
         cameras: [view 20] float64.
-        visible: [view gaussian] float32, 1 or 0.
+        visible: [view lane] float32, 1 or 0.
         gradients: [view band gaussian 16], written by `composite` for the visible Gaussians.
+        first: a multiple of 16.
     """
-    totals = np.empty((TOTALS, LANES), np.float32)
     for start in range(first, last, LANES):
-        sum_views(means, prepared, cameras, blur, visible, gradients, start, last, totals.reshape(-1))
-        for lane in range(min(LANES, last - start)):
-            i = start + lane
-            for axis in range(3):
-                grad_colors[i, axis] = totals[COLOR + axis, lane]
-                grad_means[i, axis] = totals[MEAN + axis, lane]
-            if totals[REACHED, lane] > 0:
-                grad_opacities[i] = np.float64(totals[LOG_OPACITY, lane]) / np.float64(opacities[i])
-                grad_root = nine(totals[:, lane], ROOT)
-                root_backward(quaternions, scales, i, grad_root, grad_quaternions, grad_scales)
-            else:
-                grad_opacities[i] = 0
-                grad_quaternions[i] = 0
-                grad_scales[i] = 0
+        sums = sum_views(prepared, cameras, blur, visible, gradients, start, last)
+        reached = sums[REACHED] > ZERO
+        quaternion, scale = lane_shapes(quaternions, scales, start, last)
+        opacity = gather_one(opacities, 1, 0, start, last)
+        grad_root = widen(sums[ROOT:REACHED])
+        grad_quaternion, grad_scale = root_backward(widen(quaternion), widen(scale), grad_root)
+        (grad_log_opacity,) = widen(sums[LOG_OPACITY:MEAN])
+        grad_opacity = narrow((grad_log_opacity / widen(opacity)[0],))
+        scatter(grad_colors.reshape(-1), start, last, sums[COLOR:LOG_OPACITY])
+        scatter(grad_means.reshape(-1), start, last, sums[MEAN:ROOT])
+        scatter(grad_opacities, start, last, keep_each(reached, grad_opacity))
+        scatter(grad_quaternions.reshape(-1), start, last, keep_each(reached, narrow(grad_quaternion)))
+        scatter(grad_scales.reshape(-1), start, last, keep_each(reached, narrow(grad_scale)))
 
 
 @helper
-def sum_views(means, prepared, cameras, blur, visible, gradients, start, last, totals):
-    mean, root = lane_gaussians(means, prepared, start, last)
+def sum_views(prepared, cameras, blur, visible, gradients, start, last):
+    mean, root = lane_gaussians(prepared, start)
     results = no_totals()
     for view in range(cameras.shape[0]):
         sums = lane_sums_of_view(visible[view], gradients[view], start, last)
@@ -222,28 +290,30 @@ def sum_views(means, prepared, cameras, blur, visible, gradients, start, last, t
         parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
         # Of lanes that are not reached, anything may have come out, NaN included.
         results = add_each(results, keep_each(mask, parts))
-    for k in range(TOTALS):
-        store(totals, k * LANES, results[k])
+    return results
 
 
 @helper
-def root_backward(quaternions, scales, i, grad_root, grad_quaternions, grad_scales):
-    """Through root = R(q / |q|) diag(scales), to the rows i of `grad_quaternions` and `grad_scales`."""
-    w, x, y, z, inverse_norm = unit_quaternion(quaternions, i)
+def root_backward(quaternion, scale, n):
+    """Through root = R(q / |q|) diag(scale), whose gradient is n: those of the quaternion and of the scale."""
+    w, x, y, z, inverse_norm = unit_quaternion(quaternion)
     rotation = rotation_matrix(w, x, y, z)
-    a, b, c = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-    n = grad_root
-    grad_scales[i, 0] = rotation[0] * n[0] + rotation[3] * n[3] + rotation[6] * n[6]
-    grad_scales[i, 1] = rotation[1] * n[1] + rotation[4] * n[4] + rotation[7] * n[7]
-    grad_scales[i, 2] = rotation[2] * n[2] + rotation[5] * n[5] + rotation[8] * n[8]
-    g = (a * n[0], b * n[1], c * n[2], a * n[3], b * n[4], c * n[5], a * n[6], b * n[7], c * n[8])
+    grad_scale = (
+        rotation[0] * n[0] + rotation[3] * n[3] + rotation[6] * n[6],
+        rotation[1] * n[1] + rotation[4] * n[4] + rotation[7] * n[7],
+        rotation[2] * n[2] + rotation[5] * n[5] + rotation[8] * n[8],
+    )
+    g = scaled_columns(n, scale)
     grad_w = TWO * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     grad_x = TWO * (-TWO * x * (g[4] + g[8]) + y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]))
     grad_y = TWO * (x * (g[1] + g[3]) - TWO * y * (g[0] + g[8]) + z * (g[5] + g[7]) + w * (g[2] - g[6]))
     grad_z = TWO * (x * (g[2] + g[6]) + y * (g[5] + g[7]) - TWO * z * (g[0] + g[4]) + w * (g[3] - g[1]))
     # Normalisation removes the part along q (and everything for a zero quaternion, whose inverse norm is set to 0).
     along = grad_w * w + grad_x * x + grad_y * y + grad_z * z
-    grad_quaternions[i, 0] = (grad_w - along * w) * inverse_norm
-    grad_quaternions[i, 1] = (grad_x - along * x) * inverse_norm
-    grad_quaternions[i, 2] = (grad_y - along * y) * inverse_norm
-    grad_quaternions[i, 3] = (grad_z - along * z) * inverse_norm
+    grad_quaternion = (
+        (grad_w - along * w) * inverse_norm,
+        (grad_x - along * x) * inverse_norm,
+        (grad_y - along * y) * inverse_norm,
+        (grad_z - along * z) * inverse_norm,
+    )
+    return grad_quaternion, grad_scale

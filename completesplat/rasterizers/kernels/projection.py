@@ -1,6 +1,6 @@
-"""The steps of the projection, the chain rule back through them for 16 Gaussians at once, one to a lane, and cameras.
+"""The steps of the projection, for 16 Gaussians at once, one to a lane; the chain rule back through them, and cameras.
 
-Scalars are float64: huge scales must not overflow.
+Scalars, and the lanes going forward, are float64: huge scales must not overflow.
 """
 
 import math
@@ -13,10 +13,11 @@ from completesplat.rasterizers.kernels.simd import (
     LANES,
     add_each,
     any_lane,
-    gather,
+    choose,
+    columns,
     keep,
     keep_each,
-    lane_constant,
+    load,
     square_root,
     store,
     transposed_rows,
@@ -25,8 +26,7 @@ from completesplat.rasterizers.kernels.simd import (
 
 ZERO = np.float32(0)
 Array = np.ndarray
-lane_index = lane_constant(range(LANES))
-gather_one, gather_three, gather_nine = gather(1), gather(3), gather(9)
+three_columns, nine_columns = columns(3), columns(9)
 COLUMNS = layout.REACHED + 1
 no_sums = zeros(COLUMNS)
 ONE, TWO = np.float64(1), np.float64(2)
@@ -35,15 +35,12 @@ SMALLEST_SQUARED_NORM = np.float64(1e-24)  # of a quaternion that has a directio
 
 
 @helper
-def unit_quaternion(quaternions, i):
-    """(w, x, y, z, 1 / norm) of row i; the identity with 1 / norm = 0 for a zero quaternion."""
-    w, x = np.float64(quaternions[i, 0]), np.float64(quaternions[i, 1])
-    y, z = np.float64(quaternions[i, 2]), np.float64(quaternions[i, 3])
+def unit_quaternion(quaternion):
+    """(w, x, y, z, 1 / norm); the identity with 1 / norm = 0 for a zero quaternion."""
+    w, x, y, z = quaternion
     squared = w * w + x * x + y * y + z * z
-    if squared > SMALLEST_SQUARED_NORM:
-        inverse = ONE / math.sqrt(squared)
-        return w * inverse, x * inverse, y * inverse, z * inverse, inverse
-    return ONE, 0.0, 0.0, 0.0, 0.0
+    inverse = keep(squared > SMALLEST_SQUARED_NORM, ONE / square_root(squared))
+    return choose(inverse > 0.0, w * inverse, ONE), x * inverse, y * inverse, z * inverse, inverse
 
 
 @helper
@@ -136,13 +133,11 @@ def covariance_2d(a, b, blur):
 
 
 @helper
-def lane_gaussians(means, prepared, start, last):
-    """Means and roots R(quaternion) diag(scales), row-major, of the Gaussians start..start + 15.
-
-    The last one stands again where there are no more.
-    """
-    mean = gather_three(means.reshape(-1), 3, 0, start, last)
-    return mean, gather_nine(prepared.reshape(-1), layout.PREPARED_WIDTH, layout.ROOT, start, last)
+def lane_gaussians(prepared, start):
+    """Means and roots R(quaternion) diag(scales), row-major, of the Gaussians start..start + 15."""
+    flat, stride = prepared.reshape(-1), prepared.shape[1]
+    mean = three_columns(flat, stride, layout.MEAN * stride + start)
+    return mean, nine_columns(flat, stride, layout.ROOT * stride + start)
 
 
 @helper
@@ -150,10 +145,10 @@ def lane_sums_of_view(visible, gradients, start, last):
     """The columns of these Gaussians' gradients in one view, added over its bands; REACHED is the number of bands.
 
     Args:
-        visible: [gaussian] float32, 1 or 0.
+        visible: [lane] float32, 1 or 0.
         gradients: [band gaussian 16]; rows of Gaussians that are not visible hold anything.
     """
-    seen = gather_one(visible, 1, 0, start, last)[0] > ZERO
+    seen = load(visible, start) > ZERO
     sums = no_sums()
     for band in range(gradients.shape[0]):
         parts = transposed_rows(gradients[band].reshape(-1), layout.GRADIENT_WIDTH, start, last)[:COLUMNS]
@@ -260,27 +255,26 @@ def point_gradient(
 
 @kernel
 def camera_backward(
-    means: Array, prepared: Array, camera: Array, blur: float, visible: Array, gradients: Array, grad_camera: Array
+    prepared: Array, camera: Array, blur: float, visible: Array, gradients: Array, grad_camera: Array
 ) -> None:
     """Chain rule from one view's Gaussians to its camera.
 
     Args:
         camera: [20] float64.
-        visible: [gaussian] float32, 1 or 0.
+        visible: [lane] float32, 1 or 0.
         gradients: [band gaussian 16], written by `composite` for the visible Gaussians.
         grad_camera: [16] float64, receives the gradients of the first 16 columns of `camera`.
     """
     grad_camera[:] = 0
-    count = means.shape[0]
+    count = gradients.shape[1]
     rotation = nine(camera, layout.ROTATION)
     totals = np.empty(LANES, np.float32)
     for start in range(0, count, LANES):
         sums = lane_sums_of_view(visible, gradients, start, count)
-        # The last one is repeated where there are no more: it must count once.
-        mask = (sums[layout.REACHED] > ZERO) & (lane_index() <= np.float32(count - start - 1))
+        mask = sums[layout.REACHED] > ZERO
         if not any_lane(mask):
             continue
-        mean, root = lane_gaussians(means, prepared, start, count)
+        mean, root = lane_gaussians(prepared, start)
         slope_x, slope_y, inverse_z = slopes(mean, camera, rotation)
         center_x, center_y, row_x, row_y, _ = row_gradients(
             slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums

@@ -1,8 +1,9 @@
-"""A vector of 16 float32 lanes that numba kernels can hold in a variable, and functions of it."""
+"""Vectors of 16 lanes, float32 or float64, that numba kernels can hold in a variable, and functions of them."""
 
 import inspect
 import operator
 from collections.abc import Callable
+from functools import reduce
 from itertools import product
 from typing import Any
 
@@ -11,12 +12,10 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-from completesplat.rasterizers.kernels.array_layout import BLOCK_SHIFT
-
 LANES = 16
 FLAGS = ("contract", "nsz", "arcp", "reassoc", "afn")  # as in `compilation.OPTIONS`
 
-F32, I32 = ir.FloatType(), ir.IntType(32)
+F32, F64, I32, I64 = ir.FloatType(), ir.DoubleType(), ir.IntType(32), ir.IntType(64)
 VECTOR_IR, INTEGERS_IR = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
 # x + 1.5 * 2^23 has its last bit at 1, so it is rounded to an integer, which sits in the low bits of the sum.
 _ROUNDING_SHIFT = 1.5 * 2**23
@@ -27,14 +26,15 @@ _EXP2_POLYNOMIAL = (
 
 
 class LanesType(types.Type):
-    """16 numbers (float32) or booleans."""
+    """16 numbers or booleans."""
 
     def __init__(self, name: str, element: Any) -> None:
         super().__init__(name=f"{name}x{LANES}")
         self.llvm = ir.VectorType(element, LANES)
 
 
-VECTOR, MASK = LanesType("Float32", F32), LanesType("Mask", ir.IntType(1))
+VECTOR, DOUBLES = LanesType("Float32", F32), LanesType("Float64", F64)
+MASK = LanesType("Mask", ir.IntType(1))
 
 
 @register_model(LanesType)
@@ -57,8 +57,8 @@ def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
     """Turn `emit(builder, *operands)`, which writes LLVM code, into a function for kernels with this type of result.
 
     What a kernel passes to it arrives so: an array as the address of its first element, an integer as one of 64 bits,
-    any other scalar in every lane. A list of what it returns becomes a tuple. `result` may be a function of the
-    operands' types that returns the signature.
+    any other scalar in every lane (as float64 beside such a vector, else as float32). A list of what it returns becomes
+    a tuple. `result` may be a function of the operands' types that returns the signature.
     """
 
     def decorate(emit: Callable[..., Any]) -> Any:
@@ -75,7 +75,9 @@ def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
 def _generator(emit: Callable[..., Any]) -> Callable[..., Any]:
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         pairs = zip(values, signature.args, strict=True)
-        found = emit(builder, *(_operand(context, builder, value, type_) for value, type_ in pairs))
+        wide = any(DOUBLES in (type_, getattr(type_, "dtype", None)) for type_ in signature.args)
+        element = types.float64 if wide else types.float32
+        found = emit(builder, *(_operand(context, builder, value, type_, element) for value, type_ in pairs))
         if isinstance(found, list):
             return context.make_tuple(builder, signature.return_type, found)
         return context.get_dummy_value() if signature.return_type == types.void else found
@@ -83,22 +85,33 @@ def _generator(emit: Callable[..., Any]) -> Callable[..., Any]:
     return generate
 
 
-def _operand(context: Any, builder: Any, value: Any, type_: Any) -> Any:
+def _operand(context: Any, builder: Any, value: Any, type_: Any, element: Any) -> Any:
     if isinstance(type_, types.Array):
         return context.make_array(type_)(context, builder, value).data
     if isinstance(type_, types.Integer):
         return context.cast(builder, value, type_, types.intp)
     if not isinstance(type_, types.Float):
         return value
-    undefined = ir.Constant(VECTOR_IR, ir.Undefined)
-    scalar = context.cast(builder, value, type_, types.float32)
+    return in_every_lane(builder, context.cast(builder, value, type_, element))
+
+
+def in_every_lane(builder: Any, scalar: Any) -> Any:
+    undefined = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS_IR, [0] * LANES))
 
 
-def _define_operator(function: Any, result: Any, emit: Callable[..., Any], kind: Any = VECTOR, count: int = 2) -> None:
-    """Give a Python operator of this number of operands its meaning for vectors, with scalars beside them, or masks."""
+def _define_operator(function: Any, emit: Callable[..., Any], mask: bool = False, count: int = 2) -> None:
+    """Give a Python operator of this number of operands its meaning for vectors, with scalars beside them.
 
+    Args:
+        mask: whether it gives one.
+    """
+    for kind in (VECTOR, DOUBLES):
+        _define_for(kind, MASK if mask else kind, function, emit, count)
+
+
+def _define_for(kind: Any, result: Any, function: Any, emit: Callable[..., Any], count: int = 2) -> None:
     def type_of(*operands: Any) -> Any:
         return result if kind in operands and all(t == kind or isinstance(t, types.Float) for t in operands) else None
 
@@ -110,22 +123,23 @@ def _define_operator(function: Any, result: Any, emit: Callable[..., Any], kind:
             lower_builtin(function, *kinds)(_generator(emit))
 
 
-_define_operator(operator.add, VECTOR, lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
-_define_operator(operator.sub, VECTOR, lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
-_define_operator(operator.mul, VECTOR, lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
-_define_operator(operator.truediv, VECTOR, lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
-_define_operator(operator.gt, MASK, lambda builder, a, b: builder.fcmp_ordered(">", a, b))
-_define_operator(operator.ge, MASK, lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
-_define_operator(operator.le, MASK, lambda builder, a, b: builder.fcmp_ordered("<=", a, b))
-_define_operator(operator.neg, VECTOR, lambda builder, a: builder.fneg(a), count=1)
-_define_operator(operator.and_, MASK, lambda builder, a, b: builder.and_(a, b), MASK)
+_define_operator(operator.add, lambda builder, a, b: builder.fadd(a, b, flags=FLAGS))
+_define_operator(operator.sub, lambda builder, a, b: builder.fsub(a, b, flags=FLAGS))
+_define_operator(operator.mul, lambda builder, a, b: builder.fmul(a, b, flags=FLAGS))
+_define_operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b, flags=FLAGS))
+_define_operator(operator.gt, lambda builder, a, b: builder.fcmp_ordered(">", a, b), mask=True)
+_define_operator(operator.ge, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), mask=True)
+_define_operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), mask=True)
+_define_operator(operator.lt, lambda builder, a, b: builder.fcmp_ordered("<", a, b), mask=True)
+_define_operator(operator.neg, lambda builder, a: builder.fneg(a), count=1)
+_define_for(MASK, MASK, operator.and_, lambda builder, a, b: builder.and_(a, b))
 # Of two numbers of which one is NaN, these give the second, as the processors' own instructions do.
-_define_operator(max, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
-_define_operator(min, VECTOR, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+_define_operator(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+_define_operator(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
-def _vectors(count: int) -> Any:
-    return types.UniTuple(VECTOR, count)  # type: ignore[no-untyped-call]
+def _vectors(count: int, kind: Any = VECTOR) -> Any:
+    return types.UniTuple(kind, count)  # type: ignore[no-untyped-call]
 
 
 def lane_constant(values: Any) -> Any:
@@ -145,22 +159,47 @@ def splat(builder: Any, scalar: Any) -> Any:
     return scalar
 
 
-@vector_function(VECTOR)
+@vector_function(lambda mask, vector: vector(mask, vector))
 def keep(builder: Any, mask: Any, vector: Any) -> Any:
     """The vector where the mask is set, zero elsewhere."""
-    return builder.select(mask, vector, uniform(0))
+    return builder.select(mask, vector, ir.Constant(vector.type, None))
+
+
+@vector_function(lambda mask, vector, scalar: vector(mask, vector, scalar))
+def choose(builder: Any, mask: Any, vector: Any, scalar: Any) -> Any:
+    """The vector where the mask is set, the scalar elsewhere."""
+    return builder.select(mask, vector, scalar)
+
+
+@vector_function(lambda vectors: _vectors(len(vectors), DOUBLES)(vectors))
+def widen(builder: Any, vectors: Any) -> Any:
+    """A tuple of vectors as float64."""
+    return [builder.fpext(one, DOUBLES.llvm) for one in unpack(builder, vectors)]
+
+
+@vector_function(lambda vectors: _vectors(len(vectors))(vectors))
+def narrow(builder: Any, vectors: Any) -> Any:
+    """A tuple of vectors of float64 as float32."""
+    return [builder.fptrunc(one, VECTOR_IR) for one in unpack(builder, vectors)]
 
 
 @vector_function(lambda mask, vectors: vectors(mask, vectors))
 def keep_each(builder: Any, mask: Any, vectors: Any) -> Any:
     """`keep` for every vector of a tuple."""
-    return [builder.select(mask, one, uniform(0)) for one in _unpack(builder, vectors)]
+    return [builder.select(mask, one, uniform(0)) for one in unpack(builder, vectors)]
+
+
+@vector_function(MASK)
+def all_within(builder: Any, vectors: Any, limit: Any) -> Any:
+    """Where no number of a tuple of vectors is beyond the limit, of either sign, nor NaN."""
+    masks = [builder.fcmp_ordered("<=", _each(builder, "fabs", one), limit) for one in unpack(builder, vectors)]
+    return reduce(builder.and_, masks)
 
 
 @vector_function(lambda a, b: a(a, b))
 def add_each(builder: Any, a: Any, b: Any) -> Any:
     """The sums of two tuples of vectors."""
-    return [builder.fadd(x, y, flags=FLAGS) for x, y in zip(_unpack(builder, a), _unpack(builder, b), strict=True)]
+    return [builder.fadd(x, y, flags=FLAGS) for x, y in zip(unpack(builder, a), unpack(builder, b), strict=True)]
 
 
 @vector_function(types.boolean)
@@ -170,10 +209,10 @@ def any_lane(builder: Any, mask: Any) -> Any:
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-@vector_function(VECTOR)
+@vector_function(lambda vector: vector(vector))
 def square_root(builder: Any, vector: Any) -> Any:
     """The square root of every lane."""
-    return _call(builder, f"llvm.sqrt.v{LANES}f32", VECTOR_IR, vector)
+    return _each(builder, "sqrt", vector)
 
 
 @vector_function(VECTOR)
@@ -196,7 +235,7 @@ def exp2(builder: Any, x: Any) -> Any:
 @vector_function(VECTOR)
 def lane_sums(builder: Any, vectors: Any) -> Any:
     """From a tuple of up to 16 vectors, the vector whose lane i is the sum over all lanes of vector i; rest zero."""
-    rows = _unpack(builder, vectors)
+    rows = unpack(builder, vectors)
     rows += [uniform(0)] * (LANES - len(rows))
     step = 1
     while len(rows) > 1:  # each round adds two lanes of every row and interleaves neighbouring rows
@@ -215,16 +254,18 @@ def _fold(builder: Any, a: Any, b: Any, step: int) -> Any:
 @vector_function(types.int64)
 def lowest_bit(builder: Any, bits: Any) -> Any:
     """Index of the lowest set bit of a nonzero uint64."""
-    return _call(builder, "llvm.cttz.i64", bits.type, bits, ir.Constant(ir.IntType(1), 1))
+    return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
-def _call(builder: Any, name: str, result: ir.Type, *arguments: Any) -> Any:
-    kind = ir.FunctionType(result, [a.type for a in arguments])
-    function = cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
-    return builder.call(function, arguments)
+def _each(builder: Any, name: str, vector: Any) -> Any:
+    """LLVM's function of this name, of every lane."""
+    suffix = "f64" if vector.type == DOUBLES.llvm else "f32"
+    kind = ir.FunctionType(vector.type, [vector.type])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{suffix}")  # type: ignore[no-untyped-call]
+    return builder.call(function, [vector])
 
 
-def _unpack(builder: Any, values: Any) -> list[Any]:
+def unpack(builder: Any, values: Any) -> list[Any]:
     return list(cgutils.unpack_tuple(builder, values))  # type: ignore[no-untyped-call]
 
 
@@ -234,24 +275,16 @@ def _unpack(builder: Any, values: Any) -> list[Any]:
 @vector_function(VECTOR)
 def load(builder: Any, array: Any, offset: Any) -> Any:
     """16 floats of a flat float32 array, from element `offset` on."""
-    return builder.load(_at(builder, array, offset, VECTOR_IR), align=4)
+    return builder.load(address(builder, array, offset, VECTOR_IR), align=4)
 
 
 @vector_function(types.void)
 def store(builder: Any, array: Any, offset: Any, vector: Any) -> None:
     """The reverse of `load`."""
-    builder.store(vector, _at(builder, array, offset, VECTOR_IR), align=4)
+    builder.store(vector, address(builder, array, offset, VECTOR_IR), align=4)
 
 
-@vector_function(types.void)
-def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
-    """Pixels, truncated to integers, as the numbers of their blocks, to a flat int32 array."""
-    places = ir.Constant(INTEGERS_IR, [BLOCK_SHIFT] * LANES)
-    blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
-    builder.store(blocks, _at(builder, array, offset, INTEGERS_IR), align=4)
-
-
-def _at(builder: Any, array: Any, offset: Any, kind: Any) -> Any:
+def address(builder: Any, array: Any, offset: Any, kind: Any) -> Any:
     return builder.bitcast(builder.gep(array, [offset], inbounds=True), kind.as_pointer())
 
 
@@ -274,12 +307,45 @@ def gather(count: int) -> Any:
     return gather
 
 
+@vector_function(types.void)
+def scatter(builder: Any, array: Any, start: Any, last: Any, vectors: Any) -> None:
+    """The reverse of `gather` with as many vectors as there are columns. No row beyond last - 1 is written."""
+    rows = unpack(builder, vectors)
+    firsts = _rows(builder, ir.Constant(I64, len(rows)), start, last)
+    # Backwards, so that row last - 1 is left with what is its own.
+    for lane, (k, vector) in product(reversed(range(LANES)), enumerate(rows)):
+        value = builder.extract_element(vector, ir.Constant(I32, lane))
+        place = builder.add(firsts[lane], ir.Constant(I64, k))
+        builder.store(value, builder.gep(array, [place], inbounds=True))
+
+
+def columns(count: int) -> Any:
+    """A function (array, stride, start) that returns 16 neighbours of each of so many rows of a flat array."""
+
+    @vector_function(_vectors(count))
+    def columns(builder: Any, array: Any, stride: Any, start: Any) -> Any:
+        firsts = [builder.add(start, builder.mul(stride, ir.Constant(I64, k))) for k in range(count)]
+        return [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in firsts]
+
+    return columns
+
+
+@vector_function(types.void)
+def store_columns(builder: Any, array: Any, stride: Any, start: Any, vectors: Any) -> None:
+    """The reverse of `columns`."""
+    for k, vector in enumerate(unpack(builder, vectors)):
+        first = builder.add(start, builder.mul(stride, ir.Constant(I64, k)))
+        builder.store(vector, address(builder, array, first, VECTOR_IR), align=4)
+
+
 @vector_function(_vectors(LANES))
 def transposed_rows(builder: Any, array: Any, stride: Any, start: Any, last: Any) -> Any:
     """As `gather(16)` from column 0 on, by loads of whole rows."""
-    matrix = [
-        builder.load(_at(builder, array, first, VECTOR_IR), align=4) for first in _rows(builder, stride, start, last)
-    ]
+    rows = _rows(builder, stride, start, last)
+    return transposed(builder, [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in rows])
+
+
+def transposed(builder: Any, matrix: list[Any]) -> list[Any]:
     for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
         for i in (i for i in range(LANES) if not i & step):
             a, b = matrix[i], matrix[i + step]

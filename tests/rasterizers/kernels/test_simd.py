@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from completesplat.rasterizers.kernels import composite, simd
+from completesplat.rasterizers.kernels import composite, project, simd
 from completesplat.rasterizers.kernels.compilation import kernel
 from completesplat.rasterizers.kernels.simd import LANES
 
@@ -37,3 +37,66 @@ def test_word_masks_hold_the_bits_of_their_columns(first: int, last: int) -> Non
         columns = [64 * word + bit for bit in range(64) if mask >> bit & 1]
         assert columns == [column for column in range(first, last + 1) if column // 64 == word]
         assert lowest == columns[0] - 64 * word
+
+
+append, load_block, store_block = project.append, composite.load_block, composite.store_block
+three_columns, sixteen_columns = simd.columns(3), simd.columns(LANES)
+narrow, scatter, square_root, widen = simd.narrow, simd.scatter, simd.square_root, simd.widen
+
+
+@kernel
+def run_doubles(values: np.ndarray, out: np.ndarray) -> None:
+    (x,) = widen((load(values, 0),))
+    (y,) = narrow((square_root(x * x + 1e-10) - x,))  # all of it is lost in float32
+    store(out, 0, y)
+
+
+@kernel
+def run_append(values: np.ndarray, rows: np.ndarray, numbers: np.ndarray, count: int) -> int:
+    vectors = sixteen_columns(values, LANES, 0)
+    (number,) = widen((vectors[0],))
+    return append(number > 0.0, vectors, rows, number, numbers, count)
+
+
+@kernel
+def run_scatter(values: np.ndarray, out: np.ndarray, start: int, last: int) -> None:
+    scatter(out, start, last, three_columns(values, LANES, 0))
+
+
+@kernel
+def run_blocks(image: np.ndarray, out: np.ndarray, corner: int, width: int) -> None:
+    store_block(out, corner, width, load_block(image, corner, width))
+
+
+def test_doubles_have_the_precision_of_float64() -> None:
+    x, out = np.linspace(1, 2, LANES, dtype=np.float32), np.zeros(LANES, np.float32)
+    run_doubles(x, out)
+    assert np.allclose(out, 0.5e-10 / x, rtol=1e-4, atol=0)
+
+
+def test_appended_rows_are_those_of_the_mask_in_their_order() -> None:
+    values = np.random.default_rng(0).normal(size=(LANES, LANES)).astype(np.float32)
+    rows, numbers = np.zeros((LANES + 3, LANES), np.float32), np.zeros(LANES + 3)
+    count = run_append(values.reshape(-1), rows.reshape(-1), numbers, 2)
+    kept = values.T[values[0] > 0]
+    assert count == 2 + len(kept)
+    assert np.array_equal(rows[2:count], kept)
+    assert np.array_equal(numbers[2:count], kept[:, 0])
+    assert not rows[:2].any()
+
+
+@pytest.mark.parametrize("last", [17, 31, 32])
+def test_scattered_rows_end_with_the_last_one(last: int) -> None:
+    values, out = np.arange(1, 3 * LANES + 1, dtype=np.float32).reshape(3, LANES), np.zeros((40, 3), np.float32)
+    run_scatter(values.reshape(-1), out.reshape(-1), 16, last)
+    assert np.array_equal(out[16:last], values.T[: last - 16])
+    assert not out[:16].any()
+    assert not out[last:].any()
+
+
+def test_a_block_is_read_and_written_where_it_stands() -> None:
+    image, out = np.arange(11 * 9, dtype=np.float32).reshape(9, 11), np.zeros((9, 11), np.float32)
+    run_blocks(image.reshape(-1), out.reshape(-1), 3 * 11 + 5, 11)
+    expected = np.zeros_like(image)
+    expected[3:7, 5:9] = image[3:7, 5:9]
+    assert np.array_equal(out, expected)
