@@ -154,23 +154,41 @@ class CompleteSplat(SceneModel):
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
         conditioning = self.conditioning(images)
-        _, features = self.autoreconstructor.encoder(images)
+        features = self._features(images) if weight else []
         shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
         noise = draw_noise(len(images), samples, shape, seed).to(images.device)
         image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+        decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
-        def draw(part: slice) -> Gaussians:
-            own = image_of[part]
-            skips = [feature[own] for feature in features], weight
-            decode = partial(self._decode, skips=skips, cameras=cameras[own], depth_range=depth_range[own])
-            shown = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent))
-            return decode(self.sampler(self.denoiser, noise[part], conditioning[own], guidance_weight, steps, shown))
+        def draw(part: slice) -> Any:
+            shown = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
+            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, shown)
 
-        return concatenate(in_parts(draw, len(noise), batch))
+        # One after the other: where a GPU's memory does not suffice to decode a part, its latents are kept.
+        latents = torch.cat(in_parts(draw, len(noise), batch))
+        return concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
 
-    def _decode(self, latent: Tensor, skips: tuple[Any, ...], cameras: Cameras, depth_range: Tensor) -> Gaussians:
+    def _features(self, images: Tensor) -> list[Tensor]:
+        """What the skips need of the encoder."""
+        stage1 = self.autoreconstructor
+        found: list[Tensor] = stage1.encoder.features(images, stage1.reconstructor.feature_levels)
+        return found
+
+    def _decode(
+        self,
+        image_of: Tensor,
+        features: Sequence[Tensor],
+        skip_weight: float,
+        cameras: Cameras,
+        depth_range: Tensor,
+        latent: Tensor,
+        part: slice,
+    ) -> Gaussians:
+        """Scenes of the latents of a part of all samples, whose images' numbers `image_of` has."""
+        own = image_of[part]
+        skips = [feature[own] for feature in features], skip_weight
         splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)
-        gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
+        gaussians: Gaussians = splatter_image.gaussians(cameras[own], depth_range[own])
         return gaussians
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:

@@ -115,6 +115,58 @@ def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, pi
             torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-4, rtol=1e-4)
 
 
+def calls_of(model, **settings) -> dict[str, list[int]]:
+    """Batch sizes with which the networks are called in a drawing of one picture."""
+    encoder, reconstructor = model.autoreconstructor.encoder.network, model.autoreconstructor.reconstructor
+    networks = {"conditioning": model.conditioning, "denoiser": model.denoiser, "reconstructor": reconstructor}
+    networks |= {"first level": encoder.conv_in, "second level": encoder.down_blocks[1].resnets[0]}
+    networks |= {"latent": encoder.mid_block, "skip": reconstructor.skips["0"]}
+    sizes = {name: [] for name in networks}
+    hooks = [
+        network.register_forward_pre_hook(lambda _, inputs, seen=sizes[name]: seen.append(len(inputs[0])))
+        for name, network in networks.items()
+    ]
+    size = model.image_size
+    camera = Cameras(torch.eye(4), pinhole(50.0, size), (size, size))[None]
+    model.generate(torch.rand(1, 3, size, size), camera, model.depth_range[None], **settings)
+    for hook in hooks:
+        hook.remove()
+    return {name: seen for name, seen in sizes.items() if seen}
+
+
+@pytest.mark.parametrize(("guidance_weight", "passes"), [(0.0, 1), (0.5, 2)])
+def test_a_picture_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
+    model, guidance_weight, passes
+):
+    found = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
+    once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
+    assert found == {**once, "denoiser": [20 * passes] * 4}
+
+
+def test_without_skips_a_picture_is_not_encoded(model):
+    found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
+    assert found == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
+
+
+def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, picture, monkeypatch):
+    whole, decode, sizes = model(picture, samples=5, steps=2), model._decode, []
+
+    def small(*inputs):
+        sizes.append(len(inputs[-2]))
+        if sizes[-1] > 2:
+            raise torch.cuda.OutOfMemoryError
+        return decode(*inputs)
+
+    monkeypatch.setattr(model, "_decode", small)
+    denoised = []
+    hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
+    parts = model(picture, samples=5, steps=2)
+    hook.remove()
+    assert (denoised, sizes) == ([5, 5], [5, 3, 2, 2, 1])
+    for one, other in zip(whole, parts, strict=True):
+        torch.testing.assert_close(one.means, other.means, atol=1e-4, rtol=1e-4)
+
+
 def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
     photograph = model.read(picture)
     other = replace(photograph, image=torch.where(half > 0, photograph.image, 1 - photograph.image))

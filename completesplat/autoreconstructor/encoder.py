@@ -82,14 +82,27 @@ class Encoder(nn.Module):
     ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
         """Encode values as they are, which should lie around zero; returns what `forward` does."""
         network: Any = self.network
-        run = recompute if self.gradient_checkpointing else nn.Module.__call__
-        hidden = network.conv_in(values)
-        features = []
-        for block in network.down_blocks:
-            for resnet in block.resnets:
-                hidden = run(resnet, hidden, None)
-            features.append(hidden)
-            for downsampler in block.downsamplers or ():
-                hidden = run(downsampler, hidden)
-        hidden = network.conv_act(network.conv_norm_out(run(network.mid_block, hidden)))
+        features = self._features(values, len(network.down_blocks))
+        hidden = self._run(network.mid_block, features[-1])
+        hidden = network.conv_act(network.conv_norm_out(hidden))
         return from_moments(self.quant_conv(network.conv_out(hidden))), features
+
+    def features(
+        self, images: Float[Tensor, "batch 3 height width"], levels: int
+    ) -> list[Float[Tensor, "batch _ _ _"]]:
+        """The features of the first levels, as `forward` returns them, without the work for what follows these."""
+        return self._features(images * 2 - 1, levels)
+
+    def _features(self, values: Tensor, levels: int) -> list[Tensor]:
+        network: Any = self.network
+        hidden, features = network.conv_in(values), list[Tensor]()
+        for level, block in enumerate(network.down_blocks[:levels]):
+            for downsampler in network.down_blocks[level - 1].downsamplers if level else ():
+                hidden = self._run(downsampler, hidden)
+            for resnet in block.resnets:
+                hidden = self._run(resnet, hidden, None)
+            features.append(hidden)
+        return features
+
+    def _run(self, block: nn.Module, *inputs: Any) -> Any:
+        return recompute(block, *inputs) if self.gradient_checkpointing else block(*inputs)

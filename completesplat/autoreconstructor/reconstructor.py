@@ -55,19 +55,28 @@ class Reconstructor(nn.Module):
         self.skips = nn.ModuleDict({str(level): _zero_conv(channels[level], inputs[level]) for level in skip_levels})
         self.gradient_checkpointing = False
 
+    @property
+    def feature_levels(self) -> int:
+        """Levels of the encoder that the skips take features from, and those before them."""
+        return max((int(level) + 1 for level in self.skips), default=0)
+
     def forward(
         self,
         latent: Float[Tensor, "batch channel latent_height latent_width"],
         features: Sequence[Float[Tensor, "batch _ _ _"]],
         skip_weight: Float[Tensor, " batch"] | float = 1.0,
     ) -> SplatterImage:
-        """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one, or one per sample)."""
+        """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one, or one per sample).
+
+        Args:
+            features: of `feature_levels` levels or more, or none at all: no skips, as with a weight of 0.
+        """
         network = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__
         weight = torch.as_tensor(skip_weight, dtype=latent.dtype, device=latent.device).view(-1, 1, 1, 1)
         hidden = run(network.mid_block, network.conv_in(self.post_quant_conv(latent)))
         for level, block in zip(reversed(range(len(network.up_blocks))), network.up_blocks, strict=True):
-            if str(level) in self.skips:
+            if str(level) in self.skips and features:
                 hidden = hidden + weight * self.skips[str(level)](features[level])
             hidden = run(block, hidden)
         output = network.conv_out(network.conv_act(network.conv_norm_out(hidden)))

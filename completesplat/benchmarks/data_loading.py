@@ -1,6 +1,5 @@
 """`completesplat bench data`: reading from published and packed forms of the same scenes, side by side."""
 
-import json
 import logging
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,6 +14,7 @@ from rich.console import Console
 
 from completesplat.benchmarks.printing import print_results
 from completesplat.benchmarks.reading import MakeData, chunks, decoding_share, opening_figures, rows
+from completesplat.commands.protocol import write_json
 from completesplat.data.packed.rows import CODECS
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
@@ -77,7 +77,7 @@ def run(
     results = {"machine": machine(), "not_measured": {}, **figures}
     if "opening" in figures and "added_mb" not in figures["opening"]:
         results["not_measured"] = {"memory": "this system has no /proc/self/status"}
-    (out / "data.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_json(out / "data.json", results)
     show(results)
 
 

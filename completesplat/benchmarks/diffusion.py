@@ -1,13 +1,8 @@
 """`completesplat bench diffusion`: what stage 2 costs, one way against another on the same work."""
 
-import json
-import signal
 import statistics
-import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,10 +12,13 @@ from typing import Annotated, Any, Literal
 import torch
 from hydra.utils import instantiate
 from rich.console import Console
+from torch import nn
 from torch.optim import Optimizer
 
+from completesplat.benchmarks.compiling import NotMeasured, compiled_within
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands import quieten
+from completesplat.commands.protocol import write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
@@ -37,10 +35,6 @@ from completesplat.training.scene_module import SceneModule
 WARM_UP = 2
 
 Work = Callable[[], object]
-
-
-class NotMeasured(CompleteSplatError):
-    """A comparison has no figures on this machine, for the reason in the message."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +56,7 @@ def run(
     samples: Positive,
     steps: Positive,
     compile_limit: Annotated[float, Range(0)],
+    only: Sequence[str] | None,
     seed: int,
     out: Path,
 ) -> None:
@@ -75,9 +70,10 @@ def run(
         repeats: timed calls of each way.
         samples: drawn of one picture, in a batch and one by one, in `steps` steps.
         compile_limit: seconds that `torch.compile` may take; 0 leaves it out.
+        only: names of the comparisons; None for all.
 
     Raises:
-        CompleteSplatError: there is no such device.
+        CompleteSplatError: there is no such device or comparison.
     """
     chosen = chosen_device(device)
     quieten()
@@ -93,11 +89,12 @@ def run(
             "cached_vs_on_the_fly": lambda: cached_vs_on_the_fly(training, make_data, Path(folder) / "latents"),
             **{comparison.name: partial(_same, comparison) for comparison in drawn},
             "compiled_vs_eager": lambda: compiled_vs_eager(generator, batch, precision, compile_limit),
+            "drawn_compiled_vs_eager": lambda: drawn_compiled_vs_eager(generator, samples, steps, compile_limit),
         }
-        rows, not_measured = _measured_in_turn(prepared, repeats, chosen)
+        rows, not_measured = _measured_in_turn(chosen_of(prepared, only), repeats, chosen)
     workload = {"device": chosen.type, "precision": precision, "image_size": data["image_size"], "batch": batch}
     results = {"machine": machine(), "workload": workload, "rows": rows, "not_measured": not_measured}
-    (out / "diffusion.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_json(out / "diffusion.json", results)
     show(results)
 
 
@@ -111,6 +108,20 @@ def chosen_device(device: str) -> torch.device:
     if device == "cuda" and not there:
         raise CompleteSplatError("device=cuda: there is no GPU here; device=auto takes what there is")
     return torch.device("cuda" if there and device != "cpu" else "cpu")
+
+
+def chosen_of(
+    prepared: Mapping[str, Callable[[], Comparison]], only: Sequence[str] | None
+) -> Mapping[str, Callable[[], Comparison]]:
+    """Those of these names, or all.
+
+    Raises:
+        CompleteSplatError: a name that is none of theirs.
+    """
+    for name in only or ():
+        if name not in prepared:
+            raise CompleteSplatError(f"only={name}: choose from {', '.join(prepared)}")
+    return {name: prepare for name, prepare in prepared.items() if only is None or name in only}
 
 
 def _measured_in_turn(
@@ -311,8 +322,6 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
     Raises:
         NotMeasured: it takes longer or fails, for want of a C++ compiler, say.
     """
-    if not limit:
-        raise NotMeasured("compile_limit=0")
     denoiser, device = model.denoiser, model.latent_std.device
     with torch.no_grad():
         conditioning = model.conditioning(torch.rand(batch, 3, model.image_size, model.image_size, device=device))
@@ -326,15 +335,7 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
         denoiser.zero_grad()
 
     denoiser.train()
-    try:
-        with at_most(limit), warnings.catch_warnings(action="ignore"):  # of code that torch will not see into
-            compiled = torch.compile(denoiser)
-            work(compiled)
-    except Exception as error:
-        first = (str(error).strip().splitlines() or [""])[0]
-        raise NotMeasured(f"torch.compile failed: {type(error).__name__}: {first}") from error
-    except _TimeIsUp:
-        raise NotMeasured(f"torch.compile took longer than compile_limit={limit:g} s") from None
+    compiled = compiled_within(limit, denoiser, work)
     return Comparison(
         "compiled_vs_eager",
         ("denoiser compiled, both passes", lambda: work(compiled)),
@@ -342,27 +343,24 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
     )
 
 
-class _TimeIsUp(BaseException):
-    """No Exception, because what is interrupted may handle those."""
+def drawn_compiled_vs_eager(model: CompleteSplat, samples: int, steps: int, limit: float) -> Comparison:
+    """Samples of a picture in a batch; compiles the denoiser now, on a GPU into CUDA graphs (`compiled_vs_eager`)."""
+    denoiser, graphs = model.eval().denoiser, model.latent_std.device.type == "cuda"
 
+    def work(network: nn.Module) -> None:
+        model.denoiser = network
+        try:
+            _draw(model, model.sampler, 1, steps=steps, samples=samples)
+        finally:
+            model.denoiser = denoiser
 
-@contextmanager
-def at_most(seconds: float) -> Iterator[None]:
-    """Interrupt what takes longer, where the system and the thread allow it."""
-    if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_: object) -> None:
-        raise _TimeIsUp
-
-    before = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
+    compiled = compiled_within(limit, denoiser, work, **({"mode": "reduce-overhead"} if graphs else {}))
+    way = "CUDA graphs" if graphs else "denoiser compiled"
+    return Comparison(
+        "drawn_compiled_vs_eager",
+        (f"{samples} samples, {way}", lambda: work(compiled)),
+        ("as it is", lambda: work(denoiser)),
+    )
 
 
 COMPARED: list[Column] = [

@@ -1,6 +1,5 @@
 """`completesplat bench clips`: what opening and reading a packed store costs a clip, for few and for many of them."""
 
-import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,6 +12,7 @@ from rich.console import Console
 from completesplat.benchmarks.data_loading import repeated
 from completesplat.benchmarks.printing import print_results
 from completesplat.benchmarks.reading import opening_figures
+from completesplat.commands.protocol import write_json
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.schema import Filled, Positive, Range
@@ -56,7 +56,7 @@ def run(
     finally:
         shutil.rmtree(folder)
     results: dict[str, Any] = {"machine": machine(), "not_measured": {}, "rows": found}
-    (out / "clips.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_json(out / "clips.json", results)
     hardware = f"{results['machine']['processor']}, {results['machine']['cores']} cores"
     print_results(results, hardware, [table("A packed store of many tiny clips", COLUMNS, found)])
 

@@ -1,7 +1,6 @@
 """`completesplat bench paper`: the durations that the paper gives for an A100, beside ours."""
 
 import gc
-import json
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 from completesplat.benchmarks.diffusion import WARM_UP, Training, autocast, milliseconds
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands import quieten
+from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -136,7 +136,7 @@ def run(
     work = {"image_size": data["image_size"], "batch": data["batch_size"], "samples": samples, "steps": steps}
     found = _beside_the_papers(found) if is_as_in_the_paper(work, channels) else found
     results = {"machine": machine(), "workload": {"device": device, **work, "repeats": repeats}, "rows": found}
-    (out / "paper.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_json(out / "paper.json", results)
     show(results)
 
 

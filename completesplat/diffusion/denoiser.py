@@ -4,6 +4,8 @@ from typing import Any, TypedDict, Unpack
 
 import torch
 from diffusers import UNet2DConditionModel, UNet2DModel
+from diffusers.models.attention import BasicTransformerBlock
+from diffusers.models.attention_processor import AttnProcessor2_0
 from jaxtyping import Int
 from torch import Tensor, nn
 
@@ -71,6 +73,21 @@ class ConditionalUNet(nn.Module):
         return {}
 
 
+class AttentionToNothing(AttnProcessor2_0):
+    """Cross-attention with the one token of zeros: the same values, without queries and keys where nothing is trained.
+
+    In training every weight has its part in the loss, with a gradient of zero, which DDP waits for.
+    """
+
+    def __call__(self, attn: Any, hidden_states: Tensor, *inputs: Any, **settings: Any) -> Tensor:
+        """See diffusers' `AttnProcessor2_0`: [batch, place, channel] to the same."""
+        if torch.is_grad_enabled():
+            attended: Tensor = super().__call__(attn, hidden_states, *inputs, **settings)
+            return attended
+        constant: Tensor = attn.to_out[0](hidden_states.new_zeros(1, 1, attn.inner_dim))
+        return constant.expand_as(hidden_states)
+
+
 class TextlessStableDiffusion(ConditionalUNet):
     """Stable Diffusion 1's UNet, cross-attention included: 859.5 M parameters with 8 input channels.
 
@@ -95,6 +112,10 @@ class TextlessStableDiffusion(ConditionalUNet):
     def __init__(self, heads: Width = 8, context_channels: Width = 768, **sizes: Unpack[Sizes]) -> None:
         attention = {"attention_head_dim": heads, "cross_attention_dim": context_channels}
         super().__init__(UNet2DConditionModel, "CrossAttn", attention, **sizes)
+        for module in self.network.modules():
+            if isinstance(module, BasicTransformerBlock):
+                crossing: Any = module.attn2
+                crossing.set_processor(AttentionToNothing())  # type: ignore[no-untyped-call]
         self.register_buffer("context", torch.zeros(1, 1, context_channels), persistent=False)
 
     def context_of(self, batch: int) -> dict[str, Tensor]:

@@ -66,6 +66,18 @@ def test_skips_start_at_zero_and_their_weight_acts_per_sample(images, levels):
 
 
 @torch.no_grad()
+def test_features_of_the_first_levels_are_those_of_a_whole_pass(images):
+    model = build(skip_levels=(0, 2)).eval()
+    _, features = model.encoder(images)
+    for levels in range(len(features) + 1):
+        first = model.encoder.features(images, levels)
+        assert len(first) == levels
+        assert all(map(torch.equal, first, features))
+    assert model.reconstructor.feature_levels == 3
+    assert build(skip_levels=()).reconstructor.feature_levels == 0
+
+
+@torch.no_grad()
 def test_evaluation_draws_nothing_and_training_samples_the_posterior(images):
     model = trained_skips((0,))
     assert torch.equal(model(images).splatter_image.raw, model(images).splatter_image.raw)

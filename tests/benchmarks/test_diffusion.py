@@ -19,10 +19,13 @@ from completesplat.benchmarks.diffusion import (
     Training,
     batches,
     cached_vs_on_the_fly,
+    chosen_of,
     comparisons,
     compiled_vs_eager,
+    drawn_compiled_vs_eager,
     measured,
 )
+from completesplat.errors import CompleteSplatError
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
 
@@ -49,6 +52,7 @@ class Wrapped(nn.Module):
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
+        self.latent_channels = network.latent_channels
         self.calls = 0
 
     def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
@@ -58,7 +62,7 @@ class Wrapped(nn.Module):
 
 def test_both_ways_pass_the_same_through_the_denoiser_forward_and_backward(monkeypatch):
     model, wrapped, seen, gradients = tiny_generator(), [], [], []
-    monkeypatch.setattr(torch, "compile", lambda network: wrapped.append(Wrapped(network)) or wrapped[0])
+    monkeypatch.setattr(torch, "compile", lambda network, **_: wrapped.append(Wrapped(network)) or wrapped[0])
     comparison = compiled_vs_eager(model, 3, "32-true", 60)
     assert wrapped[0].calls == 1  # which compiles
     model.denoiser.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
@@ -70,6 +74,38 @@ def test_both_ways_pass_the_same_through_the_denoiser_forward_and_backward(monke
         assert torch.equal(one, other)
     torch.testing.assert_close(*gradients)
     assert gradients[0].any()
+
+
+def test_both_ways_draw_the_same_and_the_model_keeps_its_denoiser(monkeypatch):
+    model, wrapped, seen, asked = tiny_generator(), [], [], []
+
+    def compile(network: nn.Module, **settings: object) -> nn.Module:
+        asked.append(settings)
+        wrapped.append(Wrapped(network))
+        return wrapped[0]
+
+    monkeypatch.setattr(torch, "compile", compile)
+    denoiser = model.denoiser
+    comparison = drawn_compiled_vs_eager(model, 3, 2, 60)
+    assert asked == [{}]  # CUDA graphs are a GPU's
+    assert wrapped[0].calls == 2  # which compiles
+    assert model.denoiser is denoiser
+    reconstructor = model.autoreconstructor.reconstructor
+    reconstructor.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    for _, work in (comparison.a, comparison.b):
+        work()
+        assert wrapped[0].calls == 4
+        assert model.denoiser is denoiser
+    assert len(seen[0]) == 3
+    assert torch.equal(*seen)
+
+
+def test_only_some_are_measured_and_an_unknown_one_is_refused():
+    prepared = {"x": lambda: Comparison("x", ("", list), ("", list)), "y": lambda: pytest.fail("not asked for")}
+    assert list(chosen_of(prepared, ["x"])) == ["x"]
+    assert list(chosen_of(prepared, None)) == ["x", "y"]
+    with pytest.raises(CompleteSplatError, match=r"^only=z: choose from x, y$"):
+        chosen_of(prepared, ["z"])
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
@@ -103,7 +139,8 @@ def compared() -> tuple[CompleteSplat, dict[str, Comparison]]:
 
 def drawn(model: CompleteSplat, work: Callable[[], object]) -> tuple[list[int], ...]:
     """Batch sizes of the calls of the encoder, the denoiser and the reconstructor."""
-    networks = model.autoreconstructor.encoder, model.denoiser, model.autoreconstructor.reconstructor
+    frozen = model.autoreconstructor
+    networks = frozen.encoder.network.conv_in, model.denoiser, frozen.reconstructor
     seen: tuple[list[int], ...] = [], [], []
     hooks = [
         network.register_forward_pre_hook(lambda _, inputs, sizes=sizes: sizes.append(len(inputs[0])))
@@ -118,7 +155,6 @@ def drawn(model: CompleteSplat, work: Callable[[], object]) -> tuple[list[int], 
 @pytest.mark.parametrize(
     ("name", "a", "b"),
     [
-        # By turns: a sample is denoised and reconstructed before the next.
         ("batch_vs_one_by_one_k4", ([1], [4] * 2, [4]), ([1], [1] * 2 * 4, [1] * 4)),
         ("unguided_vs_guided", ([3], [3] * 2, [3]), ([3], [6] * 2, [3])),
         ("few_steps_vs_50", ([3], [3] * 3, [3]), ([3], [3] * 50, [3])),
@@ -211,7 +247,7 @@ def test_what_can_be_measured_is_written_and_shown(command, tmp_path, monkeypatc
     results = strict_json(out / "diffusion.json")
     assert set(results) == {"machine", "workload", "rows", "not_measured"}
     reason = "torch.compile failed: RuntimeError: no C++ compiler"
-    assert results["not_measured"] == {"compiled_vs_eager": reason}
+    assert results["not_measured"] == dict.fromkeys(["compiled_vs_eager", "drawn_compiled_vs_eager"], reason)
     assert results["workload"] == {"device": "cpu", "precision": "32-true", "image_size": 32, "batch": 2}
     names = ["cached_vs_on_the_fly", "batch_vs_one_by_one_k3", "unguided_vs_guided", "few_steps_vs_50"]
     assert [row["name"] for row in results["rows"]] == names

@@ -66,6 +66,22 @@ def test_cross_attention_without_text_adds_a_constant():
     assert all(torch.equal(output, bias.expand_as(output)) for output, bias in added)
 
 
+def test_cross_attention_asks_nothing_where_nothing_is_trained_and_gives_the_same():
+    denoiser, asked = tiny(TextlessStableDiffusion), []
+    crossing = [module for name, module in denoiser.network.named_modules() if name.endswith("attn2")]
+    for module in crossing:
+        torch.nn.init.normal_(module.to_out[0].bias)
+        module.to_q.register_forward_hook(lambda *_: asked.append(1))
+    trained = denoiser(*inputs())
+    assert len(asked) == len(crossing)  # DDP waits for a gradient of every weight
+    trained.sum().backward()
+    assert all(parameter.grad is not None for parameter in denoiser.parameters())
+    with torch.no_grad():
+        drawn = denoiser(*inputs())
+    assert len(asked) == len(crossing)
+    assert torch.equal(drawn, trained)
+
+
 def test_stable_diffusions_size_is_the_published_one():
     with torch.device("meta"):
         denoiser, without_text = TextlessStableDiffusion(), Denoiser()
