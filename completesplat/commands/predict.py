@@ -17,8 +17,8 @@ from rich.markup import escape
 from rich.progress import Progress
 from torch import Tensor
 
+from completesplat.commands.settings import REMOVE
 from completesplat.commands.trained import open_generator
-from completesplat.data.importing.transforms_json import read_photographs
 from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
@@ -36,7 +36,6 @@ FAR = 1.5
 """Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
 UNLIKE = 2.0
 """Distance from the training pictures (`SceneModel.distance`) from which a warning is given."""
-REMOVE = "remove"
 
 log = logging.getLogger(__name__)
 
@@ -170,6 +169,8 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
         CompleteSplatError: one picture alone, something hidden, or a field of view beside that of the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
+    from completesplat.data.importing.transforms_json import read_photographs
+
     if len(pictures) < 2:
         raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")
     beside = [name for name in ("mask", "box", "fov") if config[name] is not None]

@@ -7,7 +7,8 @@ from pathlib import Path
 from signal import SIGINT
 from typing import Any
 
-from completesplat.commands.jobs import at_work
+from completesplat.commands.jobs import at_work, importing
+from completesplat.commands.settings import REMOVE, check_parts
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.names import printable
 from completesplat.signals import Interrupted
@@ -18,21 +19,33 @@ KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
 PAUSE = 2.0  # seconds after which a run is looked at again
 SCENE_FILES = ("sample_*.ply", "scene.ply")
+LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
 
 
 def run(config: Any, out: Path) -> None:
-    """Open the page and stay until Ctrl-C; with `export`, write it as a file instead."""
+    """Open the page, fill it and stay until Ctrl-C; with `export`, write it as a file instead.
+
+    The page comes first, and says that it is loading: torch alone takes a second to import, the model longer.
+    """
     try:
         import viser  # noqa: F401
     except ImportError as error:
         raise CompleteSplatError('the viewer needs viser: pip install "completesplat[view]"') from error
 
+    from completesplat.viewer.access import start_server, stop_server
+
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
-    page = make_page(config, out)
+    background = {} if config.background == REMOVE else {"background": config.background}
+    server = start_server(0 if config.export is not None else config.port, **background)
+    page = None
     try:
+        if config.export is None:
+            print(f"{server.address} (Ctrl-C ends it)", flush=True)
+        loading = server.gui.add_markdown(LOADING)
+        page = make_page(server, config, out)
+        loading.remove()
         if config.export is not None:
             return export(page, Path(config.export))
-        print(f"{page.server.address} (Ctrl-C ends it)", flush=True)
         while True:
             time.sleep(PAUSE)
             if config.watch is not None:
@@ -41,7 +54,7 @@ def run(config: Any, out: Path) -> None:
         if stop.signal != SIGINT:
             raise
     finally:
-        page.close()
+        stop_server(server) if page is None else page.close()
 
 
 def settings_of(path: Path) -> dict[str, str]:
@@ -71,20 +84,21 @@ def settings_of(path: Path) -> dict[str, str]:
     )
 
 
-def make_page(config: Any, out: Path) -> Any:
-    """The page with what the settings name, on a port of its own."""
-    import torch
-    from hydra.utils import instantiate
+def make_page(server: Any, config: Any, out: Path) -> Any:
+    """Fill the page of a server with what the settings name."""
+    with importing():
+        import torch
+        from hydra.utils import instantiate
 
-    from completesplat.commands.predict import REMOVE
-    from completesplat.commands.trained import open_generator
-    from completesplat.export.prediction import Wanted
-    from completesplat.viewer.completion import Completion
-    from completesplat.viewer.page import Page, Saver, start_server, stop_server
-    from completesplat.viewer.panel import SLIDERS
-    from completesplat.viewer.sample import read_scene
-    from completesplat.viewer.stage import Stage
+        from completesplat.commands.trained import open_generator
+        from completesplat.export.prediction import Wanted
+        from completesplat.viewer.completion import Completion
+        from completesplat.viewer.page import Page, Saver
+        from completesplat.viewer.panel import SLIDERS
+        from completesplat.viewer.sample import read_scene
+        from completesplat.viewer.stage import Stage
 
+        check_parts(config)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = None
     if config.watch is not None:
@@ -100,27 +114,22 @@ def make_page(config: Any, out: Path) -> Any:
     if model is not None and config.image is not None:
         photograph = model.read(Path(config.image), config.fov, remove)
     cameras = None if config.get("data") is None else data_cameras(config.data)
-    server = start_server(0 if config.export is not None else config.port, background)
-    try:
-        stage = Stage(server, up, cameras)
-        stage.show(samples)
-        rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
-        saver = Saver(out, stage, rasterizer, config.frames, background)
-        if model is None:
-            page = Page(server, stage, saver, max(sample.layers for sample in samples))
-            page.show(samples, step_of(samples) if config.watch is not None else "")
-            return page
-        page = Page(server, stage, saver, model.parameterization.layers)
-        own_steps = model.sampler.steps if model.draws_samples else 1
-        steps = own_steps if config.steps is None else config.steps
-        start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
-        completion = Completion(page, model, start)
-        if photograph is not None:
-            completion.load(printable(Path(config.image).name), photograph)
+    stage = Stage(server, up, cameras)
+    stage.show(samples)
+    rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
+    saver = Saver(out, stage, rasterizer, config.frames, background)
+    if model is None:
+        page = Page(server, stage, saver, max(sample.layers for sample in samples))
+        page.show(samples, step_of(samples) if config.watch is not None else "")
         return page
-    except BaseException:
-        stop_server(server)
-        raise
+    page = Page(server, stage, saver, model.parameterization.layers)
+    own_steps = model.sampler.steps if model.draws_samples else 1
+    steps = own_steps if config.steps is None else config.steps
+    start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
+    completion = Completion(page, model, start)
+    if photograph is not None:
+        completion.load(printable(Path(config.image).name), photograph)
+    return page
 
 
 def newest_scenes(run: Path) -> tuple[list[Any], tuple[float, ...]]:

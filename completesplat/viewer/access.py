@@ -1,8 +1,12 @@
 """Who may use the page: browsers on this machine that know its token; and how much of theirs is taken in at once.
 
 viser answers everyone who reaches its port. A web page of any site, opened on the same machine, reaches it as well.
+Nothing here needs torch, so that the page is there before what fills it is imported.
 """
 
+import contextlib
+import io
+import logging
 import secrets
 import threading
 from collections.abc import Callable
@@ -11,6 +15,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import parse_qs
 
+import numpy as np
 import viser
 from viser._messages import FileTransferPart, FileTransferPartAck, FileTransferStartUpload
 from viser.infra import ClientId
@@ -130,6 +135,24 @@ class GuardedServer(viser.ViserServer):
         if upload is not None and upload["transferred_bytes"] + len(message.content) > upload["total_bytes"]:
             del uploads[message.transfer_uuid]  # more than it announced
         self.gui._handle_file_transfer_part(client_id, message)
+
+
+def start_server(port: int, background: float = 0.5) -> GuardedServer:
+    """Listen on the port or, if it is taken, on the next free one (0 takes any), before a grey background."""
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = GuardedServer(port)
+    server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
+    server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would lead through the internet
+    server.gui.set_panel_label("completesplat")
+    server.gui.main_panel.dock_right()
+    return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """End it, and with it what browsers show."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
 
 
 def cookie_name(port: int) -> str:

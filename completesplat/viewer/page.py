@@ -1,7 +1,5 @@
-"""The page: its server, what its controls of looking do, and the files that it saves."""
+"""The page: what its controls of looking do, and the files that it saves."""
 
-import contextlib
-import io
 import logging
 import threading
 from collections.abc import Callable, Sequence
@@ -9,7 +7,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import viser
 
@@ -21,7 +18,7 @@ from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.access import GuardedServer
+from completesplat.viewer.access import GuardedServer, stop_server
 from completesplat.viewer.head import with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Picture, add_looking, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample
@@ -84,18 +81,6 @@ class Worker:
                     self._failed(error)
                 except Exception:
                     log.exception("the viewer could not say what failed")
-
-
-def start_server(port: int, background: float = 0.5) -> GuardedServer:
-    """Listen on the port or, if it is taken, on the next free one (0 takes any), before a grey background."""
-    logging.getLogger("websockets").setLevel(logging.WARNING)
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = GuardedServer(port)
-    server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
-    server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would lead through the internet
-    server.gui.set_panel_label("completesplat")
-    server.gui.main_panel.dock_right()
-    return server
 
 
 class Saver:
@@ -245,12 +230,6 @@ class Page:
             self.status.content = f"saved {', '.join(file.name for file in files)} in {self.saver.folder}"
 
         self.worker.submit(kind, save)
-
-
-def stop_server(server: viser.ViserServer) -> None:
-    """End it, and with it what browsers show."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
 
 
 def write_page(server: viser.ViserServer, path: Path) -> Path:

@@ -50,7 +50,8 @@ def completed(
 
 def write_offline(path: Path, sample: Sample, up: Sequence[float]) -> None:
     """One sample as the viewer's offline page, by a server of its own: one that goes on keeps what it has shown."""
-    from completesplat.viewer.page import start_server, stop_server, write_page
+    from completesplat.viewer.access import start_server, stop_server
+    from completesplat.viewer.page import write_page
     from completesplat.viewer.stage import Stage
 
     server = start_server(0)

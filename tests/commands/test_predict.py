@@ -1,4 +1,6 @@
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -15,6 +17,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.schema import check_settings
 
 FEW = ["samples=2", "frames=4", "steps=2"]
+UNNEEDED = ["kornia", "lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]
+UNNEEDED += [f"completesplat.{part}" for part in ("data.importing", "data.loading", "metrics", "studies", "training")]
 
 
 @pytest.fixture
@@ -53,6 +57,18 @@ def test_every_file_is_there_and_opens(predict):
     settings = scene["settings"]
     assert (scene["seed"], settings["gaussians"]) == (0, [2048, 2048])
     assert (settings["sampler"], settings["steps"]) == ("DDIMScheduler", 2)  # those that the weights were saved with
+
+
+def test_a_prediction_imports_only_what_it_needs_and_the_garbage_collector_leaves_that_alone(pipeline, tmp_path):
+    """In a process of its own."""
+    given = [str(pipeline.photograph()), f"weights={pipeline.weights}", "samples=1", "video=[]"]
+    program = f"import gc, sys; sys.argv = {['completesplat', 'predict', *given, f'out={tmp_path}']}\n"
+    program += "from completesplat.cli import main; main()\n"
+    program += f"print([name for name in {UNNEEDED} if name in sys.modules], gc.isenabled(), gc.get_freeze_count())"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    unneeded, enabled, frozen = done.stdout.splitlines()[-1].rsplit(" ", 2)
+    assert (unneeded, enabled) == ("[]", "True")
+    assert int(frozen) > 100_000
 
 
 def test_maps_another_sampler_and_a_field_of_view_can_be_asked_for(predict):

@@ -1,23 +1,30 @@
 import os
 import re
+import subprocess
 import sys
 from types import SimpleNamespace
+from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import ProxyHandler, build_opener
 
 import pytest
 import torch
 from scenes_for_training import scene_batch
 from support import compose_config
 from viewer_scenes import balls
+from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
 from completesplat.commands.settings import View
-from completesplat.commands.view import data_cameras, newest_scenes, settings_of, show_newest
+from completesplat.commands.view import LOADING, data_cameras, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.scene_model import SceneModel
 from completesplat.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
 from completesplat.viewer.sample import UP
+
+SECONDS = 60
 
 
 def folder(path, *names: str):
@@ -125,6 +132,33 @@ def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path)
     finished = command("view", f"out={tmp_path}")
     assert finished.status == 2
     assert finished.err == 'error: the viewer needs viser: pip install "completesplat[view]"\n'
+
+
+def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
+    """In a process of its own, in which torch is a module that never comes to an end."""
+    viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from viser.infra import _infra
+    from websockets.sync.client import connect
+
+    (tmp_path / "torch.py").write_text("print('torch', flush=True)\ninput()\n")
+    program = [sys.executable, "-m", "completesplat", "view", f"out={tmp_path / 'out'}"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(program, env=environment, text=True, **pipes) as process:
+        try:
+            address = process.stdout.readline().split(" ")[0]
+            assert address.startswith("http:")
+            assert process.stdout.readline() == "torch\n"
+            assert build_opener(ProxyHandler({})).open(address, timeout=SECONDS).status == 200
+            place, protocol = urlsplit(address), f"viser-v{viser.__version__}"
+            socket = connect(
+                address.replace("http:", "ws:"), origin=f"http://{place.netloc}", subprotocols=[protocol], proxy=None
+            )
+            with socket:
+                page = socket.recv(timeout=SECONDS)  # behind its size, before and after compression
+            assert LOADING.encode() in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
+        finally:
+            process.kill()
 
 
 def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, pipeline, tmp_path):

@@ -20,8 +20,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from completesplat.errors import CompleteSplatError  # noqa: E402
 from completesplat.viewer import access  # noqa: E402
-from completesplat.viewer.access import MOST_FRAME, cookie_name, told  # noqa: E402
-from completesplat.viewer.page import start_server  # noqa: E402
+from completesplat.viewer.access import MOST_FRAME, cookie_name, start_server, told  # noqa: E402
 
 SECONDS = 30
 MIB = 2**20

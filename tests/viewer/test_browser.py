@@ -22,8 +22,9 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
+from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import Page, Saver, start_server, write_page  # noqa: E402
+from completesplat.viewer.page import Page, Saver, write_page  # noqa: E402
 from completesplat.viewer.stage import Stage  # noqa: E402
 
 CHROMIUM = shutil.which("chromium")

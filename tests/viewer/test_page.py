@@ -23,8 +23,9 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
 from completesplat.viewer import page as page_module  # noqa: E402
+from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
-from completesplat.viewer.page import Page, Saver, start_server  # noqa: E402
+from completesplat.viewer.page import Page, Saver  # noqa: E402
 from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
 from completesplat.viewer.stage import Stage  # noqa: E402
 

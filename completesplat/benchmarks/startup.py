@@ -1,0 +1,180 @@
+"""`completesplat bench startup`: what the first scene costs from a cold start, and which imports it waits for."""
+
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from PIL import Image
+from rich.console import Console
+
+from completesplat.benchmarks.printing import print_results
+from completesplat.commands.protocol import git_commit, write_json
+from completesplat.errors import CompleteSplatError
+from completesplat.results.machine import machine
+from completesplat.results.tables import Column, table
+from completesplat.schema import Positive
+
+TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
+OTHER = ", other version"
+# What no prediction does without: diffusers' networks and scheduler, with what diffusers imports of its own accord.
+NEEDED = "import torch and the networks of diffusers"
+NETWORKS = "import gc; gc.disable(); import torch; from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel; "
+NETWORKS += "from diffusers.models.autoencoders import vae"
+PACKAGE = "completesplat"
+# What remains where everything is imported, and the kernels are there: settings, weights, a sample, files.
+TWICE = """
+import json, sys, time
+from completesplat.cli import main
+arguments = list(sys.argv)
+main()
+sys.argv, start = arguments, (time.process_time(), time.perf_counter())
+main()
+print(json.dumps([time.process_time() - start[0], time.perf_counter() - start[1]]))
+"""
+# The working folder may hold another version of the package.
+SETTINGS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
+IMPORTED = re.compile(r"import time: +(\d+) \| +\d+ \| ( *)(\S+)")
+PROCESSES: list[Column] = [("", "what", ""), ("processor\ns", "cpu_seconds", ".2f"), ("wall\ns", "wall_seconds", ".2f")]
+PROCESSES += [("times\nimport torch", "times_torch", ".1f")]
+IMPORTS: list[Column] = [("package", "package", ""), ("its own\nms", "own_ms", ",.0f")]
+IMPORTS += [("with what it\nimports, ms", "ms", ",.0f")]
+
+
+class Seconds(NamedTuple):
+    """Of a process and those that it starts: the processor's, and the clock's."""
+
+    cpu: float
+    wall: float
+
+
+class ImportedModule(NamedTuple):
+    """One that a process imported: the seconds of its own, and the packages that it was imported within."""
+
+    name: str
+    seconds: float
+    within: frozenset[str]
+
+
+def run(weights: str, repeats: Positive, packages: Positive, against: str | None, out: Path) -> None:
+    """Time whole processes in turn, list what is imported; write `startup.json`, print both tables.
+
+    Args:
+        weights: one sample is drawn with them, without a video.
+        repeats: timed processes of each kind, after one that is not timed; the median counts.
+        packages: that are listed, the most costly first.
+        against: a folder with another version of the package, which is measured in turn.
+
+    `CompleteSplatError`: there is none in `against`, or a process fails.
+    """
+    if against is not None and not (Path(against) / PACKAGE / "cli.py").is_file():
+        raise CompleteSplatError(f"against={against}: no {PACKAGE}/ here, of another version")
+    with TemporaryDirectory(prefix="bench_startup_") as folder:
+        picture = Path(folder) / "picture.png"
+        Image.new("RGB", (64, 64), "grey").save(picture)  # what it shows does not change the work
+        shared = [f"weights={weights}", f"out={folder}/out"]
+        programs = {PREDICT: ["predict", str(picture), "samples=1", "video=[]", *shared], VIEW: ["view", *shared]}
+        if find_spec("viser") is None:
+            del programs[VIEW]
+        found = timed(programs, repeats, None if against is None else Path(against).resolve())
+        ours = imported_by(["-m", PACKAGE, *programs[PREDICT]])
+        torchs = imported_by(["-c", "import torch"])
+    rows: list[dict[str, Any]] = [
+        {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / found[TORCH].cpu}
+        for name, x in found.items()
+    ]
+    beyond = costs(ours, {module.name for module in torchs})[:packages]
+    results: dict[str, Any] = {"machine": machine(), "commit": git_commit(), "rows": rows, "imports": beyond}
+    write_json(out / "startup.json", results)
+    tables = [table("One sample, without a video, from a cold start", PROCESSES, rows)]
+    tables += [table("Imports beyond those of torch, in one process", IMPORTS, beyond)]
+    print_results(results, results["machine"]["processor"], tables)
+    starting = (found[PREDICT].cpu - found[AGAIN].cpu) / found[TORCH].cpu
+    print(f"predict without what it takes once more: {starting:.1f} times import torch, by the processor's time")
+
+
+def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | None) -> dict[str, Seconds]:
+    """Medians by the name of what was timed; of processes that are started in turn, each with one thread.
+
+    Args:
+        programs: the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
+        against: another version's folder, or None.
+    """
+    kinds: dict[str, tuple[list[str], Path | None]] = {TORCH: (["-c", "import torch"], None)}
+    kinds[NEEDED] = ["-c", NETWORKS], None
+    for name, arguments in programs.items():
+        if against is not None:
+            kinds[name + OTHER] = ["-m", PACKAGE, *arguments], against
+        kinds[name] = ["-m", PACKAGE, *arguments], None
+    kinds[AGAIN] = ["-c", TWICE, *programs[PREDICT]], None
+    taken: dict[str, list[Seconds]] = {name: [] for name in kinds}
+    with Console(stderr=True).status("") as status:
+        for number in range(repeats + 1):
+            for name, (arguments, package) in kinds.items():
+                status.update(f"{name}: {number} of {repeats}")
+                before, start = os.times(), time.perf_counter()
+                printed = _run(arguments, package, first_line=name.startswith(VIEW)).stdout
+                after, wall = os.times(), time.perf_counter() - start
+                cpu = after.children_user - before.children_user + after.children_system - before.children_system
+                seconds = Seconds(cpu, wall) if name != AGAIN else Seconds(*json.loads(printed.splitlines()[-1]))
+                taken[name] += [seconds] if number else []  # the first one brings files into memory
+    return {name: Seconds(*map(statistics.median, zip(*taken[name], strict=True))) for name in kinds}
+
+
+def imported_by(arguments: Sequence[str]) -> list[ImportedModule]:
+    """What a process of Python imports (`-X importtime`, which lists a module behind those that it imports)."""
+    found: list[ImportedModule] = []
+    above: list[str] = []
+    for line in reversed(_run(["-X", "importtime", *arguments], None).stderr.splitlines()):
+        if (match := IMPORTED.match(line)) is None:
+            continue
+        depth, name = len(match[2]) // 2, match[3]
+        above[depth:] = [name.partition(".")[0]]
+        found.append(ImportedModule(name, int(match[1]) / 1e6, frozenset(above)))
+    return found
+
+
+def costs(modules: Sequence[ImportedModule], known: set[str]) -> list[dict[str, Any]]:
+    """For each package what its modules cost, and all that is imported within it; without modules that are known.
+
+    The package of this project, within which all is imported, has its own modules alone.
+    """
+    own: dict[str, float] = defaultdict(float)
+    total: dict[str, float] = defaultdict(float)
+    for module in modules:
+        if module.name not in known:
+            package = module.name.partition(".")[0]
+            own[package] += 1000 * module.seconds
+            for one in module.within - ({PACKAGE} - {package}):
+                total[one] += 1000 * module.seconds
+    most_first = sorted(total, key=lambda name: -total[name])
+    return [{"package": name, "own_ms": own[name], "ms": total[name]} for name in most_first]
+
+
+def _run(arguments: Sequence[str], package: Path | None, first_line: bool = False) -> subprocess.CompletedProcess[str]:
+    """Run Python with the package of this process, or with that of a folder, to its end or to its first line.
+
+    `CompleteSplatError`: it fails.
+    """
+    folder = Path(__file__).parents[2] if package is None else package
+    environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(folder)}
+    pipe = subprocess.PIPE
+    program = [sys.executable, *arguments]
+    with subprocess.Popen(program, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
+        begun = process.stdout.readline() if first_line and process.stdout is not None else ""
+        if begun:
+            process.kill()
+        printed, said = process.communicate()
+    if process.returncode and not begun:
+        last = (said.strip().splitlines() or ["it says nothing"])[-1]
+        raise CompleteSplatError(f"a process that was timed has failed: {last}")
+    return subprocess.CompletedProcess(program, 0, begun + printed, said)
