@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and what is said where the disk is full or a folder is gone."""
+"""Files and folders that appear whole or not at all, and what is said where the disk is full or a folder is gone."""
 
 import errno
 import os
@@ -32,20 +32,31 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
     path = Path(path)
     temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
-        yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except CompleteSplatError:
-        raise
-    except Exception as error:
-        size = max(size, temporary.stat().st_size if temporary.is_file() else 0)
-        cause = error if isinstance(error, OSError) and error.errno is not None else _refusal_of_disk(temporary)
-        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
-            raise
-        raise refusal from error
+        with _asking_the_disk(path, temporary, size):
+            yield temporary
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """An empty folder beside `folder`, which is not there, that becomes it when the block ends without an exception.
+
+    After one nothing is left; nor is what a process left that was killed. `DiskError`: as `atomic_path`.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    try:
+        with _asking_the_disk(folder, unfinished):
+            unfinished.mkdir()
+            yield unfinished
+            unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 @contextmanager
@@ -76,10 +87,32 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(exist_ok=True)
 
 
-def _refusal_of_disk(path: Path) -> OSError | None:
-    """What the operating system says if more is written to a file, which is no longer needed."""
+def disk_refusal(error: BaseException) -> DiskError | None:
+    """What to show for an error of the operating system that names the file which it has no space for, or None."""
+    if not isinstance(error, OSError) or error.errno not in {*NO_SPACE, errno.EROFS}:
+        return None
+    name = error.filename2 or error.filename
+    return _disk_error(error, Path(name)) if isinstance(name, str) else None
+
+
+@contextmanager
+def _asking_the_disk(path: Path, temporary: Path, size: int = 0) -> Iterator[None]:
+    """`DiskError` where `temporary`, a file or folder that is to become `path`, cannot be written."""
     try:
-        with path.open("ab") as file:
+        yield
+    except CompleteSplatError:
+        raise
+    except Exception as error:
+        cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
+        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
+            raise
+        raise refusal from error
+
+
+def _asked(path: Path) -> OSError | None:
+    """What the operating system says if more is written to a file or folder, which is no longer needed."""
+    try:
+        with (path / "more" if path.is_dir() else path).open("ab") as file:
             file.write(bytes(PROBE_BYTES))
             file.flush()
             os.fsync(file.fileno())
@@ -88,16 +121,17 @@ def _refusal_of_disk(path: Path) -> OSError | None:
     return None
 
 
-def _disk_error(error: OSError, path: Path, size: int, temporary: Path | None = None) -> DiskError | None:
+def _disk_error(error: OSError, path: Path, size: int = 0, temporary: Path | None = None) -> DiskError | None:
     """The refusal to show; None for an error that is not of the disk. What `temporary` takes is going to be free."""
     from rich.filesize import decimal
 
     if not path.parent.is_dir():
         return DiskError(f"{path}: cannot be written, {path.parent} is not there any more")
     if error.errno in NO_SPACE:
+        files = [] if temporary is None else [temporary, *temporary.rglob("*")]
+        taken = [file.stat() for file in files if file.is_file()]
+        size = max(size, sum(file.st_size for file in taken))
         needed = f"{decimal(size)} or more are needed" if size else "more is needed"
-        free = shutil.disk_usage(path.parent).free
-        if temporary is not None and temporary.is_file():
-            free += temporary.stat().st_blocks * BLOCK_BYTES
+        free = shutil.disk_usage(path.parent).free + sum(file.st_blocks for file in taken) * BLOCK_BYTES
         return DiskError(f"{path}: {error.strerror}: {needed}, {decimal(free)} are free on this disk")
     return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in UNUSABLE else None

@@ -1,5 +1,7 @@
 """A disk that is full, or a folder that is gone: one line, what was there stays, and nothing half written."""
 
+import errno
+import os
 import re
 import resource
 import shutil
@@ -13,16 +15,23 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import SMALL, some_gaussians, tiny_generator
+from support import SMALL, some_gaussians, tiny_generator, write_capture
 
 from completesplat.atomic import make_folder, write_text
+from completesplat.commands import exit_status, refusal
+from completesplat.data.audit import Findings
+from completesplat.data.importing import import_capture
 from completesplat.data.latent_cache import ArrayWriter
+from completesplat.data.pictures.files import save_picture
+from completesplat.data.toy import write_objects, write_rooms
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
 from completesplat.export.pictures import write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.video import write_video
+from completesplat.studies import statistics
 from completesplat.tensors import concatenate
+from completesplat.training import sharding
 from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.loggers import MetricsFile
 from completesplat.training.reconstruction import ReconstructionModule
@@ -77,6 +86,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": checkpoint,
     "metrics.csv": rows,
     "metrics.json": lambda path: write_text(path, "figures " * 500),
+    "check.json": lambda path: Findings(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}).write(path),
     "sheet.png": picture,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),
@@ -129,6 +139,40 @@ def test_rows_of_latents_that_do_not_fit_are_refused_and_removed(tmp_path):
         with quota(most), pytest.raises(DiskError, match=f"{path.name}: {SAID}" if most > 200 else path.name):
             write()
         assert list(tmp_path.iterdir()) == []
+
+
+def capture(out: Path) -> Path:
+    source = out.parent / "capture"
+    if not source.exists():
+        write_capture(source, 6)
+    return import_capture(out, "desk", source / "transforms.json", progress=False)
+
+
+TINY = {"scenes": 2, "frames": 2, "size": 16, "seed": 0, "workers": 1, "progress": False}
+FOLDERS: dict[str, Callable[[Path], Path]] = {
+    "toy_objects": lambda out: write_objects(out, **TINY),
+    "toy_rooms": lambda out: write_rooms(out, **TINY),
+    "desk": capture,
+}
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_data_set_that_does_not_fit_is_refused_and_nothing_of_it_stays(tmp_path, name):
+    write, out = FOLDERS[name], tmp_path / "out"
+    folder = write(out)
+    largest = max(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    shutil.rmtree(folder)
+    for most in offsets(largest):
+        with quota(most), pytest.raises(DiskError, match=rf"^{re.escape(str(folder))}: {SAID}$"):
+            write(out)
+        assert list(out.iterdir()) == []
+    assert write(out).is_dir()
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_a_picture_that_does_not_fit_is_not_cut_short(tmp_path, suffix):
+    with quota(100), pytest.raises(OSError, match=rf"Errno {errno.EFBIG}"):
+        save_picture(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
 
 
 def test_weights_that_do_not_fit_are_refused_and_the_old_ones_stay(tmp_path):
@@ -221,6 +265,81 @@ def test_prepared_data_and_latents_that_do_not_fit(command, pipeline, packed_toy
         assert command(*given, f"out={out}").status == 0
 
 
+def test_toys_captures_and_statistics_that_do_not_fit(command, toy_root, tmp_path, monkeypatch):
+    write_capture(tmp_path / "capture", 6)
+    for path in (tmp_path / "capture").glob("*.png"):
+        picture(path)
+    monkeypatch.setattr(statistics, "statistics", lambda sources: {"of many splits": "1" * 6000})
+    toy = ["toy", "kind=objects", "scenes=2", "frames=2", "size=64", "workers=1"]
+    captured = ["import", f"transforms={tmp_path}/capture/transforms.json", "category=desk"]
+    stats = ["stats", "data=toy_objects", f"data.root={toy_root}"]
+    for given, name in ((toy, "toy_objects"), (captured, "desk"), (stats, "stats.json")):
+        out = tmp_path / given[0]
+        with quota(6000):
+            finished = command("data", *given, f"out={out}")
+        assert re.fullmatch(rf"error: {out}/{re.escape(name)}: {SAID}", line(finished))
+        assert finished.status == 1
+        assert not list(out.glob(f"*{name}*"))
+        if given != stats:
+            assert command("data", *given, f"out={out}").status == 0
+
+
+def test_a_part_of_ones_own_that_does_not_fit(command):
+    with quota(600):
+        finished = command("new", "loss", "mine")
+    assert re.fullmatch(rf"error: mine\.py: {SAID}", line(finished))
+    assert finished.status == 1
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
+def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number):
+    error = Exception("Error in call to target")
+    error.__cause__ = OSError(number, os.strerror(number), str(tmp_path / "new"))
+    said = refusal(error) or ""
+    assert said.startswith(f"{tmp_path}/new: ")
+    assert os.strerror(number) in said
+    assert exit_status(error) == 1
+    assert (re.search(rf"{AMOUNT} are free on this disk", said) is None) == (number == errno.EROFS)
+    # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
+    assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
+    assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None
+
+
+def test_shards_that_do_not_fit_leave_the_checkpoint_before(command, toy_root, tmp_path, monkeypatch):
+    step, run = ReconstructionModule.training_step, tmp_path / "run"
+    before: dict[Path, bytes] = {}
+
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in (run / "checkpoints").rglob("*") if path.is_file()}
+
+    def full(self, *inputs):
+        if self.global_step == 3:
+            before.update(files())
+            resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        return step(self, *inputs)
+
+    given = [*FIT, f"data.root={toy_root}", f"out={run}", "trainer=fsdp", "trainer.devices=1"]
+    with monkeypatch.context() as patch, quota(2**30):
+        patch.setattr(ReconstructionModule, "training_step", full)
+        finished = command("fit", *given)
+    last = run / "checkpoints/last.ckpt"
+    assert re.fullmatch(rf"error: {last}: {SAID}", line(finished))
+    assert finished.status == 1
+    assert len(before) == 2
+    assert files() == before | {last.with_name("previous.ckpt"): before[last]}
+    assert command("fit", *given, "ckpt_path=last").status == 0
+
+
+def test_shards_go_where_the_checkpoint_that_names_them_does_not_fit(tmp_path, monkeypatch):
+    strategy = sharding.FullyShardedStrategy(checkpoint_io=CheckpointFiles())
+    for name in ("barrier", "broadcast"):
+        monkeypatch.setattr(strategy, name, lambda value=None: value)
+    monkeypatch.setattr(sharding, "save", lambda *_, **__: None)
+    with quota(1000), pytest.raises(DiskError, match=rf"last\.ckpt: {SAID}"):
+        strategy.save_checkpoint({"state_dict": {"a": torch.ones(3000)}}, tmp_path / "last.ckpt")
+    assert list(tmp_path.iterdir()) == []
+
+
 FULL = """
 import gc, os, shutil, sys
 from pathlib import Path
@@ -248,14 +367,41 @@ print(refused)
 """
 
 
+FULL_OF_TOYS = """
+import os, re, shutil, sys
+from pathlib import Path
+from completesplat.data.toy import write_objects, write_rooms
+from completesplat.errors import DiskError
+
+disk, refused = Path(sys.argv[1]), 0
+said = "No space left on device: (.+ or more are|more is) needed, .+ are free on this disk"
+for write in (write_objects, write_rooms):
+    make = lambda: write(disk, scenes=2, frames=2, size=32, seed=0, workers=1, progress=False)
+    empty = shutil.disk_usage(disk).free
+    folder = make()
+    taken = empty - shutil.disk_usage(disk).free
+    shutil.rmtree(folder)
+    for tenth in range(10):
+        (disk / "ballast").write_bytes(bytes(empty - tenth * taken // 10))
+        try:
+            make()
+        except DiskError as error:
+            refused += re.fullmatch(f"{folder}: {said}", str(error)) is not None
+        assert os.listdir(disk) == ["ballast"]
+        (disk / "ballast").unlink()
+print(refused)
+"""
+
+
 @pytest.mark.slow
-def test_a_file_system_that_is_full_keeps_the_checkpoint_before(tmp_path):
+@pytest.mark.parametrize("program", [FULL, FULL_OF_TOYS], ids=["checkpoint", "toys"])
+def test_a_file_system_that_is_full_keeps_what_was_there(tmp_path, program):
     """A small one, mounted in a name space of its own: nobody needs to be root for it."""
     (tmp_path / "disk").mkdir()
     mounted = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
     mount = f"mount -t tmpfs -o size=1m none {tmp_path}/disk"
     if not shutil.which("unshare") or subprocess.run([*mounted, mount], capture_output=True).returncode:
         pytest.skip("no file system can be mounted here")
-    (tmp_path / "full.py").write_text(FULL)
-    program = f"{mount} && {sys.executable} {tmp_path}/full.py {tmp_path}/disk"
-    assert subprocess.run([*mounted, program], capture_output=True, text=True, check=True).stdout == "20\n"
+    (tmp_path / "full.py").write_text(program)
+    started = f"{mount} && {sys.executable} {tmp_path}/full.py {tmp_path}/disk"
+    assert subprocess.run([*mounted, started], capture_output=True, text=True, check=True).stdout == "20\n"

@@ -268,5 +268,6 @@ def test_colmap(tmp_path):
     read_models(("", b""))
     tracks, records = claimed("points3D.bin", 8 + 43, 8), [claimed(name, 0, 8) for name in files]
     cases = [tracks, *records, claimed("rigs.bin", 8 + 4, 4), claimed("frames.bin", 8 + 64, 4)]
+    cases += [("images.bin", files["images.bin"].replace(b"frame3", b"\x80rame3"))]
     changed = st.sampled_from(sorted(files)).flatmap(lambda name: st.tuples(st.just(name), damaged([files[name]])))
     fuzz(changed, read_models, cases)

@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
+from completesplat.atomic import disk_refusal
 from completesplat.commands import help, jobs
 from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
 from completesplat.commands.settings import misspelt
@@ -144,10 +145,15 @@ def exit_status(error: BaseException) -> int:
 
 
 def _own_error(error: BaseException) -> CompleteSplatError | None:
+    """What the package refused, or what a full disk did wherever it was written to."""
     chain: BaseException | None = error
-    while chain is not None and not isinstance(chain, CompleteSplatError):
+    while chain is not None:
+        if isinstance(chain, CompleteSplatError):
+            return chain
+        if (refused := disk_refusal(chain)) is not None:
+            return refused
         chain = chain.__cause__
-    return chain
+    return None
 
 
 # What `conf/` interpolates besides hydra's own; here, because jobs that a cluster starts elsewhere import this alone.

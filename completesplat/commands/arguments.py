@@ -153,12 +153,20 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     try:
         read = OverridesParser.create().parse_override(argument)
     except HydraException:
-        example = f'"{key}={quoted(value)}"'
+        example = f'"{key}={_readable(value)}"'
         said = "cannot be read; a text with such characters wants quotes"
         raise CompleteSplatError(f"{_shown(argument)}: {said}: {_shown(example)}") from None
     if read.is_sweep_override() and not sweep:
         said = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
         raise CompleteSplatError(f"{_shown(argument)}: {_shown(said)}")
+
+
+def _readable(value: str) -> str:
+    """The value in quotes; of a list, its entries."""
+    if not (value.startswith("[") and value.endswith("]")):
+        return quoted(value)
+    entries = re.split(r",(?![^\[\]]*\])", value[1:-1])  # a list inside stays whole
+    return f"[{','.join(quoted(entry.strip()) for entry in entries)}]"
 
 
 def _shown(text: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.schema import Positive
 
@@ -39,7 +40,7 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
     sources = _sources(data, splits)
     shown = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
     results = statistics({split: _readable(sources[split], names) for split, names in shown.items()})
-    (out / "stats.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
+    write_text(out / "stats.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
     plot_statistics(results, out / "stats.png", str(data.root))
     show_statistics(results)
 

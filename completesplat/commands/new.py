@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError
 from completesplat.options import conf_folder
 
@@ -21,7 +22,7 @@ def run(config: Any, out: Path) -> None:
     files = begun(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        write_text(path, text)
         print(path)
     print(f"next: python -m pytest test_{kind}_{name}.py")
 

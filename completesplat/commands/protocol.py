@@ -39,7 +39,7 @@ def git_commit() -> str | None:
     """The commit of the source, marked when there are changes on top; None where there is no repository."""
 
     def git(*arguments: str) -> str:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:

@@ -16,6 +16,7 @@ from completesplat.schema import Positive, Range, Share, arguments_of, check_set
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
+REMOVE = "remove"
 HYDRAS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 # Of a part's size: each level but the last halves the picture's sides.
 LEVELS = (
@@ -78,17 +79,20 @@ class Test(TypedDict):
 
 
 OF_VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
+# It has a page to show before what parts are made of is imported, and holds them against their annotations itself.
+FIRST_A_PAGE = "view"
 
 
 def check_verb(verb: str, config: Any) -> None:
-    """Hold the settings of a verb and of all parts that it has against their annotations.
+    """Hold the settings of a verb and of all parts that it has against their annotations; of `view` not the parts.
 
     Raises:
         CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
     """
     if verb in OF_VERBS:
         check_settings(OF_VERBS[verb], config)
-    check_parts(config)
+    if verb != FIRST_A_PAGE:
+        check_parts(config)
 
 
 def check_parts(config: Any, place: str = "") -> None:

@@ -123,7 +123,7 @@ class Trained:
             **stage,
             "rasterizer": self.rasterizer,
             "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
-            "schedule": {"_target_": "completesplat.training.schedules.constant", "_partial_": True},
+            "schedule": {"_target_": "completesplat.training.optimization.constant", "_partial_": True},
         }
         found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
         if published:

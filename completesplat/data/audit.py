@@ -12,6 +12,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from completesplat.atomic import write_text
 from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import TooFewFrames, at, refused_to
@@ -73,7 +74,7 @@ class Findings:
 
     def write(self, path: Path) -> None:
         """Write `json()` as a file."""
-        path.write_text(json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
+        write_text(path, json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
 
 
 def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:

@@ -9,8 +9,6 @@ import re
 from pathlib import Path
 from urllib.parse import urlparse
 
-import torch
-
 from completesplat.atomic import write_text
 from completesplat.errors import WeightsError
 
@@ -132,6 +130,8 @@ def sha256_of(path: Path) -> str:
 
 def _download_file(url: str, sha256: str | None, advice: str) -> Path:
     """The file of a URL in torch's hub cache, where torchvision keeps its own too."""
+    import torch
+
     path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
     if path.is_file():
         return path

@@ -169,12 +169,12 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
 def test_the_page_has_no_sliders_for_one_answer(tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     from completesplat.commands.view import make_page
-    from completesplat.viewer.page import stop_server
+    from completesplat.viewer.access import start_server
 
     weights, image = write_published(tmp_path / "objects", "objaverse"), cut_out(tmp_path / "a.png")
     export = tmp_path / "page.html"
     settings = [f"weights={weights}", f"image={image}", f"export={export}", "rasterizer=reference"]
-    page = make_page(compose_config("view", *settings), tmp_path)
+    page = make_page(start_server(0), compose_config("view", *settings), tmp_path)
     try:
         assert page.worker.wait(60)
         assert [sample.gaussians.count for sample in page.stage.samples] == [16 * 16]
@@ -184,4 +184,3 @@ def test_the_page_has_no_sliders_for_one_answer(tmp_path):
         assert "Keep earlier samples" in shown
     finally:
         page.close()
-        stop_server(page.server)

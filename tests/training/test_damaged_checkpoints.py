@@ -2,9 +2,12 @@
 
 import random
 import shutil
+import struct
+import zipfile
 
 import pytest
 import torch
+from fuzzing import bounded
 from support import SMALL, refused, strict_json
 
 from completesplat.errors import WeightsError
@@ -58,6 +61,81 @@ def torch_io(path):
 def test_what_torch_saves_is_read_without_a_checksum(tmp_path):
     torch.save({"state_dict": {"a": torch.ones(2)}}, tmp_path / "own.ckpt")
     assert read_checkpoint(tmp_path / "own.ckpt")["state_dict"]["a"].tolist() == [1, 1]
+
+
+def text(value: str) -> bytes:
+    return b"X" + struct.pack("<I", len(value)) + value.encode()
+
+
+def called(name: str, number: int) -> bytes:
+    """Instructions of a pickle for a value: what a call with one number makes."""
+    module, _, name = name.rpartition(".")
+    return f"c{module}\n{name}\n".encode() + b"\x8a\x05" + number.to_bytes(5, "little") + b"\x85R"
+
+
+def doubled(times: int) -> bytes:
+    """Eight bytes in hexadecimal digits, those again, and so on."""
+    encode, value = b"c_codecs\nencode\n", text("12345678")
+    for codec in ("latin1", *["Hex-Codec"] * times):
+        value = encode + value + text(codec) + b"\x86R"
+    return value
+
+
+ASKS = {
+    "bytearray": called("builtins.bytearray", 2**31),
+    "Tensor": called("torch.FloatTensor", 2**31),
+    "UntypedStorage": called("torch.storage.UntypedStorage", 2**31),
+    "Hex-Codec": doubled(24),
+}
+
+
+@pytest.mark.parametrize("name", ASKS)
+def test_a_checkpoint_that_asks_for_bytes_from_nothing_is_refused(tmp_path, name):
+    path = tmp_path / "last.ckpt"
+    torch.save({"state_dict": {"a": torch.ones(2)}}, path)
+    with zipfile.ZipFile(path) as archive:
+        records = {record: archive.read(record) for record in archive.namelist()}
+    pickle = b"\x80\x02}" + text("state_dict") + b"}" + text("a") + ASKS[name] + b"ss."
+    with zipfile.ZipFile(path, "w") as archive:
+        for record, content in records.items():
+            archive.writestr(record, pickle if record.endswith("data.pkl") else content)
+    with bounded(2**26), pytest.raises(WeightsError, match=rf"last\.ckpt: .*made of .*{name}, not of tensors alone"):
+        read_checkpoint(path)
+
+
+def test_bytes_of_a_callback_are_read(tmp_path):
+    torch.save({"state_dict": {"a": torch.ones(2)}, "callbacks": {"own": bytes(range(256))}}, tmp_path / "last.ckpt")
+    assert read_checkpoint(tmp_path / "last.ckpt")["callbacks"]["own"] == bytes(range(256))
+
+
+def test_a_checkpoint_that_is_larger_than_its_file_is_refused(tmp_path):
+    path = tmp_path / "last.ckpt"
+    torch.save({"state_dict": {"a": torch.zeros(2**22)}}, path)
+    with zipfile.ZipFile(path) as archive:
+        records = {record: archive.read(record) for record in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for record, content in records.items():
+            archive.writestr(record, content)
+    with bounded(2**23), pytest.raises(WeightsError, match="its parts are larger than the file"):
+        read_checkpoint(path)
+    for contents in ({"a": torch.zeros(1).expand(2**28)}, {"a": [(torch.zeros(1).expand(2**40),)]}):
+        torch.save({"state_dict": contents}, path)
+        with bounded(2**26), pytest.raises(WeightsError, match="a tensor is larger than the file"):
+            read_checkpoint(path)
+    torch.save({"state_dict": {"a": torch.zeros(1).expand(2**10)}}, path)
+    assert read_checkpoint(path)["state_dict"]["a"].shape == (2**10,)
+
+
+def test_numbers_that_the_file_does_not_have_are_refused(tmp_path):
+    path = tmp_path / "last.ckpt"
+    torch.save({"state_dict": {"a": torch.ones(2)}}, path)
+    with zipfile.ZipFile(path) as archive:
+        records = {record: archive.read(record) for record in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for record, content in records.items():
+            archive.writestr(record, content.replace(b"K\x02", b"J" + struct.pack("<i", 2**28)))
+    with bounded(2**26), pytest.raises(WeightsError, match="not a readable checkpoint"):
+        read_checkpoint(path)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

@@ -3,9 +3,9 @@
 import logging
 import re
 import shlex
-import shutil
 from pathlib import Path
 
+from completesplat.atomic import atomic_folder
 from completesplat.data.importing.capture import Capture
 from completesplat.data.importing.colmap import read_colmap
 from completesplat.data.importing.layout import SUBSET, CaptureWriter, Written
@@ -39,7 +39,7 @@ def import_capture(
 
     Raises:
         CompleteSplatError: settings that do not go together, or pycolmap is missing.
-        DataError: something of the capture is missing, malformed or impossible, or the folder exists.
+        DataError: something is missing, malformed or impossible, or the folder exists. DiskError: the disk is full.
     """
     if (transforms is None) == (colmap is None):
         raise CompleteSplatError("give either transforms=FILE or colmap=FOLDER images=FOLDER")
@@ -68,16 +68,8 @@ def import_capture(
 
 
 def _write_whole(folder: Path, sequence: str, capture: Capture, hold_out: int, quality: int, progress: bool) -> Written:
-    # Everything is made beside the final place, so that an interrupted import leaves no half category behind.
-    unfinished = folder.parent / f".{folder.name}.unfinished"
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    try:
-        written = CaptureWriter(unfinished, folder.name, sequence, quality).write(capture, hold_out, progress)
-        unfinished.rename(folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
-    return written
+    with atomic_folder(folder) as unfinished:
+        return CaptureWriter(unfinished, folder.name, sequence, quality).write(capture, hold_out, progress)
 
 
 def _report(folder: Path, sequence: str, written: Written) -> None:

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from completesplat.data.importing.capture import Capture, CapturedFrame, Lens, check_lens, in_order, make_cloud
-from completesplat.data.validation import BadCamera, MissingFile, UnreadableFile, at, finite_array, inside, require_file
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    MissingFile,
+    UnreadableFile,
+    at,
+    finite_array,
+    inside,
+    require_file,
+)
 from completesplat.errors import CompleteSplatError
 
 # Number of parameters by the id that binary models use (colmap, `src/colmap/sensor/models.h`); other ids are refused.
@@ -56,8 +65,12 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
 
 def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | None) -> CapturedFrame:
     image = reconstruction.images[number]
-    path = require_file(inside(images, image.name))
-    mask = None if masks is None else _find_mask(masks, image.name)
+    try:
+        name = image.name
+    except UnicodeDecodeError:
+        raise BadAnnotation("the name of its picture is not UTF-8") from None
+    path = require_file(inside(images, name))
+    mask = None if masks is None else _find_mask(masks, name)
     pose = np.eye(4)
     pose[:3] = finite_array(image.cam_from_world().matrix(), (3, 4), "the pose")
     return CapturedFrame(number, path, mask, _lens_of(reconstruction.cameras[image.camera_id]), pose)

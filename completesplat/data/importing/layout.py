@@ -17,7 +17,7 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
 from completesplat.data.importing.capture import Capture, CapturedFrame, Lens, PointCloud, read_picture
-from completesplat.data.pictures.files import decode
+from completesplat.data.pictures.files import decode, save_picture
 from completesplat.data.validation import BadCamera, at
 from completesplat.geometry.cameras import pixel_centers
 
@@ -150,11 +150,15 @@ class CaptureWriter:
         for kind in ("images", "masks"):
             (self.folder / self.sequence / kind).mkdir(parents=True)
         held_out = held_out_frames(len(capture.frames), hold_out)
-        frames = []
-        shown = track(capture.frames, description="Importing pictures", disable=not progress)
-        for number, frame in enumerate(shown):
+
+        def write_frame(number: int) -> dict[str, Any]:
+            frame = capture.frames[number]
             with at(frame.image, self.sequence, frame.number):
-                frames.append(self._write_frame(number, frame, number in held_out))
+                return self._write_frame(number, frame, number in held_out)
+
+        # What goes wrong passes through the bar, which ends before that is shown.
+        count = len(capture.frames)
+        frames = list(track(map(write_frame, range(count)), "Importing pictures", count, disable=not progress))
         points = 0 if capture.cloud is None else self._write_cloud(capture.cloud)
         self._write_lists(frames, held_out, points)
         return Written(len(frames), self._copied, len(held_out), points)
@@ -175,9 +179,9 @@ class CaptureWriter:
             self._copied += 1
         else:
             options: dict[str, Any] = {"quality": self.quality, "subsampling": 0} if picture.lossy else {}
-            image.save(self.folder / path, **options)
+            save_picture(image, self.folder / path, **options)
         mask_path = f"{self.sequence}/masks/{stem}.png"
-        mask.save(self.folder / mask_path)
+        save_picture(mask, self.folder / mask_path)
         return {
             "sequence_name": self.sequence,
             "frame_number": number,

@@ -175,6 +175,13 @@ def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
     return values.astype(np.float32)
 
 
+def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+    """Write a picture in the format of its path's suffix; `OSError` on a full disk, where Pillow cuts a JPEG short."""
+    content = io.BytesIO()
+    image.save(content, Image.registered_extensions()[path.suffix], **options)
+    path.write_bytes(content.getvalue())
+
+
 @contextmanager
 def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
     """A picture, decoded completely, and its EXIF record; what is wrong with it becomes a `BadPicture`."""

@@ -1,7 +1,6 @@
 """How toy data get onto the disk: a folder is there as a whole or not at all, and scenes are made in parallel."""
 
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -9,6 +8,7 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import track
 
+from completesplat.atomic import atomic_folder
 from completesplat.data.processes import map_in_processes
 from completesplat.errors import DataError
 
@@ -25,6 +25,7 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
 
     Raises:
         DataError: a number that is too small, or the folder holds something else.
+        DiskError: the disk is full.
     """
     least = {"scenes": fewest, "frames": 2, "size": 8}
     if any(numbers[name] < number for name, number in least.items()):
@@ -41,13 +42,9 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
         if progress:
             Console().print(f"{folder} already holds these scenes")
         return folder
-    # Everything is made beside the final place, so that an interrupted run leaves no half folder behind.
-    unfinished = folder.parent / f".{folder.name}.unfinished"
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    fill(unfinished)
-    (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
-    unfinished.rename(folder)
+    with atomic_folder(folder) as unfinished:
+        fill(unfinished)
+        (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
     return folder
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
+from completesplat.data.pictures.files import save_picture
 from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.mini_scene import draw_mini
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
@@ -39,11 +40,11 @@ def _write_frame(
     }
     image, coverage, depth = render_frame(scene, frame, size)
     picture, mask = _to_bytes(image), _to_bytes(coverage)
-    Image.fromarray(picture).save(folder / files["image"], quality=95, subsampling=0)
-    Image.fromarray(mask).save(folder / files["mask"])
+    save_picture(Image.fromarray(picture), folder / files["image"], quality=95, subsampling=0)
+    save_picture(Image.fromarray(mask), folder / files["mask"])
     # A 16-bit picture whose bits are float16, in units of `scale_adjustment`: this is how CO3D stores depth.
-    Image.fromarray(depth.astype(np.float16).view(np.uint16)).save(folder / files["depth"])
-    Image.fromarray(np.full_like(mask, 255)).save(folder / files["depth_mask"])
+    save_picture(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
+    save_picture(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
     paths = {key: f"{category}/{path}" for key, path in files.items()}
     return {
         "sequence_name": name,
