@@ -13,6 +13,7 @@ from lightning import LightningModule
 from lightning.pytorch.callbacks import WeightAveraging
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
+from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageWriter
 from torch.distributed.checkpoint.state_dict_saver import save
 from torch.distributed.device_mesh import init_device_mesh
@@ -20,7 +21,7 @@ from torch.distributed.fsdp import FSDPModule, fully_shard
 from torch.distributed.tensor import DTensor, distribute_tensor
 
 from completesplat.atomic import writing
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.training.scene_module import SceneModule
 from completesplat.weights import sha256_of
 from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUFFIX, shards_of
@@ -69,13 +70,28 @@ class FullyShardedStrategy(DDPStrategy):
             with writing(folder):
                 folder.mkdir()
         self.barrier()
-        with writing(folder / "shards"):
-            save(divided, storage_writer=HuggingFaceStorageWriter(str(folder), save_distributed=True))
+        with writing(path, sum(value.nbytes for value in divided.values())):
+            self._save_shards(divided, folder)
         self.barrier()
         if self.is_global_zero:
             files = {file.name: sha256_of(file) for file in sorted(folder.iterdir())}
             contents[SHARDS] = {"folder": folder.name, "files": files}
-        super().save_checkpoint(contents, filepath, storage_options)
+        try:
+            super().save_checkpoint(contents, filepath, storage_options)
+        except DiskError:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+
+    def _save_shards(self, divided: dict[str, Tensor], folder: Path) -> None:
+        """Write this process's share of the tensors. Where one cannot, all end; the first raises what that did."""
+        try:
+            save(divided, storage_writer=HuggingFaceStorageWriter(str(folder), save_distributed=True))
+        except CheckpointException as error:  # no `Exception`
+            shutil.rmtree(folder, ignore_errors=True)
+            self.barrier()
+            if not self.is_global_zero:
+                raise SystemExit(DiskError.exit_status) from error  # the line is to be there once
+            raise next(iter(error.failures.values()))[0] from error
 
     def on_exception(self, exception: BaseException) -> None:
         """Other processes may be gone, and the networks cannot be put together."""

@@ -38,10 +38,13 @@ def stopped_together() -> Iterator[None]:
     `fit` and `test` with exit status 0, and its observer kills the first process when another one has got a signal.
     """
     started: list[subprocess.Popen[bytes]] = []
+    observers: list[_Observer] = []
 
     def observe(processes: list[subprocess.Popen[bytes]]) -> None:
-        started.extend(processes)
-        _Observer(os.getpid(), processes).start()
+        if processes:
+            started.extend(processes)
+            observers.append(_Observer(os.getpid(), processes))
+            observers[-1].start()
 
     connector, launchers = cast(Any, _SignalConnector), (launcher_of_fabric, launcher_of_trainers)
     before = connector.register_signal_handlers, launchers[0]._launch_process_observer
@@ -61,7 +64,9 @@ def stopped_together() -> Iterator[None]:
         connector.register_signal_handlers = before[0]
         for launcher in launchers:
             launcher._launch_process_observer = before[1]  # type: ignore[attr-defined]
-        if started:
+        if (
+            observers
+        ):  # whose sockets are open until here: what is opened with the number of a closed one would be written to
             signal.set_wakeup_fd(-1)
 
 

@@ -41,7 +41,7 @@ def one_of_two(rank: int, folder: str) -> None:
 
 
 def test_two_processes_tell_what_one_tells_for_any_number_of_scenes(tmp_path):
-    multiprocessing.start_processes(one_of_two, (str(tmp_path),), nprocs=2, start_method="fork")
+    multiprocessing.spawn(one_of_two, (str(tmp_path),), nprocs=2)
     alone = json.loads(json.dumps([scored(count, skipped=2) for count in COUNTS]))
     for rank in (0, 1):
         assert json.loads((tmp_path / f"{rank}.json").read_text()) == alone

@@ -1,6 +1,7 @@
 """FSDP: two processes, each with its share of the networks, train what one does, and read each other's checkpoints."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,7 +26,13 @@ FSDP = ["trainer=fsdp", "trainer.devices=2"]
 # Without anything that is drawn in the steps, as what processes draw is their own.
 STAGE1 = ["experiment=toy_var", "ablation=no_variational", "autoreconstructor.skip_dropout=0", *SMALL]
 STAGE1 += ["data.image_size=16", "data.batch_size=4", "data.references_per_sequence=8", "optimizer.lr=0.1"]
-STAGE1 += ["optimizer._target_=torch.optim.SGD", "trainer.precision=32-true", "trainer.val_check_interval=1"]
+STAGE1 += [
+    "optimizer=adam",
+    "optimizer._target_=torch.optim.SGD",
+    "optimizer.fused=false",
+    "trainer.precision=32-true",
+    "trainer.val_check_interval=1",
+]
 STAGE2 = ["experiment=toy_diffusion", *SMALL, "trainer.precision=32-true", "data.references_per_sequence=8"]
 STAGE2 += ["sampler.steps=2", "callbacks.samples.samples=1"]
 
@@ -91,17 +98,33 @@ def test_stage_two_with_averages_trains_as_with_ddp_and_goes_on_with_another_num
     assert furthest(*ends, "state_dict", "current_model_state", "optimizer_states") < 1e-4
 
 
-def divided(path: Path, value: float = 1.0) -> None:
-    """A checkpoint as two processes leave it: a tensor of four rows in two files."""
+@pytest.mark.slow
+def test_two_processes_whose_shards_do_not_fit_end_with_one_line(toy_root, tmp_path):
+    given = [*STAGE1, *FSDP, f"data.root={toy_root}", "data.workers=0", "rasterizer=reference", f"out={tmp_path}/run"]
+    small_files = ["bash", "-c", 'ulimit -f 60; exec "$@"', "bash"]  # of 1024 bytes
+    done = subprocess.run(
+        [*small_files, sys.executable, str(script(tmp_path)), "fit", *given, "test=false"],
+        env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    said = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert len(said) == 1
+    assert re.search(r"last\.ckpt: File too large: [\d.]+ kB or more are needed, .+ are free on this disk$", said[0])
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert list((tmp_path / "run/checkpoints").iterdir()) == []
+
+
+def divided(path: Path, value: float = 1.0, rows: int = 2) -> None:
+    """A checkpoint as two processes leave it: a tensor in two files, two rows in each; the second begins at `rows`."""
     folder = path.parent / f"{path.stem}-{value}.shards"
     folder.mkdir()
     for number in range(2):
-        offsets = f'{{"state_dict.w": {{"saved_offsets": [{2 * number}, 0]}}}}'
-        rows = {"state_dict.w": torch.full((2, 3), value + number)}
-        save_file(rows, folder / f"shard-{number}.safetensors", {"DCP_SHARDING_INFO": offsets})
+        offsets = f'{{"state_dict.w": {{"saved_offsets": [{rows * number}, 0]}}}}'
+        held = {"state_dict.w": torch.full((2, 3), value + number)}
+        save_file(held, folder / f"shard-{number}.safetensors", {"DCP_SHARDING_INFO": offsets})
     files = {file.name: sha256_of(file) for file in folder.iterdir()}
-    held = {"state_dict": {"w": f"{DIVIDED}state_dict.w", "b": torch.zeros(2)}, "steps": [1, (2,)]}
-    CheckpointFiles().save_checkpoint(held | {SHARDS: {"folder": folder.name, "files": files}}, path)
+    whole = {"state_dict": {"w": f"{DIVIDED}state_dict.w", "b": torch.zeros(2)}, "steps": [1, (2,)]}
+    CheckpointFiles().save_checkpoint(whole | {SHARDS: {"folder": folder.name, "files": files}}, path)
 
 
 def test_shards_are_read_as_one_checkpoint(tmp_path):
@@ -140,6 +163,12 @@ def test_shards_that_no_checkpoint_names_are_removed(tmp_path):
     remove_unused_shards(tmp_path)
     assert [path.name for path in tmp_path.glob("*.shards")] == ["last-2.0.shards"]
     assert read_checkpoint(tmp_path / "last.ckpt")["state_dict"]["w"][0, 0] == 2
+
+
+def test_shards_that_say_they_are_larger_than_their_files_are_refused(tmp_path):
+    divided(tmp_path / "last.ckpt", rows=2**20)
+    with pytest.raises(WeightsError, match=r"its tensors are larger than the files in .*last-1\.0\.shards"):
+        read_checkpoint(tmp_path / "last.ckpt")
 
 
 def test_a_checkpoint_cannot_name_files_elsewhere(tmp_path):

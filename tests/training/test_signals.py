@@ -1,15 +1,18 @@
 """A signal ends training after the step that it came in; what goes on from there is as if there had been none."""
 
+import gc
 import os
 import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 from contextlib import suppress
 
 import pytest
 import torch
+from lightning.fabric.strategies.launchers import subprocess_script as launcher
 from small_runs import STEPS, Logging, fit, rows
 
 from completesplat import signals
@@ -146,3 +149,21 @@ def test_a_program_ends_whose_workers_nobody_has_ended():
     assert (
         subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=40, capture_output=True).stdout == b"ready\n"
     )
+
+
+def test_numbers_of_signals_are_written_to_a_socket_that_is_open_and_to_nothing_else():
+    """Whatever has the number of a closed one, a checkpoint for one, would get a byte with each signal."""
+    with stopped_together():
+        launcher._launch_process_observer([])
+        assert signal.set_wakeup_fd(-1) == -1
+        with subprocess.Popen(["true"]) as child:
+            launcher._launch_process_observer([child])
+        for thread in threading.enumerate():
+            if thread.name == "child-process-observer":
+                thread.join()
+        del thread
+        gc.collect()
+        written = signal.set_wakeup_fd(-1)
+        signal.set_wakeup_fd(written)
+        assert stat.S_ISSOCK(os.fstat(written).st_mode)
+    assert signal.set_wakeup_fd(-1) == -1
