@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -49,11 +50,17 @@ NOISE = torch.rand(4, 3, 64, 64, generator=torch.Generator().manual_seed(0))  # 
 
 @contextmanager
 def quota(most: int) -> Iterator[None]:
-    """No file of this process, and of those that it starts, grows beyond so many bytes."""
+    """No file of this process, and of those that it starts, grows beyond so many bytes.
+
+    None keeps compiled modules: Python does not see that they were cut short, and no process could import them again.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
     try:
-        yield
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "dont_write_bytecode", True)
+            patch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+            yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
@@ -282,6 +289,18 @@ def test_toys_captures_and_statistics_that_do_not_fit(command, toy_root, tmp_pat
         assert not list(out.glob(f"*{name}*"))
         if given != stats:
             assert command("data", *given, f"out={out}").status == 0
+
+
+def test_modules_first_imported_under_a_quota_can_be_imported_again(tmp_path, monkeypatch):
+    (tmp_path / "imported_first.py").write_text("\n".join(f"a_{i} = {i}" for i in range(100)))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
+    again = [sys.executable, "-c", "import imported_first"]
+    with quota(600):
+        sys.modules.pop(import_module("imported_first").__name__)
+        subprocess.run(again, cwd=tmp_path, check=True)
+    subprocess.run(again, cwd=tmp_path, check=True)
 
 
 def test_a_part_of_ones_own_that_does_not_fit(command):
