@@ -64,9 +64,8 @@ def stopped_together() -> Iterator[None]:
         connector.register_signal_handlers = before[0]
         for launcher in launchers:
             launcher._launch_process_observer = before[1]  # type: ignore[attr-defined]
-        if (
-            observers
-        ):  # whose sockets are open until here: what is opened with the number of a closed one would be written to
+        # Their sockets are open until here: what is opened with the number of a closed one would be written to.
+        if observers:
             signal.set_wakeup_fd(-1)
 
 
