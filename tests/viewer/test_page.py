@@ -191,12 +191,17 @@ def test_a_slider_draws_anew_with_its_value_unless_that_is_switched_off(completi
 
 
 def test_earlier_samples_stay_if_that_is_wanted(completion):
+    completion.controls.live.value = False
     upload(completion)
     completion.controls.keep.value = True
-    for seed in (1, 2, 3, 4):
+    completion.controls.samples.value = 3
+    for seed in (1, 2):
         completion.controls.seed.value = seed
-        finish(completion)
-    assert [sample.settings["seed"] for sample in finish(completion)] == [1, 1, 2, 2, 3, 3, 4, 4]  # eight at most
+        press(completion.controls.draw, Browser())
+        samples = finish(completion)
+    assert [sample.settings["seed"] for sample in samples] == [0, 0, 1, 1, 1, 2, 2, 2]  # eight at most
+    press(completion.controls.draw, Browser())
+    assert [sample.settings["seed"] for sample in finish(completion)] == [1, 1, 2, 2, 2, 2, 2, 2]
 
 
 def test_a_refusal_is_told_to_who_caused_it_and_changes_nothing(completion, monkeypatch):
