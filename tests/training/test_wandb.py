@@ -18,12 +18,12 @@ FIT, TESTED = (STAGE1, STAGE2), (STAGE1, STAGE2, TEST)  # `fit` ends with a test
 # The kind of the values, the runs that log them, and their keys; `*` stands for anything.
 LOGGED = [
     ("number", FIT, "train/loss val/psnr_novel gaussians/opacity_p* gaussians/log10_scale_p* gaussians/depth_p*"),
-    ("number", FIT, "speed/scenes_per_second speed/data_wait"),
+    ("number", FIT, "speed/scenes_per_second speed/data_wait train/bad_steps"),
     ("number", FIT if Path("/proc/self/status").exists() else (), "memory/process_gb"),
     ("number", FIT if torch.cuda.is_available() else (), "memory/gpu_gb"),
     ("histogram", FIT, "histograms/opacity histograms/log10_scale histograms/depth"),
     ("image", FIT, "pictures"),
-    ("number", (STAGE1,), "train/mse train/ssim train/kl latent/bits latent/bits_* latent/active_channels"),
+    ("number", (STAGE1,), "train/psnr train/mse train/ssim train/kl latent/bits latent/bits_* latent/active_channels"),
     ("number", (STAGE2,), "train/loss_t* samples/psnr samples/psnr_of_mean samples/diversity"),
     ("number", (STAGE2,), "latents/std_* latents/mean_*"),
     ("image", (STAGE2,), "samples denoising"),
