@@ -1,9 +1,10 @@
 """Muon, and learning-rate schedules, stepped once per optimizer step. `total_steps` is the length of the run."""
 
 import math
-from collections.abc import Callable, Iterable
-from typing import Annotated
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Annotated, Any
 
+import torch
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
@@ -35,8 +36,19 @@ def muon(
     matrices = {"params": [p for p in given if p.ndim > 1], "lr": lr, "use_muon": True}
     others = {"params": [p for p in given if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
     groups = [group for group in (matrices, others) if group["params"]]
-    optimizer: Optimizer = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
-    return optimizer
+    optimizer: Any = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
+    if given[0].device.type == "cpu" and not torch.cpu._is_avx512_bf16_supported():
+        optimizer._orthogonalize = _orthogonal_in_float32
+    result: Optimizer = optimizer
+    return result
+
+
+def _orthogonal_in_float32(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Tensor]:
+    """As the library, whose bfloat16 takes a hundred times as long on a processor that does not compute in it."""
+    from pytorch_optimizer.optimizer.utils.matrix import zero_power_via_newton_schulz_5
+
+    settings = {"num_steps": group["ns_steps"], "weights": group["ns_coeffs"], "dtype": torch.float32}
+    return [zero_power_via_newton_schulz_5(update.flatten(1), **settings) for update in updates]
 
 
 def exponential(

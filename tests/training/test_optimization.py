@@ -48,6 +48,20 @@ def test_muon_steps_equally_far_in_all_directions_of_a_kernel_and_adam_moves_the
     assert [len(group["params"]) for group in muon([bias], lr=0.5, adam_lr=0.01).param_groups] == [1]
 
 
+def test_muon_takes_bfloat16_only_where_the_processor_computes_in_it(monkeypatch):
+    steps, gradients = {}, [torch.randn(shape) for shape in ((8, 4, 3, 3), (8, 36), (16, 8))]
+    for native in (True, False):
+        monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda native=native: native)
+        parameters = [torch.zeros_like(gradient, requires_grad=True) for gradient in gradients]
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient.clone()
+        muon(parameters, lr=1.0, adam_lr=0.01).step()
+        steps[native] = torch.cat([parameter.detach().flatten() for parameter in parameters])
+    assert (steps[True] - steps[False]).norm() < 0.05 * steps[True].norm()
+    short = {native: (step[:288] == step[:288].bfloat16()).all().item() for native, step in steps.items()}
+    assert short == {True: True, False: False}
+
+
 @pytest.mark.parametrize("length", [["trainer.max_steps=6"], ["trainer.max_steps=-1", "+trainer.max_epochs=6"]])
 def test_the_schedule_ends_with_the_run_whether_steps_or_epochs_are_given(length, toy_root, tmp_path):
     settings = [*SMALL, *length, "schedule.warmup_steps=0", "optimizer.lr=1.0e-3", "data.references_per_sequence=1"]
