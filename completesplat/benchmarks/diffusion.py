@@ -14,6 +14,7 @@ from hydra.utils import instantiate
 from rich.console import Console
 from torch import nn
 from torch.optim import Optimizer
+from torch.utils.flop_counter import FlopCounterMode
 
 from completesplat.benchmarks.compiling import NotMeasured, compiled_within
 from completesplat.benchmarks.printing import device_of, print_results
@@ -39,11 +40,15 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two ways, each with a few words for tables; the first is the one that should be faster."""
+    """Two ways, each with a few words for tables; the first is the one that should be faster.
+
+    `counted`: also count their floating-point operations, which a compiled network hides.
+    """
 
     name: str
     a: tuple[str, Work]
     b: tuple[str, Work]
+    counted: bool = True
 
 
 def run(
@@ -144,18 +149,23 @@ def _same(comparison: Comparison) -> Comparison:
 
 
 def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict[str, Any]:
-    """A row: medians in ms of both, which take turns, and how many times faster `a` is than `b`.
+    """Return a row: medians in ms of both ways, which take turns, how many times faster `a` is, and TFLOP of a call.
 
-    The first two of each are not counted.
+    The first two calls of each are not timed. FLOPs are those of torch's own counter (products, convolutions).
     """
     ways = {"a": comparison.a, "b": comparison.b}
+    tflop = {}
+    for key, (_, work) in ways.items() if comparison.counted else ():
+        with FlopCounterMode(display=False) as counter:
+            work()
+        tflop[f"{key}_tflop"] = counter.get_total_flops() / 1e12
     times: dict[str, list[float]] = {key: [] for key in ways}
     for _ in range(WARM_UP + repeats):
         for key, (_, work) in ways.items():
             times[key].append(milliseconds(work, device))
     medians = {f"{key}_ms": statistics.median(taken[WARM_UP:]) for key, taken in times.items()}
     texts = {key: text for key, (text, _) in ways.items()}
-    return {"name": comparison.name, **texts, **medians, "ratio": medians["b_ms"] / medians["a_ms"]}
+    return {"name": comparison.name, **texts, **medians, "ratio": medians["b_ms"] / medians["a_ms"], **tflop}
 
 
 def milliseconds(work: Work, device: torch.device) -> float:
@@ -340,6 +350,7 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
         "compiled_vs_eager",
         ("denoiser compiled, both passes", lambda: work(compiled)),
         ("as it is", lambda: work(denoiser)),
+        counted=False,
     )
 
 
@@ -360,6 +371,7 @@ def drawn_compiled_vs_eager(model: CompleteSplat, samples: int, steps: int, limi
         "drawn_compiled_vs_eager",
         (f"{samples} samples, {way}", lambda: work(compiled)),
         ("as it is", lambda: work(denoiser)),
+        counted=False,
     )
 
 
@@ -369,6 +381,8 @@ COMPARED: list[Column] = [
     ("a\nms", "a_ms", ",.1f"),
     ("b\nms", "b_ms", ",.1f"),
     ("times\nfaster", "ratio", ",.2f"),
+    ("a\nTFLOP", "a_tflop", ",.4f"),
+    ("b\nTFLOP", "b_tflop", ",.4f"),
 ]
 
 

@@ -29,6 +29,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.generation import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
 
+CPU = torch.device("cpu")
+
 
 def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatch):
     now, calls = [0.0], []
@@ -40,10 +42,17 @@ def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatc
         calls.append(key)
         now[0] += seconds[key].pop(0)
 
-    comparison = Comparison("x", ("this", lambda: work("a")), ("that", lambda: work("b")))
+    comparison = Comparison("x", ("this", lambda: work("a")), ("that", lambda: work("b")), counted=False)
     row = measured(comparison, 3, torch.device("cpu"))
     assert row == {"name": "x", "a": "this", "b": "that", "a_ms": 2000.0, "b_ms": 8000.0, "ratio": 4.0}
     assert calls == ["a", "b"] * (WARM_UP + 3)
+
+
+def test_the_operations_of_both_ways_are_counted():
+    one, other = torch.ones(20, 30), torch.ones(30, 50)
+    row = measured(Comparison("x", ("once", lambda: one @ other), ("twice", lambda: one @ other @ other.T)), 1, CPU)
+    assert row["a_tflop"] * 1e12 == pytest.approx(2 * 20 * 30 * 50)
+    assert row["b_tflop"] == pytest.approx(2 * row["a_tflop"])
 
 
 class Wrapped(nn.Module):
