@@ -104,13 +104,13 @@ def _vae_folder(source: str) -> Path:
     """The folder of the VAE's files, fetched from the hub if `source` is no folder."""
     local = Path(source).expanduser()
     if local.exists():
-        hint = "give a folder from `hf download stabilityai/sd-vae-ft-mse --local-dir DIR`"
+        hint = "give a folder from `hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`"
         folder = _find(local)
     elif HUB_ID.fullmatch(source):
         hint = _fetch_hint(source)
         folder = _find(_download(source, WEIGHTS_FILES[0])) or _find(_download(source, WEIGHTS_FILES[1]))
     else:
-        raise WeightsError(f"{source}: no such folder; {_fetch_hint('stabilityai/sd-vae-ft-mse')}")
+        raise WeightsError(f"{source}: no such folder; {_fetch_hint('CompVis/stable-diffusion-v1-4')}")
     if folder is None:
         files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
         raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {hint}")

@@ -22,7 +22,7 @@ from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, wei
 GOOD = "a test rendering is as it should be"
 WEIGHTS_FILES = (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)
 PUBLISHED = [("LPIPS: VGG16", VGG_URL), ("FID, KID: Inception", INCEPTION_URL)]
-VAE = "stabilityai/sd-vae-ft-mse"
+VAE = "CompVis/stable-diffusion-v1-4"
 
 
 def check_rasterizers() -> Iterator[Finding]:

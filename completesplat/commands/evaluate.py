@@ -17,7 +17,7 @@ from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.protocol import drawing, protocol, provenance, write_json
 from completesplat.commands.trained import Trained
 from completesplat.data.hidden_modes import hidden_modes
-from completesplat.data.packed.manifest import is_packed
+from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_modes, log_scores, log_shown
@@ -33,8 +33,8 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
 
     Raises:
         CompleteSplatError: the protocol is of no pictures or of other data, changes a setting that these data have not
-            got, or scores at a smaller size, or at another one than that of prepared pictures.
-        DataError: the protocol's files cannot be used.
+            got, lacks a file, or scores at a smaller size.
+        DataError: the protocol's files cannot be used, or prepared images are smaller than it needs.
     """
     chosen = f"evaluation={evaluation['name']}"
     if "scoring" not in evaluation:
@@ -42,6 +42,8 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
     for key, value in evaluation["data"].items():
         if key not in run_config.data:
             raise CompleteSplatError(f"{chosen}: the data of this run have no setting {key}")
+        if value == "???":
+            raise CompleteSplatError(f"{chosen} needs evaluation.data.{key}=FILE (fit: or test=false)")
         run_config.data[key] = value
     data = instantiate(run_config.data, _convert_="all")
     found = data.describe()["data_set"]
@@ -53,10 +55,9 @@ def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
         return data
     if resolution < size:
         raise CompleteSplatError(f"evaluation.resolution={resolution}: below the model's {size}")
-    if is_packed(data.root):
-        said = f"evaluation.resolution={resolution}: prepared pictures have one size"
-        raise CompleteSplatError(f"{said}; give the data as they were published (data.root)")
     larger = instantiate(run_config.data, image_size=resolution, _convert_="all")
+    if is_packed(data.root):
+        settings_must_match(larger.root, larger.packed_settings())
     larger.at_model_size = data
     return larger
 

@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 OTHER_WEIGHTS = {"pretrained", "checkpoint", "autoreconstructor_checkpoint"}  # settings of weights to start from
 EXAMPLES = {
     "root": "DIR",
-    "pretrained": "stabilityai/sd-vae-ft-mse, or null for random weights",
+    "pretrained": "CompVis/stable-diffusion-v1-4, or null for random weights",
     "checkpoint": "RUN/checkpoints/last.ckpt",
     "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
 }

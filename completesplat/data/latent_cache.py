@@ -246,7 +246,7 @@ class CachedTrainingScenes(TrainingScenes):
         self,
         cache: LatentCache,
         store: SceneStore,
-        choose: Callable[[int, np.random.Generator], Choice],
+        choose: Callable[[int, int, np.random.Generator], Choice],
         box_masks: BoxMasks | None,
         references: int,
         seed: int,
@@ -259,10 +259,10 @@ class CachedTrainingScenes(TrainingScenes):
         self.cache = cache
         self.box_masks = box_masks
 
-    def draw(self, name: str, rng: np.random.Generator) -> CachedScene:
+    def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
         """An encoded reference frame of the sequence of this name."""
         sequence = self.cache.sequences[name]
-        reference, _ = self.choose(sequence.frames, rng)
+        reference, _ = self.choose(sequence.frames, epoch, rng)
         stored = np.array(sequence.stored)
         scene = self.cache.scene(name, int(stored[np.abs(stored - reference).argmin()]))
         if self.box_masks is None:

@@ -20,11 +20,22 @@ from completesplat.results.tables import (
     score_heading,
 )
 
-ALIKE = ["data_set", "subset", "split", "name", "resolution", "scenes", "skipped", "views", "protocol_views", "crop"]
-ALIKE += ["background", "precision", "data_fingerprint", "metrics"]
+ALIKE = [
+    "data_set",
+    "subset",
+    "split",
+    "name",
+    "resolution",
+    "scenes",
+    "skipped",
+    "views",
+    "protocol_views",
+    "scene_list",
+]
+ALIKE += ["crop", "background", "precision", "data_fingerprint", "metrics"]
 """What the protocols of a table's rows have in common."""
-SAID = ["subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "crop"]
-SAID += ["background", "precision"]
+SAID = ["subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "scene_list"]
+SAID += ["crop", "background", "precision"]
 """What a table says of its protocol."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]

@@ -81,7 +81,7 @@ class PublishedTable:
     title: str
     region: str
     view: str
-    evaluations: list[str]
+    evaluations: Mapping[str, Mapping[str, Any]]
     says: list[str]
     columns: list[PrintedColumn]
     rows: list[list[PrintedCell]]
@@ -89,7 +89,6 @@ class PublishedTable:
     resolution: str = ""
     subset: str = ""
     oracle_samples: int | None = None
-    complete: Mapping[str, str] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     options: Mapping[str, str] = field(default_factory=dict)
 
@@ -153,31 +152,25 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
 def belongs(table: PublishedTable, entry: Entry) -> bool:
     """Whether an entry was measured as the table's figures were.
 
-    It was tested by one of the table's protocols on one of its data sets and on the table's list of sequences, no scene
-    was skipped, and resolution and number of scenes are those of a published row; where the table states no number,
-    they are all scenes of the list, and some numbers stand for those of a complete run. A best of k belongs where the
-    paper has one of equally many samples; what has seen the views that it is scored on belongs nowhere.
+    The run followed one of the table's evaluations: the same views, resolution and number of scenes (all scenes of the
+    list where the table states no number), on one of the table's data sets and on its list of sequences, with no scene
+    skipped, with skip connections at full weight, and on all pixels. A best of k belongs where the paper has one of
+    equally many samples. A model that has seen the views that it is scored on belongs nowhere.
     """
     protocol = entry.run.protocol
-    if protocol.get("name") not in table.evaluations:
+    wanted = table.evaluations.get(str(protocol.get("name")))
+    if wanted is None or protocol.get("skipped") or entry.upper_bound:
+        return False
+    if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
         return False
     data_sets = {column.data_set for column in table.columns if column.key in METRICS}
-    if protocol.get("background") is not None:  # objects only, whose scores for all pixels are no table's
-        return False
-    if protocol["data_set"] not in data_sets or protocol.get("skipped") or entry.upper_bound:
-        return False
-    if table.subset and protocol.get("subset") != table.subset:
+    if protocol["data_set"] not in data_sets or (table.subset and protocol.get("subset") != table.subset):
         return False
     if entry.predictor == BEST_OF_K and protocol.get("samples") != table.oracle_samples:
         return False
-    own = {"scenes": str(protocol["scenes"]), "resolution": str(protocol["resolution"])}
-    unstated = {"scenes": str(protocol.get("scenes_listed"))}
-    sizes = [_size(table, row) for row in table.rows]
-    sizes += [size | {"scenes": table.complete[size["scenes"]]} for size in sizes if size["scenes"] in table.complete]
-    return any(
-        all(own[key] == (value.replace(",", "") or unstated.get(key, own[key])) for key, value in size.items())
-        for size in sizes
-    )
+    if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
+        return False
+    return all(protocol.get(key) == wanted[key] for key in ("resolution", "protocol_views"))
 
 
 def _size(table: PublishedTable, row: Sequence[PrintedCell]) -> dict[str, str]:

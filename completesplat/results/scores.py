@@ -22,8 +22,8 @@ LEADING = {"method": "method", "speed": "rendering speed", **COST, "scenes": "sc
 """The columns before the scores, and their headings."""
 OURS = "completesplat: "  # not "ours": so the paper calls its own rows
 DESCRIBED = ["name", "data_set", "subset", "split", "image_size", "resolution", "crop", "precision", "scenes"]
-DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "samples", "criterion", "seed", "sampler", "steps"]
-DESCRIBED += ["skip_weight", "guidance_weight", "ema", "commit"]
+DESCRIBED += ["scenes_listed", "skipped", "views", "protocol_views", "scene_list", "samples", "criterion", "seed"]
+DESCRIBED += ["sampler", "steps", "skip_weight", "guidance_weight", "ema", "commit"]
 """What the note on a row says of its protocol."""
 
 

@@ -18,8 +18,8 @@ def refusal(source, **changes) -> str:
 def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    message = refusal("stabilityai/sd-vae-ft-mse")
-    assert "`hf download stabilityai/sd-vae-ft-mse --local-dir DIR`" in message
+    message = refusal("CompVis/stable-diffusion-v1-4")
+    assert "`hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`" in message
     assert "autoreconstructor.pretrained=DIR" in message
 
 

@@ -35,7 +35,7 @@ def loader() -> SceneLoader:
     """Five scenes of three views, in batches of two."""
     source = ListedSource([f"sequence {number}" for number in range(5)])
     store = SceneStore(source, source.names)
-    scenes = TrainingScenes(store, lambda n, rng: training_views(n, 2, rng), lambda scene, rng: scene, 1, 0)
+    scenes = TrainingScenes(store, lambda n, _, rng: training_views(n, 2, rng), lambda scene, rng: scene, 1, 0)
     return SceneLoader(scenes, 2, EpochSampler(scenes.groups(), 0), 0)
 
 

@@ -96,7 +96,11 @@ def test_a_protocol_that_does_not_fit_is_refused_before_training(toy_root, tmp_p
 @pytest.mark.parametrize(
     ("experiment", "place", "asked"),
     [
-        ("co3d_var_stage1", "autoreconstructor.pretrained", "stabilityai/sd-vae-ft-mse, or null for random weights"),
+        (
+            "co3d_var_stage1",
+            "autoreconstructor.pretrained",
+            "CompVis/stable-diffusion-v1-4, or null for random weights",
+        ),
         ("toy_var_masked", "model.checkpoint", "RUN/checkpoints/last.ckpt"),
         ("re10k_diffusion", "data.root", "DIR"),
         ("toy_diffusion", "model.autoreconstructor_checkpoint", "RUN/checkpoints/last.ckpt of stage 1"),

@@ -11,7 +11,7 @@ from completesplat.commands.evaluate import scored_data
 from completesplat.commands.trained import Trained
 from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.results.tables import SSIM_NOTE
 from completesplat.training.scene_module import SceneModule
 
@@ -133,16 +133,16 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
     ("arguments", "said"),
     [
         (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
-        (["evaluation=realestate10k_100", "evaluation.scene_list=FILE"], "have no setting scene_list"),
+        (["evaluation=realestate10k_100", "evaluation.data.scene_list=FILE"], "have no setting scene_list"),
         (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
         (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores pictures only"),
-        (["evaluation.resolution=48"], "evaluation.resolution=48: prepared pictures have one size"),
+        (["evaluation.resolution=48"], r"prepared with image_size=32 \(asked for: 48\)"),
     ],
 )
 def test_protocols_that_do_not_fit_the_data_are_refused(toy_root, packed_toys, arguments, said):
     root = packed_toys if "prepared" in said else toy_root
     run = compose_config("fit", "experiment=toy_var", f"data.root={root}", "data.image_size=32")
-    with pytest.raises(CompleteSplatError, match=said):
+    with pytest.raises((CompleteSplatError, DataError), match=said):
         scored_data(run, compose_config("fit", *arguments).evaluation)
 
 

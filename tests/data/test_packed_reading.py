@@ -13,6 +13,7 @@ import pyarrow as pa
 import pytest
 import torch
 from packed_sequences import SIZE, ListedSource, make_sequence, smooth_picture
+from PIL import Image
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
 from completesplat.data.packed.rows import EncodedPicture, decode, encode, from_row, to_row
@@ -77,6 +78,19 @@ def test_jpeg_keeps_cameras_and_masks_and_changes_colours_by_little(tmp_path: Pa
     assert_same(found, expected, tolerance=16)
     differences = [found.read(index).image.float() - expected.read(index).image for index in range(4)]
     assert 0 < torch.stack(differences).abs().mean() < 2
+
+
+def test_one_store_serves_smaller_images_as_pillow_makes_them(tmp_path: Path) -> None:
+    store, size = make(tmp_path / "store", masked=True), SIZE // 2
+    large, small = (PackedSource(store, "train", image_size).read("s1") for image_size in (None, size))
+    assert torch.equal(small.cameras.world_to_camera, large.cameras.world_to_camera)
+    torch.testing.assert_close(small.cameras.intrinsics[:, :2] * 2, large.cameras.intrinsics[:, :2])
+    assert small.cameras.image_size == (size, size)
+    for index in range(4):
+        for part, whole, filtered in zip(small.read(index), large.read(index), ("LANCZOS", "BILINEAR"), strict=True):
+            image = Image.fromarray(whole.numpy().transpose(1, 2, 0).squeeze())
+            expected = np.asarray(image.resize((size, size), Image.Resampling[filtered])).reshape(size, size, -1)
+            assert np.array_equal(part.numpy(), expected.transpose(2, 0, 1))
 
 
 def test_masks_of_some_frames_only_stay_with_them() -> None:
@@ -204,7 +218,7 @@ def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
             sequence.read(1)
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
-    assert decode(flipped, 3, SIZE).shape == (3, SIZE, SIZE)
+    assert decode(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
     row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedPicture(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
@@ -237,6 +251,7 @@ def test_a_manifest_that_does_not_fit_is_refused(place: list, value: object, kin
 
 def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> None:
     settings_must_match(store, {"image_size": float(SIZE)})
+    settings_must_match(store, {"image_size": SIZE // 2})  # images are made smaller when they are read
     with pytest.raises(DataError, match=r"crop=None \(asked for: central\), image_size=16 \(asked for: 32\)"):
         settings_must_match(store, {"image_size": 32, "crop": "central"})
 

@@ -87,8 +87,13 @@ def test_a_point_reprojects_onto_its_pixel(tmp_path, form, crop):
 def test_targets_stay_near_the_reference_and_may_be_none(root):
     data = module(root, min_gap=1, max_gap=2)
     for seed in range(50):
-        reference, targets = data.training_views(7, np.random.default_rng(seed))
+        reference, targets = data.training_views(7, 0, np.random.default_rng(seed))
         assert {abs(target - reference) for target in targets} <= {1, 2}
+    growing = module(root, targets=9, max_gap={"first": 2, "last": 6, "epochs": 4})
+    drawn = {epoch: growing.training_views(40, epoch, np.random.default_rng(epoch)) for epoch in range(9)}
+    farthest = {epoch: max(abs(target - views[0]) for target in views[1]) for epoch, views in drawn.items()}
+    assert [farthest[epoch] for epoch in (0, 2, 4, 8)] == [2, 4, 6, 6]
+    assert growing.describe()["protocol_views"].endswith("the last 6 frames away")  # what is trained is tested
     (batch, *_) = epoch(module(root, targets=0, horizontal_flip=True).train_dataloader(), 0)
     assert batch.targets.images.shape == (2, 0, 3, 16, 16)
     assert torch.equal(batch.all_views().images, batch.reference.images[:, None])
@@ -99,7 +104,7 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
     (batch,) = list(data.test_dataloader())
     store = data.store("test")
     for number, key in enumerate(store.names):
-        assert same(batch[number], store.scene(store.source.read(key), 0, [1, 3]))
+        assert same(batch[number], store.scene(store.source.read(key), 0, [2, 4]))
     assert sorted(batch.names) == sorted(clip.key for clip in TEST)
 
 

@@ -2,12 +2,14 @@ import numpy as np
 import pytest
 
 from completesplat.data.loading.view_selection import (
+    GrowingGap,
     draws,
     evaluation_views,
     evaluation_views_within,
     nearby_views,
     training_views,
 )
+from completesplat.errors import CompleteSplatError
 
 
 def test_every_frame_becomes_the_reference_and_a_target_of_every_other():
@@ -25,6 +27,8 @@ def test_short_sequences_repeat_targets_but_never_the_reference():
     assert (len(targets), set(targets)) == (5, {0, 1, 2} - {reference})
     assert {str(nearby_views(4, 2, 9, 20, draws(0, 0, i))) for i in range(50)} == {"(0, [3, 3])", "(3, [0, 0])"}
     assert evaluation_views_within(3, 4, 30) == (0, [1, 1, 2, 2])
+    assert evaluation_views_within(300, 1, 150) == (0, [150])  # DFM's, `experiment_scripts/re_results.py`
+    assert evaluation_views_within(100, 1, 150) == (0, [99])
 
 
 def test_a_draw_depends_on_seed_epoch_and_index_only():
@@ -59,9 +63,15 @@ def test_nearby_views_keep_both_gaps_and_reach_everything_that_does(frames, min_
 @pytest.mark.parametrize(("frames", "targets", "gap"), [(100, 3, 30), (20, 3, 30), (31, 30, 30), (300, 7, 150)])
 def test_evaluation_targets_are_spread_over_the_frames_that_follow(frames, targets, gap):
     reference, chosen = evaluation_views_within(frames, targets, gap)
-    following = min(gap, frames - 1)
     assert (reference, len(set(chosen))) == (0, targets)
-    assert 1 <= chosen[0] < chosen[-1] <= following
-    # As many frames before the first as after the last, up to rounding, and equal steps.
-    assert abs((chosen[0] - 1) - (following - chosen[-1])) <= 1
-    assert np.ptp(np.diff(chosen)) <= 1
+    assert (chosen[0] >= 1, chosen[-1]) == (True, min(gap, frames - 1))
+    assert np.ptp(np.diff([reference, *chosen])) <= 1
+
+
+def test_a_growing_gap_is_linear_in_the_epoch_and_ends_at_its_last() -> None:
+    gap = GrowingGap(first=30, last=150, epochs=50)
+    assert [gap.at(epoch) for epoch in (0, 25, 50, 90)] == [30, 90, 150, 150]
+    assert GrowingGap(7, 7, 0).at(0) == 7
+    for first, last, epochs in [(0, 5, 1), (6, 5, 1), (5, 6, -1)]:
+        with pytest.raises(CompleteSplatError, match="max_gap"):
+            GrowingGap(first, last, epochs)

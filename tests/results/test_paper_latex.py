@@ -132,7 +132,7 @@ HEADINGS = {"Rendering Speed": "speed", "Methods": "method", "Apples PSNR ↑": 
 def table(rows: str = ROWS, label: str = "small", says: str = r"$\dagger$: cited from \cite{one}") -> PublishedTable:
     columns = [PrintedColumn(heading, key, "") for heading, key in HEADINGS.items()]
     cells = [[parse(cell) for cell in line.split("|")] for line in rows.splitlines()]
-    return PublishedTable("small", "Table 1", label, "", "full", "novel", [], [says], columns, cells, {})
+    return PublishedTable("small", "Table 1", label, "", "full", "novel", {}, [says], columns, cells, {})
 
 
 @pytest.mark.skipif(PAPER is None, reason="COMPLETESPLAT_PAPER does not name the LaTeX of the paper")

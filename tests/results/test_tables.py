@@ -23,6 +23,7 @@ from completesplat.results.tables import (
 @pytest.fixture
 def written(runs, run, tmp_path):
     whole = {"subset": "fewview_dev", "scenes_listed": 20}
+    whole |= {"protocol_views": "reference: a sequence's first frame; targets: its other frames"}
     run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%|", 20.0)
     found = tables(find(runs))

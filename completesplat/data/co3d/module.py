@@ -102,7 +102,7 @@ class CO3DDataModule(SceneDataModule):
         splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
-    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
+    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
         """A random reference and random targets, or targets all around."""
         return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
 

@@ -50,8 +50,6 @@ def _check_settings(
         raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
     if background is not None and not 0 <= background <= 1:
         raise CompleteSplatError(f"data.background={background}: must lie between 0 and 1")
-    if latent_cache == "":
-        raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
     if latent_cache is not None and (augmented or background is not None):
         unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
@@ -75,7 +73,7 @@ class SceneDataModule(LightningDataModule):
         workers: processes that load data; 0: none; None: one for each core, at most four.
         cache: keep decoded pictures in memory.
         latent_cache: train stage 2 from the latents in this folder (`CachedTrainingScenes`), without augmentation of
-            pictures; validation and test read pictures. An empty name is one that is still to be given.
+            pictures; validation and test read pictures.
         on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
         allow_changed: a run that is continued may go on with other training data than it had.
@@ -144,8 +142,8 @@ class SceneDataModule(LightningDataModule):
         """
 
     @abstractmethod
-    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
-        """Reference and targets of a training scene."""
+    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Return reference and targets of a training scene."""
 
     @abstractmethod
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
@@ -181,7 +179,7 @@ class SceneDataModule(LightningDataModule):
         if split not in self._sources:
             if is_packed(self.root):
                 settings_must_match(self.root, self.packed_settings())
-                self._sources[split] = PackedSource(self.root, split)
+                self._sources[split] = PackedSource(self.root, split, self.image_size)
             else:
                 self._sources |= self.open(split)
         source = self._sources[split]

@@ -105,14 +105,14 @@ class TrainingScenes(Dataset[Loaded]):
     An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
     only.
 
-    `choose` is (number of a sequence's frames, random generator) -> views; `references` are items of a sequence in one
-    epoch.
+    `choose` is (number of a sequence's frames, epoch, random generator) -> views; `references` are items of a sequence
+    in one epoch.
     """
 
     def __init__(
         self,
         store: SceneStore,
-        choose: Callable[[int, np.random.Generator], Choice],
+        choose: Callable[[int, int, np.random.Generator], Choice],
         augment: Callable[[SceneBatch, np.random.Generator], SceneBatch],
         references: int,
         seed: int,
@@ -132,16 +132,16 @@ class TrainingScenes(Dataset[Loaded]):
         refused: list[DataError] = []
         for _ in range(ATTEMPTS):
             try:
-                return Loaded(self.draw(self.store.names[index // self.references], rng), tuple(refused))
+                return Loaded(self.draw(self.store.names[index // self.references], epoch, rng), tuple(refused))
             except DataError as error:
                 refused.append(error)
                 index = int(rng.integers(len(self)))
         return Loaded(None, tuple(refused))
 
-    def draw(self, name: str, rng: np.random.Generator) -> SceneBatch | CachedScene:
+    def draw(self, name: str, epoch: int, rng: np.random.Generator) -> SceneBatch | CachedScene:
         """A scene of random views of the sequence of this name; `DataError` if it or a picture cannot be read."""
         sequence = self.store.source.read(name)
-        scene = self.store.scene(sequence, *self.choose(len(sequence.frames), rng))
+        scene = self.store.scene(sequence, *self.choose(len(sequence.frames), epoch, rng))
         return self.augment(scene, rng)
 
     def groups(self) -> list[list[int]]:

@@ -1,6 +1,31 @@
 """Which frame of a sequence is the reference and which are its targets."""
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from completesplat.errors import CompleteSplatError
+
+
+@dataclass(frozen=True)
+class GrowingGap:
+    """Largest gap in frames between two views: from `first` it grows linearly, over `epochs`, to `last`.
+
+    pixelSplat trains like this, on 25 to 45 frames (`config/dataset/view_sampler_dataset_specific_config/
+    bounded_re10k.yaml`). `CompleteSplatError` unless 1 <= first <= last and 0 <= epochs.
+    """
+
+    first: int
+    last: int
+    epochs: int
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.first <= self.last and self.epochs >= 0):
+            raise CompleteSplatError("data.max_gap: needs 1 <= first <= last and 0 <= epochs")
+
+    def at(self, epoch: int) -> int:
+        """Return the gap in an epoch."""
+        return round(self.first + (self.last - self.first) * min(epoch / max(self.epochs, 1), 1))
 
 
 def draws(seed: int, epoch: int, index: int) -> np.random.Generator:
@@ -57,9 +82,8 @@ def nearby_views(
 
 
 def evaluation_views_within(frames: int, targets: int, gap: int) -> tuple[int, list[int]]:
-    """The first frame as reference; `targets` of the `gap` frames that follow it, evenly spaced.
+    """Return the first frame as reference and `targets` evenly spaced frames, the last one `gap` frames after it.
 
-    Targets repeat in a sequence that has fewer frames.
+    In a shorter sequence the last target is the last frame; targets repeat where there are too few frames.
     """
-    following = min(gap, frames - 1)
-    return 0, (1 + np.round((np.arange(targets) + 0.5) * following / targets - 0.5).astype(int)).tolist()
+    return 0, np.ceil(min(gap, frames - 1) * np.arange(1, targets + 1) / targets).astype(int).tolist()

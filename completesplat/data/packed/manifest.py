@@ -140,8 +140,16 @@ def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None 
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
-    """Refuse a store that was made with other settings, with a `DataError` that names every one that differs."""
-    differing = differences(read_manifest(root).settings, settings)
+    """Refuse a store that was made with other settings, or in smaller images than are asked for.
+
+    Raises:
+        DataError: it names every setting that differs.
+    """
+    stored, wanted = read_manifest(root).settings, dict(settings)
+    sizes = stored.get("image_size"), wanted.get("image_size")
+    if isinstance(sizes[0], int) and isinstance(sizes[1], int) and sizes[0] > sizes[1]:
+        wanted["image_size"] = sizes[0]  # images are made smaller when they are read
+    differing = differences(stored, wanted)
     if differing:
         advice = "set these as they were, or prepare the data again into another folder"
         raise DataError(f"prepared with {differing}: {advice}", str(root))

@@ -14,9 +14,10 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
+from completesplat.data.pictures.crop import Square, cut_square
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
-from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.cameras import Cameras, crop_resize
 
 # Arguments of Pillow for each codec. BMP is not compressed: more than twice the bytes of PNG, decoded in a ninth of the
 # time.
@@ -39,12 +40,18 @@ def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
     return content.getvalue()
 
 
-def decode(content: bytes, channels: int, size: int) -> UInt8[Tensor, "channel size size"]:
-    """The inverse of `encode`; `BadPicture` if damaged, or with other channels or another size than expected."""
+def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tensor, "channel wanted wanted"]:
+    """Return the image that `encode` wrote in `size` pixels, resized to `wanted`.
+
+    Raises:
+        BadPicture: the bytes are damaged, or have other channels or another size than expected.
+    """
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
             # The header is looked at before the pixels are, so that no bytes make a huge picture.
             wrong = image.size != (size, size) or len(image.getbands()) != channels
+            if not wrong and wanted != size:
+                return cut_square(image, Square(0, 0, size), wanted)
             pixels = None if wrong else np.array(image)
     # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
@@ -124,8 +131,8 @@ def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[Enco
     return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=features().arrow_schema)
 
 
-def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
-    """The sequence of a table with one row; pictures are decoded when they are read.
+def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None) -> PosedSequence:
+    """Return the sequence of a table with one row, in images of `image_size`; they are decoded when they are read.
 
     Raises:
         DataError: damaged, another sequence than `name`, columns of different lengths, or numbers that are not finite.
@@ -145,6 +152,7 @@ def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
         frames = tuple(numbers["frames"].tolist())
         world_to_camera = torch.from_numpy(numbers["world_to_camera"]).view(count, 4, 4)
         cameras = Cameras(world_to_camera, torch.from_numpy(numbers["intrinsics"]).view(count, 3, 3), (size, size))
+        wanted = image_size or size
         depth_ranges = torch.from_numpy(numbers["depth_ranges"]).view(count, 2)
         images, masks = _values(row, "images", count), _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
@@ -154,9 +162,9 @@ def from_row(row: pa.Table, file: str, name: str) -> PosedSequence:
                 image, mask = images[index].as_py(), masks[index].as_py()
                 if image is None or EncodedPicture(image, mask).checksum() != checksums[index]:
                     raise BadPicture("is no longer what was written")
-                return Picture(decode(image, 3, size), None if mask is None else decode(mask, 1, size))
+                return Picture(decode(image, 3, size, wanted), None if mask is None else decode(mask, 1, size, wanted))
 
-        return PosedSequence(name, frames, cameras, depth_ranges, read)
+        return PosedSequence(name, frames, crop_resize(cameras, 0, 0, size, wanted), depth_ranges, read)
 
 
 def _values(row: pa.Table, column: str, count: int | None = None) -> pa.Array:

@@ -16,18 +16,21 @@ from completesplat.weights import sha256_of
 
 
 class PackedSource(SequenceSource):
-    """One split of a packed store; what was refused while it was made is in its manifest.
+    """One split of a packed store, in images of `image_size` (None: of the size that it was made with).
+
+    The manifest says what was refused while the store was made.
 
     `DataError` if there is no such split, or for a malformed manifest, or a shard that is missing or of another size.
     """
 
-    def __init__(self, root: Path, split: str) -> None:
+    def __init__(self, root: Path, split: str, image_size: int | None = None) -> None:
         splits = read_manifest(root).splits
         if split not in splits:
             there = ", ".join(splits) or "none"
             raise DataError(f"no split {split} in this packed store; there are: {there}", str(root))
         entry = splits[split]
         self.root = root
+        self.image_size = image_size
         self.shards = entry.shards
         self.names = list(entry.names)
         self.refused: list[DataError] = []
@@ -64,7 +67,7 @@ class PackedSource(SequenceSource):
                 found = self._opened[number][row]
             except (pa.ArrowException, OSError, ValueError) as error:
                 raise UnreadableFile(f"damaged ({error})") from None
-        return from_row(found, str(path), name)
+        return from_row(found, str(path), name, self.image_size)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         """Shard by shard where they have to be fetched: training starts with the first one. Else in any order."""

@@ -11,7 +11,7 @@ import torch
 
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
-from completesplat.data.loading.view_selection import evaluation_views_within, nearby_views
+from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
 from completesplat.data.pictures.crop import Square, principal_square
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import Clip, TextClips
@@ -103,9 +103,11 @@ class RE10KDataModule(SceneDataModule):
     near it. Clips are checked when they are read. Each loading process has at most two chunks in memory.
 
     Args:
-        min_gap, max_gap: frames between the reference and a training target, either way (Flash3D: at most 30).
+        min_gap, max_gap: fewest and most frames between the reference and a training target, either way; the most may
+            grow from epoch to epoch (`GrowingGap`).
         evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and
-            `evaluation_targets` evenly spaced targets among the next `evaluation_gap` frames.
+            `evaluation_targets` evenly spaced targets, the last one `evaluation_gap` frames away (None: `max_gap` in
+            the end), or the clip's last.
         evaluation_index: a file of test views, instead of that rule: in the format of pixelSplat, MVSplat360,
             latentSplat or Flash3D (`read_index`).
         scene_list: a file with the keys of the clips to test, one a line.
@@ -120,9 +122,9 @@ class RE10KDataModule(SceneDataModule):
         self,
         root: str,
         min_gap: int = 1,
-        max_gap: int = 30,
+        max_gap: int | Mapping[str, int] = 150,
         evaluation_targets: Positive = 3,
-        evaluation_gap: int = 30,
+        evaluation_gap: Positive | None = None,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
         crop: str = "center",
@@ -134,14 +136,15 @@ class RE10KDataModule(SceneDataModule):
         **settings: Any,
     ) -> None:
         super().__init__(root, **settings)
-        if not 1 <= min_gap <= max_gap or evaluation_gap < 1:
-            raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap and 1 <= evaluation_gap")
+        self.max_gap = GrowingGap(max_gap, max_gap, 0) if isinstance(max_gap, int) else GrowingGap(**max_gap)
+        if not 1 <= min_gap <= self.max_gap.first:
+            raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap")
         if not 0 < near < far or not scale > 0:
             raise CompleteSplatError("data: needs 0 < near < far and 0 < scale")
         if crop not in CROPS:
             raise CompleteSplatError(f"data.crop={crop}: choose one of {', '.join(CROPS)}")
-        self.gaps = min_gap, max_gap
-        self.evaluation = evaluation_targets, evaluation_gap
+        self.min_gap = min_gap
+        self.evaluation = evaluation_targets, evaluation_gap or self.max_gap.last
         self.evaluation_index = Path(evaluation_index) if evaluation_index else None
         self.scene_list = Path(scene_list) if scene_list else None
         self.framing = ClipFraming(self.image_size, crop, scale, near, far)
@@ -155,15 +158,15 @@ class RE10KDataModule(SceneDataModule):
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
-        """See `SceneDataModule`; a list that decides is named, with the work whose format it has and its checksum."""
-        views = "reference: first frame; {} targets within {} frames".format(*self.evaluation)
+        """See `SceneDataModule`; a file is named by its checksum, an index also by the work whose format it has."""
+        views = "reference: first frame; {} targets, the last {} frames away".format(*self.evaluation)
         if self.index is not None:
-            views = f"those of {_identity(self.evaluation_index, self.index.form)}"
-        listed = "" if self.scene_list is None else f"; scenes of {_identity(self.scene_list)}"
+            views = f"index in {self.index.form}'s format, SHA-256 {_checksum(self.evaluation_index)}"
         return {
             "data_set": "realestate10k",
             "crop": f"largest square, {self.framing.crop}",
-            "protocol_views": views + listed,
+            "protocol_views": views,
+            **({} if self.scene_list is None else {"scene_list": f"SHA-256 {_checksum(self.scene_list)}"}),
         }
 
     def packed_settings(self) -> dict[str, Any]:
@@ -193,12 +196,12 @@ class RE10KDataModule(SceneDataModule):
         views = self._test_views
         return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
 
-    def training_views(self, frames: int, rng: np.random.Generator) -> Choice:
-        """A random reference and random targets near it."""
-        return nearby_views(frames, self.targets, *self.gaps, rng)
+    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Return a random reference and random targets near it."""
+        return nearby_views(frames, self.targets, self.min_gap, self.max_gap.at(epoch), rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """The views of the evaluation index; without one, the first frame and some that follow it."""
+        """Return the views of the evaluation index; without one, the first frame and some that follow it."""
         if sequence.name not in self._test_views:
             return evaluation_views_within(len(sequence.frames), *self.evaluation)
         reference, targets = self._test_views[sequence.name]
@@ -209,7 +212,6 @@ class RE10KDataModule(SceneDataModule):
         return position[reference], [position[frame] for frame in targets]
 
 
-def _identity(path: Path | None, *said: str) -> str:
-    """A file's name and content, wherever it lies."""
+def _checksum(path: Path | None) -> str:
     assert path is not None
-    return f"{path.name} ({', '.join([*said, f'SHA-256 {sha256_of(require_file(path))[:12]}'])})"
+    return sha256_of(require_file(path))[:12]
