@@ -1,5 +1,6 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else; many of them in parts that fit into memory."""
 
+import copy
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -70,8 +71,7 @@ class Sampler:
         prediction says about the clean latent. `CompleteSplatError`: a guidance weight outside of [0, 1], or a number
         of steps that the scheduler cannot make.
         """
-        scheduler = self.scheduler
-        self._set_steps(self.steps if steps is None else steps, noise.device)
+        scheduler = self.set_up(steps, noise.device)
         flow, fresh = is_flow(scheduler), fresh_noise(noise)
         latent: Tensor = noise if flow else noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
@@ -87,19 +87,27 @@ class Sampler:
                 latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
 
-    def _set_steps(self, steps: int, device: torch.device) -> None:
+    def set_up(self, steps: int | None = None, device: torch.device | None = None) -> Any:
+        """Return a copy of the scheduler that is set to a number of steps (by default the sampler's).
+
+        Schedulers keep state while they draw. Each call has its own, so that several threads can share a model.
+
+        Raises:
+            CompleteSplatError: a number of steps that the scheduler cannot make.
+        """
+        steps, scheduler = self.steps if steps is None else steps, copy.deepcopy(self.scheduler)
         if not 1 <= steps <= self.training_timesteps:
             raise CompleteSplatError(f"steps={steps}: must lie between 1 and {self.training_timesteps}")
-        if isinstance(self.scheduler, DDIMScheduler) and self.training_timesteps % steps:
+        if isinstance(scheduler, DDIMScheduler) and self.training_timesteps % steps:
             # It goes down by whole timesteps, and would end each step at a noise level that the next does not start at.
             raise CompleteSplatError(
                 f"steps={steps}: DDIM's must divide {self.training_timesteps} (10, 20, 25, 40, 50, ...); "
                 "sampler=dpm20 takes any number"
             )
-        if is_flow(self.scheduler):  # diffusers' own would end at t = 1/1000 and waste a step from there
-            self.scheduler.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), device=device)
-        else:
-            self.scheduler.set_timesteps(steps, device=device)
+        # diffusers' own spacing for flow matching would end at t = 1/1000 and waste a step from there
+        spacing = {"sigmas": np.linspace(1, 1 / steps, steps)} if is_flow(scheduler) else {"num_inference_steps": steps}
+        scheduler.set_timesteps(**spacing, device=device)
+        return scheduler
 
     def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
         """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
