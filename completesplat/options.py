@@ -2,11 +2,14 @@
 
 A comment above a key or behind its value explains it; the first comment of a file is about the file. Shells that
 complete the command line call `completesplat --complete WORDS`, which is answered from here: it has to be quick.
+Defaults that depend on an installed package are read here as well, without importing it.
 """
 
 import re
+import runpy
 from collections.abc import Collection, Iterator, Sequence
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -251,3 +254,18 @@ def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
     # Keys below the first point are shown when it is typed.
     near = [name for name in found if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
     return [*(tasks if len(words) == 1 else []), *near, "--help"]
+
+
+def gsplat_constants() -> dict[str, float]:
+    """Return the constants compiled into the kernels of the installed gsplat, without importing it.
+
+    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. 1.5.3 has them in its kernels only
+    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); they are the default where there is no gsplat.
+    """
+    spec = find_spec("gsplat")
+    files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]
+    stated = {"MAX_ALPHA": 0.999, "ALPHA_THRESHOLD": 1 / 255, "TRANSMITTANCE_THRESHOLD": 1e-4}
+    for file in filter(Path.is_file, files):
+        stated |= runpy.run_path(str(file))
+    names = {"max_alpha": "MAX_ALPHA", "min_alpha": "ALPHA_THRESHOLD", "min_transmittance": "TRANSMITTANCE_THRESHOLD"}
+    return {name: stated[constant] for name, constant in names.items()}
