@@ -72,7 +72,7 @@ def protocol(
         "precision": evaluation["precision"],
         "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},
-        **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
+        **{"samples": scored.samples, "criterion": scored.criterion, "best": scored.best_rules(), "seed": scored.seed},
         **drawing(module),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",

@@ -24,7 +24,7 @@ Scores = dict[tuple[str, str, str], float]
 Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
 PROPER_REGIONS = ("full", "hidden")
-MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
+MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
 
@@ -36,8 +36,8 @@ class Evaluation:
     process of several scored it.
 
     Args:
-        samples: drawn of each scene. With more than one there are three rows: `model` (the first sample), `best_of_k`
-            (the best by the metric `criterion` over all pixels of the novel views, an oracle) and `mean_of_k`.
+        samples: drawn of each scene. With more than one there are further rows: `model` (the first sample), two oracles
+            (`best_of_k`, `best_of_k_by_metric`; see `best_rules`) and `mean_of_k`.
         seed: of what is drawn; each scene has its own, which depends on its name only besides.
         perceptual: LPIPS, or why it is missing.
         sets: metrics of whole sets of novel views by name, or why they are missing.
@@ -85,25 +85,33 @@ class Evaluation:
         """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
         truth = scenes.all_views()
         for b, name in enumerate(scenes.names):
-            self._add(predictor, name, images[b].clamp(0, 1), truth[b])
+            shown = images[b].clamp(0, 1)
+            self._add(predictor, name, self.score(shown, truth[b]), dict.fromkeys(REGIONS, shown), truth[b])
 
     @torch.no_grad()
     def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
-        """Score all samples of one scene as `model`, `best_of_k` and `mean_of_k`."""
+        """Score all samples of one scene: their first, the best ones (`best_rules`) and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
-        self._add(MODEL, name, images[0], truth)
+        self._add(MODEL, name, each[0], dict.fromkeys(REGIONS, images[0]), truth)
         if len(each) == 1:
             return
-        by = [scores["full", "novel", self.criterion] for scores in each]
-        higher = HIGHER_IS_BETTER[self.criterion]
-        self._add(BEST, name, images[best(by, higher)], truth)
+        chosen = {
+            (region, metric): best([scores[region, "novel", metric] for scores in each], HIGHER_IS_BETTER[metric])
+            for region in REGIONS
+            for metric in self.metrics
+        }
+        by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
+        scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
+        self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
+        self.scores[BEST_BY_METRIC][name] = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0]}
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
         with torch.autocast(images.device.type, enabled=False):
             noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
             by_noise = [self.metrics[self.criterion](one, truth.images[1:]).mean().item() for one in noisy]
+        by, higher = [scores["full", "novel", self.criterion] for scores in each], HIGHER_IS_BETTER[self.criterion]
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
@@ -132,14 +140,23 @@ class Evaluation:
                     mean = sum(found[metric] for found in known) / len(known)
                     self.scores[MODEL][name][region, kind, f"depth_{metric}"] = mean
 
-    def _add(self, predictor: str, name: str, images: Float[Tensor, "view 3 height width"], truth: Views) -> None:
-        self.scores[predictor][name] = self.score(images, truth)
-        self.views[name] = len(images) - 1
+    def best_rules(self) -> dict[str, str]:
+        """Return, for each row of a best sample, which sample its scores are of; nothing for a single sample."""
+        rules = {
+            BEST: f"one sample for all metrics of a region, the one with the best {self.criterion} there in novel views",
+            BEST_BY_METRIC: "a sample for each metric and region, the best by it in novel views; no metrics of sets",
+        }
+        return rules if self.samples > 1 else {}
+
+    def _add(self, predictor: str, name: str, scores: Scores, images: Mapping[str, Tensor], truth: Views) -> None:
+        """Keep the scores of a scene, and what set metrics need of the images [view 3 height width] of each region."""
+        self.scores[predictor][name] = scores
+        self.views[name] = len(truth.images) - 1
         # Where metrics look is no matter of chance: pictures alone have the same scores in every run.
-        seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(images))]
+        seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(truth.images))]
         for region in REGIONS:
-            for owner, pictures in ((predictor, images), (ImageSets.TRUE, truth.images)):
-                with torch.autocast(images.device.type, enabled=False):
+            for owner, pictures in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
+                with torch.autocast(pictures.device.type, enabled=False):
                     self.sets.add(owner, region, name, _region(pictures.float(), truth, region)[1:], seeds)
 
     def gather(self) -> None:

@@ -12,6 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.own import alike, mode_tables, own_tables, protocol_said
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.scores import (
+    BEST_BY_METRIC,
     BEST_OF_K,
     COST,
     LEADING,
@@ -168,7 +169,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
         return False
     if table.subset and protocol.get("subset") != table.subset:
         return False
-    if entry.predictor == BEST_OF_K and protocol.get("samples") != table.oracle_samples:
+    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.oracle_samples:
         return False
     own = {"scenes": str(protocol["scenes"]), "resolution": str(protocol["resolution"])}
     unstated = {"scenes": str(protocol.get("scenes_listed"))}
