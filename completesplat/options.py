@@ -2,7 +2,6 @@
 
 A comment above a key or behind its value explains it; the first comment of a file is about the file. Shells that
 complete the command line call `completesplat --complete WORDS`, which is answered from here: it has to be quick.
-Defaults that depend on an installed package are read here as well, without importing it.
 """
 
 import re
@@ -175,17 +174,10 @@ def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[S
 
 def settings_of_option(group: str, option: str, place: str | None = None) -> list[Setting]:
     """All settings of an option, with those that its file takes over from others; `place`: where they belong."""
-    written = read(f"{group}/{option}")
-    found: dict[str, Setting] = {}
-    for base in written.bases:
-        for setting in settings_of_option(group, base, ""):
-            found[setting.key] = setting
-    for setting in own_settings(written):
-        earlier = found.get(setting.key, setting)
-        found[setting.key] = setting._replace(comment=setting.comment or earlier.comment)
+    written = with_bases(group, option)
     where = place if place is not None else written.package or group.replace("/", ".")
     prefix = "" if where in ("", "_global_") else f"{where}."
-    return [setting._replace(key=prefix + setting.key) for setting in found.values()]
+    return [setting._replace(key=prefix + setting.key) for setting in own_settings(written)]
 
 
 def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
@@ -201,7 +193,9 @@ def with_bases(group: str, option: str) -> ConfFile:
     written = read(f"{group}/{option}")
     inherited = [with_bases(group, base) for base in written.bases]
     choices = [choice for one in inherited for choice in one.choices] + written.choices
-    settings = {one.key: one for base in [*inherited, written] for one in base.settings}
+    settings: dict[str, Setting] = {}
+    for one in (one for base in [*inherited, written] for one in base.settings):
+        settings[one.key] = one._replace(comment=one.comment or settings.get(one.key, one).comment)
     return written._replace(settings=list(settings.values()), choices=choices)
 
 

@@ -24,14 +24,7 @@ OnStep = Callable[[int, int, Tensor], None]
 """(number of the denoiser call, timestep, estimate of the clean latent)."""
 
 # What a denoiser was trained with, whatever sampler draws from it.
-FORWARD_PROCESS = (
-    "num_train_timesteps",
-    "beta_start",
-    "beta_end",
-    "beta_schedule",
-    "trained_betas",
-    "prediction_type",
-)
+FORWARD_PROCESS = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
 
 
 class Sampler:
@@ -40,8 +33,7 @@ class Sampler:
     Args:
         scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
         steps: denoising steps unless a call says otherwise (50 in the paper).
-        ancestral: of flow matching: renew as much of the noise in each step as the reverse of the forward process does
-            (`renewed`), instead of none. Errors of earlier steps are forgotten so.
+        ancestral: of flow matching only: renew noise in each step (`renewed`), which forgets errors of earlier ones.
 
     Raises:
         CompleteSplatError: `ancestral` for diffusion.
@@ -67,9 +59,10 @@ class Sampler:
         """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone.
 
         A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
-        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them with what the
-        prediction says about the clean latent. `CompleteSplatError`: a guidance weight outside of [0, 1], or a number
-        of steps that the scheduler cannot make.
+        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them.
+
+        Raises:
+            CompleteSplatError: a guidance weight outside of [0, 1], or steps that the scheduler cannot make.
         """
         scheduler = self.set_up(steps, noise.device)
         flow, fresh = is_flow(scheduler), fresh_noise(noise)
@@ -95,15 +88,14 @@ class Sampler:
         Raises:
             CompleteSplatError: a number of steps that the scheduler cannot make.
         """
-        steps, scheduler = self.steps if steps is None else steps, copy.deepcopy(self.scheduler)
-        if not 1 <= steps <= self.training_timesteps:
-            raise CompleteSplatError(f"steps={steps}: must lie between 1 and {self.training_timesteps}")
-        if isinstance(scheduler, DDIMScheduler) and self.training_timesteps % steps:
+        scheduler, most = copy.deepcopy(self.scheduler), self.training_timesteps
+        steps = self.steps if steps is None else steps
+        if not 1 <= steps <= most:
+            raise CompleteSplatError(f"steps={steps}: must lie between 1 and {most}")
+        if isinstance(scheduler, DDIMScheduler) and most % steps:
             # It goes down by whole timesteps, and would end each step at a noise level that the next does not start at.
-            raise CompleteSplatError(
-                f"steps={steps}: DDIM's must divide {self.training_timesteps} (10, 20, 25, 40, 50, ...); "
-                "sampler=dpm20 takes any number"
-            )
+            advice = f"must divide {most} (10, 20, 25, 40, 50, ...); sampler=dpm20 takes any number"
+            raise CompleteSplatError(f"steps={steps}: DDIM's {advice}")
         # diffusers' own spacing for flow matching would end at t = 1/1000 and waste a step from there
         spacing = {"sigmas": np.linspace(1, 1 / steps, steps)} if is_flow(scheduler) else {"num_inference_steps": steps}
         scheduler.set_timesteps(**spacing, device=device)
@@ -200,12 +192,11 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
     while start < count:
         try:
             parts.append(draw(slice(start, min(start + size, count))))
+            start += size
+            continue
         except torch.cuda.OutOfMemoryError:
             if size == 1:
                 raise
-        else:
-            start += size
-            continue
         # Not in the handler, where the error still holds what was computed.
         torch.cuda.empty_cache()
         logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)

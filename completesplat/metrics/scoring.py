@@ -25,6 +25,11 @@ Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
 PROPER_REGIONS = ("full", "hidden")
 MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
+BEST_RULES = {
+    BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
+    BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
+}
+"""Which sample the scores of a row are of; the paper does not say which one is the best."""
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
 
@@ -37,7 +42,7 @@ class Evaluation:
 
     Args:
         samples: drawn of each scene. With more than one there are further rows: `model` (the first sample), two oracles
-            (`best_of_k`, `best_of_k_by_metric`; see `best_rules`) and `mean_of_k`.
+            (`best_of_k`, `best_of_k_by_metric`; see `BEST_RULES`) and `mean_of_k`.
         seed: of what is drawn; each scene has its own, which depends on its name only besides.
         perceptual: LPIPS, or why it is missing.
         sets: metrics of whole sets of novel views by name, or why they are missing.
@@ -52,13 +57,11 @@ class Evaluation:
         sets: Mapping[str, SetMetric | Missing | None] | None = None,
     ) -> None:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
-        self.missing: dict[str, str] = {}
         if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
         given = list((sets or {}).values())
-        for absent in [perceptual, *given]:
-            if isinstance(absent, Missing):
-                self.missing |= dict.fromkeys(absent.names, str(absent))
+        absent = [metric for metric in (perceptual, *given) if isinstance(metric, Missing)]
+        self.missing = {name: str(metric) for metric in absent for name in metric.names}
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
         if criterion not in self.metrics:
@@ -90,7 +93,7 @@ class Evaluation:
 
     @torch.no_grad()
     def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
-        """Score all samples of one scene: their first, the best ones (`best_rules`) and their mean."""
+        """Score all samples of one scene: their first, the best ones (`BEST_RULES`) and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
         self._add(MODEL, name, each[0], dict.fromkeys(REGIONS, images[0]), truth)
@@ -140,14 +143,6 @@ class Evaluation:
                     mean = sum(found[metric] for found in known) / len(known)
                     self.scores[MODEL][name][region, kind, f"depth_{metric}"] = mean
 
-    def best_rules(self) -> dict[str, str]:
-        """Return, for each row of a best sample, which sample its scores are of; nothing for a single sample."""
-        rules = {
-            BEST: f"one sample for all metrics of a region, the one with the best {self.criterion} there in novel views",
-            BEST_BY_METRIC: "a sample for each metric and region, the best by it in novel views; no metrics of sets",
-        }
-        return rules if self.samples > 1 else {}
-
     def _add(self, predictor: str, name: str, scores: Scores, images: Mapping[str, Tensor], truth: Views) -> None:
         """Keep the scores of a scene, and what set metrics need of the images [view 3 height width] of each region."""
         self.scores[predictor][name] = scores
@@ -178,8 +173,8 @@ class Evaluation:
             names = sorted(scenes)
             entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
             for region, view, metric in dict.fromkeys(key for name in names for key in scenes[name]):
-                found = (scenes[name].get((region, view, metric)) for name in names)
-                values = [value for value in found if value is not None]
+                key = region, view, metric
+                values = [scenes[name][key] for name in names if key in scenes[name]]
                 entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
             for region in REGIONS:
                 entry[region]["novel"] |= self.sets.results(predictor, region)
@@ -187,15 +182,16 @@ class Evaluation:
         if self.drawn:
             names = sorted(self.drawn)
             for kind in ("curve", "curve_noisy_mean"):
-                curves = zip(*(self.drawn[name][kind] for name in names), strict=True)
-                results[BEST][kind] = [sum(values) / len(values) for values in curves]
+                results[BEST][kind] = _means([self.drawn[name][kind] for name in names])
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
             for region in PROPER_REGIONS:
                 known = [shares[region] for name in names if region in (shares := self.drawn[name]["ranks"])]
-                if known:
-                    mean = [sum(values) / len(known) for values in zip(*known, strict=True)]
-                    results[MEAN][f"ranks_{region}"] = mean
+                results[MEAN] |= {f"ranks_{region}": _means(known)} if known else {}
         return results
+
+
+def _means(rows: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(values) / len(rows) for values in zip(*rows, strict=True)]
 
 
 def noisy_mean(
@@ -251,12 +247,12 @@ def depth_errors(
     for own, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
         p, t = own[counted], depth[counted]
         ratio, difference = torch.maximum(p / t, t / p), p - t
-        found = {
+        measured = {
             "abs_rel": (difference.abs() / t).mean().item(),
             "rmse": difference.square().mean().sqrt().item(),
             "delta1": ((ratio < 1.25) & (p > 0)).float().mean().item(),
         }
-        errors.append(found if len(t) else None)
+        errors.append(measured if len(t) else None)
     return errors
 
 

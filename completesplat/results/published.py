@@ -108,10 +108,7 @@ def _source(table: PublishedTable) -> str:
 def parse(cell: str) -> PrintedCell:
     """`17.93 best` is the text `17.93` with the mark `best`."""
     words = cell.split()
-    marks = set()
-    while words and words[-1] in MARKS:
-        marks.add(words.pop())
-    return PrintedCell(" ".join(words), frozenset(marks))
+    return PrintedCell(" ".join(word for word in words if word not in MARKS), frozenset(words) & set(MARKS))
 
 
 @cache
@@ -160,11 +157,10 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     paper has one of equally many samples; what has seen the views that it is scored on belongs nowhere.
     """
     protocol = entry.run.protocol
-    if protocol.get("name") not in table.evaluations:
+    # Of objects alone (`background`), scores for all pixels are no table's.
+    if protocol.get("name") not in table.evaluations or protocol.get("background") is not None:
         return False
     data_sets = {column.data_set for column in table.columns if column.key in METRICS}
-    if protocol.get("background") is not None:  # objects only, whose scores for all pixels are no table's
-        return False
     if protocol["data_set"] not in data_sets or protocol.get("skipped") or entry.upper_bound:
         return False
     if table.subset and protocol.get("subset") != table.subset:
