@@ -142,7 +142,7 @@ class CompleteSplat(SceneModel):
             seed: of all noise, or one for each image: what is drawn for it then depends on no other image.
             visible: 0 where an image is hidden: what is there has no influence.
             batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
-            on_step: called after each denoiser call of each batch: its number, the timestep, the scenes estimated so far.
+            on_step: called after each denoiser call of each batch: its number, the timestep, the estimated scenes.
 
         Returns:
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
