@@ -142,8 +142,7 @@ class CompleteSplat(SceneModel):
             seed: of all noise, or one for each image: what is drawn for it then depends on no other image.
             visible: 0 where an image is hidden: what is there has no influence.
             batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
-            on_step: called after each denoiser call, for each batch, with its number, the timestep and the scenes that
-                the estimate of the clean latent stands for.
+            on_step: called after each denoiser call of each batch: its number, the timestep, the estimated scenes.
 
         Returns:
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
@@ -154,7 +153,8 @@ class CompleteSplat(SceneModel):
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
         conditioning = self.conditioning(images)
-        features = self._features(images) if weight else []
+        stage1 = self.autoreconstructor
+        features = stage1.encoder.features(images, stage1.reconstructor.feature_levels) if weight else []
         shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
         noise = draw_noise(len(images), samples, shape, seed).to(images.device)
         image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
@@ -167,12 +167,6 @@ class CompleteSplat(SceneModel):
         # One after the other: where a GPU's memory does not suffice to decode a part, its latents are kept.
         latents = torch.cat(in_parts(draw, len(noise), batch))
         return concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
-
-    def _features(self, images: Tensor) -> list[Tensor]:
-        """What the skips need of the encoder."""
-        stage1 = self.autoreconstructor
-        found: list[Tensor] = stage1.encoder.features(images, stage1.reconstructor.feature_levels)
-        return found
 
     def _decode(
         self,

@@ -5,8 +5,10 @@ complete the command line call `completesplat --complete WORDS`, which is answer
 """
 
 import re
+import runpy
 from collections.abc import Collection, Iterator, Sequence
 from difflib import get_close_matches
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -172,17 +174,10 @@ def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[S
 
 def settings_of_option(group: str, option: str, place: str | None = None) -> list[Setting]:
     """All settings of an option, with those that its file takes over from others; `place`: where they belong."""
-    written = read(f"{group}/{option}")
-    found: dict[str, Setting] = {}
-    for base in written.bases:
-        for setting in settings_of_option(group, base, ""):
-            found[setting.key] = setting
-    for setting in own_settings(written):
-        earlier = found.get(setting.key, setting)
-        found[setting.key] = setting._replace(comment=setting.comment or earlier.comment)
+    written = with_bases(group, option)
     where = place if place is not None else written.package or group.replace("/", ".")
     prefix = "" if where in ("", "_global_") else f"{where}."
-    return [setting._replace(key=prefix + setting.key) for setting in found.values()]
+    return [setting._replace(key=prefix + setting.key) for setting in own_settings(written)]
 
 
 def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
@@ -198,7 +193,9 @@ def with_bases(group: str, option: str) -> ConfFile:
     written = read(f"{group}/{option}")
     inherited = [with_bases(group, base) for base in written.bases]
     choices = [choice for one in inherited for choice in one.choices] + written.choices
-    settings = {one.key: one for base in [*inherited, written] for one in base.settings}
+    settings: dict[str, Setting] = {}
+    for one in (one for base in [*inherited, written] for one in base.settings):
+        settings[one.key] = one._replace(comment=one.comment or settings.get(one.key, one).comment)
     return written._replace(settings=list(settings.values()), choices=choices)
 
 
@@ -251,3 +248,18 @@ def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
     # Keys below the first point are shown when it is typed.
     near = [name for name in found if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
     return [*(tasks if len(words) == 1 else []), *near, "--help"]
+
+
+def gsplat_constants() -> dict[str, float]:
+    """Return the constants compiled into the kernels of the installed gsplat, without importing it.
+
+    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. 1.5.3 has them in its kernels only
+    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); they are the default where there is no gsplat.
+    """
+    spec = find_spec("gsplat")
+    files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]
+    stated = {"MAX_ALPHA": 0.999, "ALPHA_THRESHOLD": 1 / 255, "TRANSMITTANCE_THRESHOLD": 1e-4}
+    for file in filter(Path.is_file, files):
+        stated |= runpy.run_path(str(file))
+    names = {"max_alpha": "MAX_ALPHA", "min_alpha": "ALPHA_THRESHOLD", "min_transmittance": "TRANSMITTANCE_THRESHOLD"}
+    return {name: stated[constant] for name, constant in names.items()}

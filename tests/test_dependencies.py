@@ -74,6 +74,13 @@ def test_what_is_declared_is_imported_or_has_a_reason_and_nothing_else_is_import
     assert NEVER_IMPORTED.keys() <= (needed | optional | developers) - used
 
 
+def test_the_extra_takes_no_gsplat_that_is_newer_than_the_tested_one() -> None:
+    (allowed,), (tested,) = ([Requirement(x) for x in EXTRAS[e] if x.startswith("gsplat")] for e in ("cuda", "dev"))
+    major, minor = map(int, str(tested.specifier).removeprefix("==").split(".")[:2])
+    assert str(tested.specifier).removeprefix("==") in allowed.specifier
+    assert f"{major}.{minor + 1}.0" not in allowed.specifier
+
+
 # What an Apache-2.0 package may need to be installed.
 ALLOWED = {"0BSD", "Apache-2.0", "Apache-2.0 WITH LLVM-exception", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0"}
 ALLOWED |= {"CNRI-Python", "ISC", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Zlib"}

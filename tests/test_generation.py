@@ -3,6 +3,7 @@ import json
 import math
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
 
@@ -61,6 +62,16 @@ def test_seeds_decide_and_samples_differ(model, picture):
     assert same(second, again[1])
     assert not torch.equal(first.means, second.means)
     assert not torch.equal(first.means, other[0].means)
+
+
+def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model, picture):
+    def draw(seed: int):
+        return model(picture, samples=2, seed=seed, steps=(2, 4, 5, 8)[seed % 4])
+
+    alone = [draw(seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(draw, range(8)))
+    assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
 
 
 def test_samples_of_a_batch_stand_next_to_each_other(model, picture):

@@ -22,7 +22,7 @@ from completesplat.commands import help, jobs
 from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
 from completesplat.commands.settings import misspelt
 from completesplat.errors import CompleteSplatError
-from completesplat.options import conf_folder
+from completesplat.options import conf_folder, gsplat_constants
 from completesplat.signals import end_with, ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
@@ -159,4 +159,5 @@ def _own_error(error: BaseException) -> CompleteSplatError | None:
 # What `conf/` interpolates besides hydra's own; here, because jobs that a cluster starts elsewhere import this alone.
 OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
 OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
+OmegaConf.register_new_resolver("gsplat", lambda name: gsplat_constants()[name], replace=True)
 OmegaConf.register_new_resolver("job_name", jobs.job_name, replace=True)

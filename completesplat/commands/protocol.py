@@ -61,6 +61,8 @@ def protocol(
     evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any], out: Path
 ) -> dict[str, Any]:
     """The statement beside a test's results in `out`, which followed a configuration of `conf/evaluation/`."""
+    from completesplat.metrics.scoring import BEST_RULES
+
     scored, model = module.evaluation, results["model"]
     described = {
         "name": evaluation["name"],
@@ -73,6 +75,7 @@ def protocol(
         "scenes_listed": data.source("test").listed,
         **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},
         **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
+        **({"best": BEST_RULES} if scored.samples > 1 else {}),
         **drawing(module),
         "object_pixels": "background black in both, by the true mask cut at 0.5",
         "average": "over the views of a scene, then over scenes",

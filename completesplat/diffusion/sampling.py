@@ -1,5 +1,6 @@
 """Drawing latents: a denoiser, a diffusers scheduler, nothing else; many of them in parts that fit into memory."""
 
+import copy
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,14 +24,7 @@ OnStep = Callable[[int, int, Tensor], None]
 """(number of the denoiser call, timestep, estimate of the clean latent)."""
 
 # What a denoiser was trained with, whatever sampler draws from it.
-FORWARD_PROCESS = (
-    "num_train_timesteps",
-    "beta_start",
-    "beta_end",
-    "beta_schedule",
-    "trained_betas",
-    "prediction_type",
-)
+FORWARD_PROCESS = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
 
 
 class Sampler:
@@ -39,8 +33,7 @@ class Sampler:
     Args:
         scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
         steps: denoising steps unless a call says otherwise (50 in the paper).
-        ancestral: of flow matching: renew as much of the noise in each step as the reverse of the forward process does
-            (`renewed`), instead of none. Errors of earlier steps are forgotten so.
+        ancestral: of flow matching only: renew noise in each step (`renewed`), which forgets errors of earlier ones.
 
     Raises:
         CompleteSplatError: `ancestral` for diffusion.
@@ -66,12 +59,12 @@ class Sampler:
         """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone.
 
         A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
-        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them with what the
-        prediction says about the clean latent. `CompleteSplatError`: a guidance weight outside of [0, 1], or a number
-        of steps that the scheduler cannot make.
+        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them.
+
+        Raises:
+            CompleteSplatError: a guidance weight outside of [0, 1], or steps that the scheduler cannot make.
         """
-        scheduler = self.scheduler
-        self._set_steps(self.steps if steps is None else steps, noise.device)
+        scheduler = self.set_up(steps, noise.device)
         flow, fresh = is_flow(scheduler), fresh_noise(noise)
         latent: Tensor = noise if flow else noise * scheduler.init_noise_sigma
         for index, timestep in enumerate(scheduler.timesteps):
@@ -87,19 +80,26 @@ class Sampler:
                 latent = scheduler.step(predicted, timestep, latent).prev_sample
         return latent
 
-    def _set_steps(self, steps: int, device: torch.device) -> None:
-        if not 1 <= steps <= self.training_timesteps:
-            raise CompleteSplatError(f"steps={steps}: must lie between 1 and {self.training_timesteps}")
-        if isinstance(self.scheduler, DDIMScheduler) and self.training_timesteps % steps:
+    def set_up(self, steps: int | None = None, device: torch.device | None = None) -> Any:
+        """Return a copy of the scheduler that is set to a number of steps (by default the sampler's).
+
+        Schedulers keep state while they draw. Each call has its own, so that several threads can share a model.
+
+        Raises:
+            CompleteSplatError: a number of steps that the scheduler cannot make.
+        """
+        scheduler, most = copy.deepcopy(self.scheduler), self.training_timesteps
+        steps = self.steps if steps is None else steps
+        if not 1 <= steps <= most:
+            raise CompleteSplatError(f"steps={steps}: must lie between 1 and {most}")
+        if isinstance(scheduler, DDIMScheduler) and most % steps:
             # It goes down by whole timesteps, and would end each step at a noise level that the next does not start at.
-            raise CompleteSplatError(
-                f"steps={steps}: DDIM's must divide {self.training_timesteps} (10, 20, 25, 40, 50, ...); "
-                "sampler=dpm20 takes any number"
-            )
-        if is_flow(self.scheduler):  # diffusers' own would end at t = 1/1000 and waste a step from there
-            self.scheduler.set_timesteps(sigmas=np.linspace(1, 1 / steps, steps), device=device)
-        else:
-            self.scheduler.set_timesteps(steps, device=device)
+            advice = f"must divide {most} (10, 20, 25, 40, 50, ...); sampler=dpm20 takes any number"
+            raise CompleteSplatError(f"steps={steps}: DDIM's {advice}")
+        # diffusers' own spacing for flow matching would end at t = 1/1000 and waste a step from there
+        spacing = {"sigmas": np.linspace(1, 1 / steps, steps)} if is_flow(scheduler) else {"num_inference_steps": steps}
+        scheduler.set_timesteps(**spacing, device=device)
+        return scheduler
 
     def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
         """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
@@ -192,12 +192,11 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
     while start < count:
         try:
             parts.append(draw(slice(start, min(start + size, count))))
+            start += size
+            continue
         except torch.cuda.OutOfMemoryError:
             if size == 1:
                 raise
-        else:
-            start += size
-            continue
         # Not in the handler, where the error still holds what was computed.
         torch.cuda.empty_cache()
         logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)

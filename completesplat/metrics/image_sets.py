@@ -144,9 +144,8 @@ def inception(weights: str | None, sha256: str | None = None, subset_size: int =
 def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
     """NVlabs' translation of the network that FID is defined with (Heusel et al. 2017; `inception-2015-12-05`).
 
-    A TorchScript file is a program, not mere weights: only the one with this SHA-256 (or these first digits of it) is
-    run. With None any file is run, and whoever gives it vouches for it. A URL is downloaded into torch's hub cache.
-    `WeightsError`: the file is missing, cannot be downloaded, is another one, or is no such network.
+    A TorchScript file is a program: only the one with this SHA-256 (or these first digits of it) is run; with None, any
+    file. `WeightsError`: the file is missing, cannot be downloaded, is another one, or is no such network.
     """
     path = weights_file(weights, sha256, DOWNLOAD_ADVICE, "evaluation.scoring.sets.inception.sha256")
     try:

@@ -54,10 +54,7 @@ def psnr(predicted: Images, true: Images) -> PerImage:
 def ssim(predicted: Images, true: Images) -> PerImage:
     """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
 
-    The mean is over all pixels, and the window sees the picture mirrored beyond its border, as in Flash3D's evaluator
-    (`evaluation/evaluator.py`, torchmetrics). Splatter Image's metric (`utils/loss_utils.py`) sees zeros there, and
-    skimage's, which pixelSplat uses (`src/evaluation/metrics.py`), leaves 5 pixels out on every side. The paper prints
-    no SSIM.
+    The mean is over all pixels; the window sees the image mirrored beyond its border, as in torchmetrics.
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 

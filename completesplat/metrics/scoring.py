@@ -24,7 +24,12 @@ Scores = dict[tuple[str, str, str], float]
 Depths = Float[Tensor, "image 1 height width"]
 REGIONS = ("full", "object")
 PROPER_REGIONS = ("full", "hidden")
-MODEL, BEST, MEAN = "model", "best_of_k", "mean_of_k"
+MODEL, BEST, BEST_BY_METRIC, MEAN = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
+BEST_RULES = {
+    BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
+    BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
+}
+"""Which sample the scores of a row are of; the paper does not say which one is the best."""
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
 
@@ -36,8 +41,8 @@ class Evaluation:
     process of several scored it.
 
     Args:
-        samples: drawn of each scene. With more than one there are three rows: `model` (the first sample), `best_of_k`
-            (the best by the metric `criterion` over all pixels of the novel views, an oracle) and `mean_of_k`.
+        samples: drawn of each scene. With more than one there are further rows: `model` (the first sample), two oracles
+            (`best_of_k`, `best_of_k_by_metric`; see `BEST_RULES`) and `mean_of_k`.
         seed: of what is drawn; each scene has its own, which depends on its name only besides.
         perceptual: LPIPS, or why it is missing.
         sets: metrics of whole sets of novel views by name, or why they are missing.
@@ -52,13 +57,11 @@ class Evaluation:
         sets: Mapping[str, SetMetric | Missing | None] | None = None,
     ) -> None:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
-        self.missing: dict[str, str] = {}
         if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
         given = list((sets or {}).values())
-        for absent in [perceptual, *given]:
-            if isinstance(absent, Missing):
-                self.missing |= dict.fromkeys(absent.names, str(absent))
+        absent = [metric for metric in (perceptual, *given) if isinstance(metric, Missing)]
+        self.missing = {name: str(metric) for metric in absent for name in metric.names}
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
         if criterion not in self.metrics:
@@ -85,25 +88,33 @@ class Evaluation:
         """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
         truth = scenes.all_views()
         for b, name in enumerate(scenes.names):
-            self._add(predictor, name, images[b].clamp(0, 1), truth[b])
+            shown = images[b].clamp(0, 1)
+            self._add(predictor, name, self.score(shown, truth[b]), dict.fromkeys(REGIONS, shown), truth[b])
 
     @torch.no_grad()
     def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
-        """Score all samples of one scene as `model`, `best_of_k` and `mean_of_k`."""
+        """Score all samples of one scene: their first, the best ones (`BEST_RULES`) and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
-        self._add(MODEL, name, images[0], truth)
+        self._add(MODEL, name, each[0], dict.fromkeys(REGIONS, images[0]), truth)
         if len(each) == 1:
             return
-        by = [scores["full", "novel", self.criterion] for scores in each]
-        higher = HIGHER_IS_BETTER[self.criterion]
-        self._add(BEST, name, images[best(by, higher)], truth)
+        chosen = {
+            (region, metric): best([scores[region, "novel", metric] for scores in each], HIGHER_IS_BETTER[metric])
+            for region in REGIONS
+            for metric in self.metrics
+        }
+        by_criterion = {region: chosen[region, self.criterion] for region in REGIONS}
+        scores = {key: each[by_criterion[key[0]]][key] for key in each[0]}
+        self._add(BEST, name, scores, {region: images[i] for region, i in by_criterion.items()}, truth)
+        self.scores[BEST_BY_METRIC][name] = {(r, v, m): each[chosen[r, m]][r, v, m] for r, v, m in each[0]}
         self.scores[MEAN][name] = {key: sum(scores[key] for scores in each) / len(each) for key in each[0]}
         proper, ranks = proper_scores(images[:, 1:], truth)
         self.scores[MODEL][name] |= proper
         with torch.autocast(images.device.type, enabled=False):
             noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
             by_noise = [self.metrics[self.criterion](one, truth.images[1:]).mean().item() for one in noisy]
+        by, higher = [scores["full", "novel", self.criterion] for scores in each], HIGHER_IS_BETTER[self.criterion]
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
@@ -132,14 +143,15 @@ class Evaluation:
                     mean = sum(found[metric] for found in known) / len(known)
                     self.scores[MODEL][name][region, kind, f"depth_{metric}"] = mean
 
-    def _add(self, predictor: str, name: str, images: Float[Tensor, "view 3 height width"], truth: Views) -> None:
-        self.scores[predictor][name] = self.score(images, truth)
-        self.views[name] = len(images) - 1
+    def _add(self, predictor: str, name: str, scores: Scores, images: Mapping[str, Tensor], truth: Views) -> None:
+        """Keep the scores of a scene, and what set metrics need of the images [view 3 height width] of each region."""
+        self.scores[predictor][name] = scores
+        self.views[name] = len(truth.images) - 1
         # Where metrics look is no matter of chance: pictures alone have the same scores in every run.
-        seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(images))]
+        seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(truth.images))]
         for region in REGIONS:
-            for owner, pictures in ((predictor, images), (ImageSets.TRUE, truth.images)):
-                with torch.autocast(images.device.type, enabled=False):
+            for owner, pictures in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
+                with torch.autocast(pictures.device.type, enabled=False):
                     self.sets.add(owner, region, name, _region(pictures.float(), truth, region)[1:], seeds)
 
     def gather(self) -> None:
@@ -161,8 +173,8 @@ class Evaluation:
             names = sorted(scenes)
             entry: dict[str, Any] = {"scenes": len(names), "views": sum(self.views[name] for name in names)}
             for region, view, metric in dict.fromkeys(key for name in names for key in scenes[name]):
-                found = (scenes[name].get((region, view, metric)) for name in names)
-                values = [value for value in found if value is not None]
+                key = region, view, metric
+                values = [scenes[name][key] for name in names if key in scenes[name]]
                 entry.setdefault(region, {}).setdefault(view, {})[metric] = sum(values) / len(values)
             for region in REGIONS:
                 entry[region]["novel"] |= self.sets.results(predictor, region)
@@ -170,15 +182,16 @@ class Evaluation:
         if self.drawn:
             names = sorted(self.drawn)
             for kind in ("curve", "curve_noisy_mean"):
-                curves = zip(*(self.drawn[name][kind] for name in names), strict=True)
-                results[BEST][kind] = [sum(values) / len(values) for values in curves]
+                results[BEST][kind] = _means([self.drawn[name][kind] for name in names])
             results[MEAN]["diversity"] = sum(self.drawn[name]["diversity"] for name in names) / len(names)
             for region in PROPER_REGIONS:
                 known = [shares[region] for name in names if region in (shares := self.drawn[name]["ranks"])]
-                if known:
-                    mean = [sum(values) / len(known) for values in zip(*known, strict=True)]
-                    results[MEAN][f"ranks_{region}"] = mean
+                results[MEAN] |= {f"ranks_{region}": _means(known)} if known else {}
         return results
+
+
+def _means(rows: Sequence[Sequence[float]]) -> list[float]:
+    return [sum(values) / len(rows) for values in zip(*rows, strict=True)]
 
 
 def noisy_mean(
@@ -234,12 +247,12 @@ def depth_errors(
     for own, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
         p, t = own[counted], depth[counted]
         ratio, difference = torch.maximum(p / t, t / p), p - t
-        found = {
+        measured = {
             "abs_rel": (difference.abs() / t).mean().item(),
             "rmse": difference.square().mean().sqrt().item(),
             "delta1": ((ratio < 1.25) & (p > 0)).float().mean().item(),
         }
-        errors.append(found if len(t) else None)
+        errors.append(measured if len(t) else None)
     return errors
 
 

@@ -1,11 +1,10 @@
 """Swappable rasterizers: what every one takes and gives, and one file per backend.
 
-Every backend computes the same function, with gsplat's conventions: 0.3 px^2 of blur on the diagonal of the
-projected covariance, alpha = min(max_alpha, opacity * exp(-sigma)) skipped below 1/255, front-to-back compositing
-that stops before the transmittance would reach 1e-4. The constants come from one shared config.
+Every backend computes the same function, with gsplat's conventions: alpha = min(max_alpha, opacity * exp(-sigma)),
+composited from front to back, with the constants of one shared config.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -15,12 +14,13 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.options import gsplat_constants
 from completesplat.tensors import TensorDataclass
 
 
 @dataclass(frozen=True)
 class RenderingConstants:
-    """The constants on which all backends agree (values of gsplat 1.5.3, `RasterizeToPixels3DGSFwd.cu`).
+    """The constants on which all backends agree; by default those of the installed gsplat (`gsplat_constants`).
 
     Attributes:
         blur: added to the diagonal of the projected covariance, in px^2.
@@ -34,9 +34,9 @@ class RenderingConstants:
 
     blur: float = 0.3
     near_plane: float = 0.01
-    max_alpha: float = 0.999
-    min_alpha: float = 1 / 255
-    min_transmittance: float = 1e-4
+    max_alpha: float = field(default_factory=lambda: gsplat_constants()["max_alpha"])
+    min_alpha: float = field(default_factory=lambda: gsplat_constants()["min_alpha"])
+    min_transmittance: float = field(default_factory=lambda: gsplat_constants()["min_transmittance"])
     frustum_margin: float = 0.3
 
 

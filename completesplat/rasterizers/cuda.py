@@ -1,4 +1,4 @@
-"""The GPU backend: an adapter onto gsplat, version 1.5.3 or newer, imported only when a rasterizer is made."""
+"""The GPU backend: an adapter onto gsplat, imported only when a rasterizer is made."""
 
 import math
 from dataclasses import replace
@@ -13,6 +13,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
+from completesplat.options import gsplat_constants
 from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
@@ -22,6 +23,7 @@ WARP = 32
 # 1e17, gradients become NaN where the depth image has one, because coordinates are multiplied before they are divided.
 FARTHEST = 1e12
 SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
+FRUSTUM_MARGIN = 0.3  # in gsplat's `Utils.cuh`
 
 
 class CudaRasterizer:
@@ -51,7 +53,7 @@ class CudaRasterizer:
         except ImportError as error:
             message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
             raise CompleteSplatError(message) from error
-        for name, value in compiled_constants().items():
+        for name, value in (gsplat_constants() | {"frustum_margin": FRUSTUM_MARGIN}).items():
             if not math.isclose(getattr(self.constants, name), value, rel_tol=1e-6):
                 raise CompleteSplatError(
                     f"gsplat {gsplat.__version__} is compiled with {name} = {value:g}, not "
@@ -89,24 +91,6 @@ class CudaRasterizer:
         )
         images = images.movedim(-1, -3)
         return Rendering(images[:, :, :3], images[:, :, 3:], alphas.movedim(-1, -3))
-
-
-def compiled_constants() -> dict[str, float]:
-    """Those of the installed gsplat's kernels, which no argument changes.
-
-    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`, 1.5.3 only in its kernels
-    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`). The margin of the frustum stands in `Utils.cuh` in both.
-    """
-    constants = {"max_alpha": 0.999, "min_alpha": 1 / 255, "min_transmittance": 1e-4, "frustum_margin": 0.3}
-    try:
-        from gsplat.cuda import _constants as stated
-    except ImportError:
-        return constants
-    return constants | {
-        "max_alpha": stated.MAX_ALPHA,
-        "min_alpha": stated.ALPHA_THRESHOLD,
-        "min_transmittance": stated.TRANSMITTANCE_THRESHOLD,
-    }
 
 
 @torch.no_grad()

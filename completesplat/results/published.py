@@ -12,6 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.own import alike, mode_tables, own_tables, protocol_said
 from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
 from completesplat.results.scores import (
+    BEST_BY_METRIC,
     BEST_OF_K,
     COST,
     LEADING,
@@ -106,10 +107,7 @@ def _source(table: PublishedTable) -> str:
 def parse(cell: str) -> PrintedCell:
     """`17.93 best` is the text `17.93` with the mark `best`."""
     words = cell.split()
-    marks = set()
-    while words and words[-1] in MARKS:
-        marks.add(words.pop())
-    return PrintedCell(" ".join(words), frozenset(marks))
+    return PrintedCell(" ".join(word for word in words if word not in MARKS), frozenset(words) & set(MARKS))
 
 
 @cache
@@ -166,7 +164,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
     data_sets = {column.data_set for column in table.columns if column.key in METRICS}
     if protocol["data_set"] not in data_sets or (table.subset and protocol.get("subset") != table.subset):
         return False
-    if entry.predictor == BEST_OF_K and protocol.get("samples") != table.oracle_samples:
+    if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.oracle_samples:
         return False
     if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
         return False

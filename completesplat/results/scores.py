@@ -9,7 +9,7 @@ import numpy as np
 from completesplat.results.runs import SEED, Job, Result
 from completesplat.results.tables import ABSENT, FORMATS, Cell, Heading, Notes, by_name, marks
 
-MODEL, BEST_OF_K, MEAN_OF_K = "model", "best_of_k", "mean_of_k"
+MODEL, BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K = "model", "best_of_k", "best_of_k_by_metric", "mean_of_k"
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 UPPER_BOUND = "upper_bound"  # marks jobs, and their rows, whose model has seen the views that it is scored on
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
@@ -137,7 +137,7 @@ class Entry:
     @property
     def own(self) -> bool:
         """Whether it is the run's model, and no naive predictor."""
-        return self.predictor in (MODEL, BEST_OF_K, MEAN_OF_K)
+        return self.predictor in (MODEL, BEST_OF_K, BEST_BY_METRIC, MEAN_OF_K)
 
     @property
     def upper_bound(self) -> bool:
@@ -149,7 +149,9 @@ class Entry:
         protocol, label = self.run.protocol, self.predictor.replace("_", " ")
         if self.own:
             samples = protocol.get("samples", 1)
-            kinds = {BEST_OF_K: f", {samples}-best oracle", MEAN_OF_K: f", mean of {samples} samples"}
+            oracle, criterion = f", {samples}-best oracle by", str(protocol.get("criterion")).upper()
+            kinds = {BEST_OF_K: f"{oracle} {criterion}", BEST_BY_METRIC: f"{oracle} each metric"}
+            kinds[MEAN_OF_K] = f", mean of {samples} samples"
             kinds[MODEL] = ", single sample" if protocol.get("sampler") else ""
             label = f"{protocol.get('method', 'model')}{kinds[self.predictor]}"
             label += " (upper bound)" if self.upper_bound else ""

@@ -15,7 +15,7 @@ from torch import Tensor
 from completesplat.export.pictures import color_depth, image_grid, surface_depth
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
-from completesplat.metrics.scoring import BEST, MODEL, Evaluation, Scores
+from completesplat.metrics.scoring import BEST, MODEL, Evaluation
 from completesplat.results.published import tables
 from completesplat.results.runs import find
 from completesplat.results.tables import Table, by_name
@@ -92,11 +92,8 @@ def strip(images: Float[Tensor, "view 3 height width"]) -> Image.Image:
 
 def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
     """The model's scores for a scene, and those of the best of several samples, by `region_view_metric`."""
-    found: dict[str, float] = {}
-    for predictor, prefix in ((MODEL, ""), (BEST, f"{BEST}/")):
-        scores: Scores = evaluation.scores[predictor].get(name, {}) if predictor in evaluation.scores else {}
-        found |= {prefix + "_".join(key): value for key, value in scores.items()}
-    return found
+    model, best = (evaluation.scores.get(predictor, {}).get(name, {}) for predictor in (MODEL, BEST))
+    return {"_".join(key): x for key, x in model.items()} | {f"{BEST}/{'_'.join(key)}": x for key, x in best.items()}
 
 
 def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
@@ -113,8 +110,7 @@ def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> Scen
 
 def log_scores(results: dict[str, Any], trainer: Trainer) -> None:
     """Log `test/PREDICTOR/REGION_VIEW_METRIC` of `SceneModule.test_results`."""
-    flat = {predictor: by_name(scores) for predictor, scores in results.items()}
-    numbers = {f"test/{predictor}/{name}": x for predictor, scores in flat.items() for name, x in scores.items()}
+    numbers = {f"test/{row}/{name}": x for row, scores in results.items() for name, x in by_name(scores).items()}
     for logger in trainer.loggers:
         logger.log_metrics(numbers, step=trainer.global_step)
         logger.save()

@@ -59,11 +59,12 @@ class Samples(DrawsFixedScenes):
         log_drawings(trainer, scalars, {"samples": pictures["step"], "denoising": pictures["strip"]})
 
     def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
-        sampler, views = module.completesplat.sampler, scene.all_views()
+        views = scene.all_views()
         shown: dict[int, tuple[int, Gaussians]] = {}
+        calls = evenly_spaced(len(module.completesplat.sampler.set_up().timesteps), self.strip)
 
         def keep(call: int, timestep: int, estimates: Gaussians) -> None:
-            if call in evenly_spaced(len(sampler.scheduler.timesteps), self.strip):
+            if call in calls:
                 # Samples that do not fit into memory together come in parts, the first sample in the first part.
                 shown.setdefault(call, (timestep, estimates[:1]))
 

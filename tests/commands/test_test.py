@@ -102,6 +102,8 @@ def test_the_best_of_several_samples_stands_beside_one_and_the_mean(scored):
     assert (curve[0], curve[2]) == (pytest.approx(mean), pytest.approx(best))
     assert metrics["mean_of_k"]["diversity"] > 0
     assert metrics["protocol"]["samples"] == 3
+    rules = metrics["protocol"]["best"]
+    assert rules.keys() == {row for row in metrics if row.startswith("best_of_k")}
 
 
 def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pictures_it_was_trained_on(

@@ -1,6 +1,8 @@
 """Samplers against closed forms: equations, and latents whose exact denoiser is known."""
 
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from threading import Barrier
 
 import pytest
 import torch
@@ -46,17 +48,17 @@ def gaussian_noise(count: int) -> torch.Tensor:
     return torch.randn(count, 1, 4, 4, generator=torch.Generator().manual_seed(0))
 
 
-def exact_prediction(kind: str, sampler: Sampler, at_solver: bool = False):
+def exact_prediction(kind: str, sigmas: torch.Tensor | None = None):
     """The best prediction for latents N(MEAN, STD^2), in closed form: of E[h | h_t], E[eps | h_t] or both.
 
-    `at_solver`: for the solver's own noise level, which it rounds to a timestep before it asks.
+    `sigmas`: the solver's own noise levels, one a call, which it rounds to timesteps before it asks.
     """
-    scheduler = sampler.scheduler
+    levels = iter(() if sigmas is None else sigmas)
 
     def denoise(latent, timestep, conditioning):
         bar = alpha_bar()[timestep].to(latent).view(-1, 1, 1, 1)
-        if at_solver:
-            bar = 1 / (1 + scheduler.sigmas[scheduler.step_index or 0].to(latent) ** 2)
+        if sigmas is not None:
+            bar = 1 / (1 + next(levels).to(latent) ** 2)
         surplus = (latent - bar.sqrt() * MEAN) / (bar * STD**2 + 1 - bar)
         noise, clean = (1 - bar).sqrt() * surplus, MEAN + bar.sqrt() * STD**2 * surplus
         velocity = bar.sqrt() * noise - (1 - bar).sqrt() * clean
@@ -80,7 +82,8 @@ def exact_result_of_solvers(noise: torch.Tensor) -> torch.Tensor:
 
 def error(sampler: Sampler, steps: int, exact=exact_result, at_solver: bool = False) -> float:
     noise = torch.linspace(-1.5, 1.5, 16, dtype=torch.float64).view(1, 1, 4, 4)
-    drawn = sampler(exact_prediction("epsilon", sampler, at_solver), noise, nothing(1).double(), steps=steps)
+    sigmas = sampler.set_up(steps).sigmas if at_solver else None
+    drawn = sampler(exact_prediction("epsilon", sigmas), noise, nothing(1).double(), steps=steps)
     return (drawn - exact(noise)).abs().max().item()
 
 
@@ -112,7 +115,7 @@ def test_one_step_is_ddims_equation(sampler):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_exact_denoiser_gives_the_data_distribution(name, kind):
     own = made(name, f"sampler.scheduler.prediction_type={kind}")
-    drawn = own(exact_prediction(kind, own), gaussian_noise(2000), nothing(2000))
+    drawn = own(exact_prediction(kind), gaussian_noise(2000), nothing(2000))
     # Pure noise stands for h_T, of which a little is signal: the mean comes out 0.03 too low even by the exact flow.
     assert abs(drawn.mean() - MEAN) < 0.04
     assert abs(drawn.mean() - exact_result(gaussian_noise(2000)).mean()) < 0.01
@@ -164,7 +167,7 @@ def test_steps_that_ddim_cannot_make_are_refused(sampler, steps):
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction", "sample"])
 def test_estimates_are_shown_at_every_step_and_samples_do_not_depend_on_their_batch(name, kind):
     own, shown = made(name, f"sampler.scheduler.prediction_type={kind}"), []
-    noise, exact = gaussian_noise(2), exact_prediction(kind, own)
+    noise, exact = gaussian_noise(2), exact_prediction(kind)
     drawn = own(exact, noise, nothing(2), on_step=lambda *step: shown.append(step))
     alone = [own(exact, noise[i : i + 1], nothing(1)) for i in range(2)]
     torch.testing.assert_close(drawn, torch.cat(alone), atol=1e-6, rtol=1e-5)
@@ -175,6 +178,26 @@ def test_estimates_are_shown_at_every_step_and_samples_do_not_depend_on_their_ba
     torch.testing.assert_close(shown[-1][2], drawn, atol=tolerance, rtol=0)
     # The first is E[h | h_T], nearly the mean whatever the noise.
     assert (shown[0][2] - MEAN).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("name", ["ddim50", "dpm20", "unipc10", "flow25", "flow50_ancestral"])
+def test_calls_in_four_threads_draw_what_each_draws_alone(name):
+    own, steps, meeting = made(name), (5, 10, 20, 25), Barrier(4)
+
+    def draw(steps: int, wait=lambda: None) -> torch.Tensor:
+        """Every call has begun before any makes its first step."""
+        waits = iter([wait])
+
+        def denoise(latent, timestep, conditioning):
+            next(waits, lambda: None)()
+            return (latent + timestep.view(-1, 1, 1, 1) / 1000).sin()
+
+        return own(denoise, gaussian_noise(2), nothing(2), steps=steps)
+
+    alone = [draw(n) for n in steps]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda n: draw(n, lambda: meeting.wait(60)), steps))
+    assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
 
 
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])

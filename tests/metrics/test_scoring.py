@@ -81,8 +81,8 @@ def test_of_several_samples_the_first_the_best_and_the_mean_are_told():
     evaluation.update_samples("scene", off_by(0.1, 0.01, 0.001), scenes(1, 2).all_views()[0])
     results = evaluation.results()
     psnr = {row: results[row]["full"]["novel"]["psnr"] for row in results}
-    assert psnr == {key: pytest.approx(value, abs=1e-2) for key, value in zip(psnr, (20, 60, 40), strict=True)}
-    assert list(psnr) == ["model", "best_of_k", "mean_of_k"]
+    assert psnr == {key: pytest.approx(value, abs=1e-2) for key, value in zip(psnr, (20, 60, 60, 40), strict=True)}
+    assert list(psnr) == ["model", "best_of_k", "best_of_k_by_metric", "mean_of_k"]
     # Of two of the three samples the better one has 40 dB once and 60 dB twice.
     assert results["best_of_k"]["curve"] == pytest.approx([40, (40 + 60 + 60) / 3, 60], abs=1e-2)
     assert results["mean_of_k"]["diversity"] == pytest.approx((0.09 + 0.099 + 0.009) / 3, abs=1e-5)
@@ -114,6 +114,53 @@ def test_the_best_is_chosen_by_the_criterion():
         results = evaluation.results()
         chosen[criterion] = results["best_of_k"]["full"]["novel"]["psnr"] == results["model"]["full"]["novel"]["psnr"]
     assert chosen == {"psnr": True, "ssim": False}
+
+
+class Brightness:
+    """A set metric: the difference of the sets' mean values."""
+
+    regions = ("full", "object")
+
+    def describe(self, images, seeds):
+        return [images.mean((1, 2, 3))[:, None]]
+
+    def distances(self, true, predicted):
+        return {"brightness": (true[0].mean() - predicted[0].mean()).abs().item()}
+
+    def settings(self):
+        return {}
+
+
+def test_the_best_sample_is_that_of_a_region_for_all_metrics_or_that_of_each_metric():
+    truth = scenes(1, 2).all_views()[0]  # the object is the upper half
+    samples = torch.full((3, 3, 3, 16, 16), 0.5)
+    samples[0, ..., :8, :] += 0.2
+    samples[1, ..., :8, :] += 0.1
+    samples[1, ..., 8:, :] += 0.4
+    samples[2] += 0.3
+
+    def far_from_0_8(predicted, true):
+        return (predicted.amax((1, 2, 3)) - 0.8).abs()
+
+    evaluation = Evaluation(samples=3, perceptual=far_from_0_8, sets={"brightness": Brightness()})
+    evaluation.update_samples("scene", samples, truth)
+    alone = []
+    for sample in samples:
+        single = Evaluation(perceptual=far_from_0_8, sets={"brightness": Brightness()})
+        single.update("model", sample[None], scenes(1, 2))
+        alone.append(single.results()["model"])
+    results = evaluation.results()
+    by_psnr = {region: [one[region]["novel"]["psnr"] for one in alone] for region in ("full", "object")}
+    assert (best(by_psnr["full"]), best(by_psnr["object"])) == (0, 1)
+    # By PSNR in the region: LPIPS, the sets and the reference view are that sample's.
+    assert results["best_of_k"]["full"] == alone[0]["full"]
+    assert results["best_of_k"]["object"] == alone[1]["object"]
+    each = results["best_of_k_by_metric"]
+    assert each["full"]["novel"].keys() == {"psnr", "ssim", "lpips"}  # a set of images has no best of a scene
+    for region, by in ((region, metric) for region in by_psnr for metric in ("psnr", "ssim", "lpips")):
+        values = [one[region]["novel"][by] for one in alone]
+        assert each[region]["novel"][by] == (min if by == "lpips" else max)(values)
+    assert each["full"]["novel"]["lpips"] < results["best_of_k"]["full"]["novel"]["lpips"]
 
 
 def test_the_same_pictures_have_the_same_scores_whatever_the_seed():

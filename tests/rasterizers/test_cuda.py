@@ -12,6 +12,8 @@ import runpy
 import sys
 from dataclasses import replace
 from functools import partial
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -20,7 +22,9 @@ import numpy as np
 import pytest
 import torch
 from degenerate_gaussians import DRAWN, NEVER_DRAWN, SIZE, camera, changed, healthy
+from hydra.utils import instantiate
 from rasterizer_scenes import scenes
+from support import compose_config
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
@@ -29,6 +33,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, RenderingConstants, cuda
 from completesplat.rasterizers.cuda import FARTHEST, CudaRasterizer
 from completesplat.rasterizers.reference import ReferenceRasterizer
+from completesplat.rasterizers.tiled import TiledRasterizer
 from completesplat.tensors import stack
 
 
@@ -125,15 +130,19 @@ def pretend_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
 
 
-def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, **constants: float) -> None:
-    """An empty gsplat that states these constants, or none."""
-    package, kernels, stated = ModuleType("gsplat"), ModuleType("gsplat.cuda"), ModuleType("gsplat.cuda._constants")
-    package.__dict__.update(__version__="9", rasterization=None)
-    stated.__dict__.update(constants)
-    for module in (package, kernels, stated):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    if not constants:
-        monkeypatch.delitem(sys.modules, stated.__name__)
+def pretend_gsplat(monkeypatch: pytest.MonkeyPatch, folder: Path, **constants: float) -> None:
+    """An empty gsplat in a folder whose files state these constants, or none."""
+    package, spec = ModuleType("gsplat"), ModuleSpec("gsplat", None, is_package=True)
+    spec.submodule_search_locations = [str(folder)]
+    package.__dict__.update(__version__="9", __spec__=spec, rasterization=None)
+    monkeypatch.setitem(sys.modules, "gsplat", package)
+    (folder / "cuda").mkdir(exist_ok=True)
+    if constants:
+        lines = [f"{name} = {value!r}" for name, value in constants.items()]
+        (folder / "cuda/_constants.py").write_text("\n".join(lines))
+
+
+RELEASE_1_6 = {"MAX_ALPHA": 0.99, "ALPHA_THRESHOLD": 1.0 / 255.0, "TRANSMITTANCE_THRESHOLD": 1e-4}
 
 
 draw = partial(degenerate_gaussians.draw, intrinsics=False)
@@ -237,17 +246,29 @@ def test_calls_that_are_refused(front_end: list) -> None:
         ({"near_plane": 0.0}, "near_plane of at least"),
     ],
 )
-def test_constants_that_are_refused(changes: dict, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Newer releases state theirs."""
+def test_constants_that_are_refused(changes: dict, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     pretend_a_device(monkeypatch)
-    pretend_gsplat(monkeypatch)
+    pretend_gsplat(monkeypatch, tmp_path)
     CudaRasterizer(RenderingConstants(blur=0.1, near_plane=1.0))
     with pytest.raises(CompleteSplatError, match=message):
         CudaRasterizer(RenderingConstants(**changes))
-    pretend_gsplat(monkeypatch, MAX_ALPHA=0.99, ALPHA_THRESHOLD=1.0 / 255.0, TRANSMITTANCE_THRESHOLD=1e-4)
-    CudaRasterizer(RenderingConstants(max_alpha=0.99))
-    with pytest.raises(CompleteSplatError, match=r"set rasterizer\.constants\.max_alpha=0\.99$"):
-        CudaRasterizer()
+
+
+@pytest.mark.parametrize(("stated", "max_alpha", "other"), [({}, 0.999, 0.99), (RELEASE_1_6, 0.99, 0.999)])
+def test_all_backends_take_the_constants_of_the_installed_gsplat(stated, max_alpha, other, monkeypatch, tmp_path):
+    """A run that was trained with others keeps them: `cuda` refuses, the others draw with them."""
+    pretend_a_device(monkeypatch)
+    pretend_gsplat(monkeypatch, tmp_path, **stated)
+    configured = instantiate(compose_config("fit", "rasterizer=cuda").rasterizer.constants)
+    assert configured == RenderingConstants() == CudaRasterizer().constants
+    assert configured.max_alpha == max_alpha
+    with pytest.raises(CompleteSplatError, match=rf"set rasterizer\.constants\.max_alpha={max_alpha}$"):
+        CudaRasterizer(RenderingConstants(max_alpha=other))
+    opaque = changed({"scales": (50.0, 50.0, 50.0)})
+    opaque = replace(opaque, opacities=torch.ones_like(opaque.opacities))
+    for make in (TiledRasterizer, ReferenceRasterizer):
+        for constants, expected in ((None, max_alpha), (RenderingConstants(max_alpha=other), other)):
+            assert make(constants)(opaque, camera()).alpha.max().item() == pytest.approx(expected)
 
 
 def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -268,7 +289,7 @@ def kernels() -> RenderingConstants:
     pytest.importorskip("gsplat")
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
-    return RenderingConstants(**cuda.compiled_constants())
+    return RenderingConstants()
 
 
 @pytest.mark.parametrize(("batch", "views", "count"), [(2, 3, 60), (1, 1, 200), (3, 1, 12), (3, 1, 45), (2, 2, 64)])

@@ -87,8 +87,7 @@ def test_gsplat_is_tried_and_not_only_imported(gpu: None, monkeypatch, caplog) -
         raise AttributeError("'NoneType' object has no attribute 'CameraModelType'")
 
     monkeypatch.setattr(gsplat, "rasterization", fail)
-    constants = RenderingConstants(**cuda.compiled_constants())
-    assert isinstance(selection.auto(constants), TiledRasterizer)
+    assert isinstance(selection.auto(), TiledRasterizer)
     assert "not cuda: AttributeError: 'NoneType'" in warnings_in(caplog)
 
 
@@ -121,7 +120,7 @@ def test_constants_that_the_tiled_backend_refuses_go_to_the_reference(caplog: py
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_gpu_with_gsplat_is_used(gpu: None) -> None:
     pytest.importorskip("gsplat")
-    assert isinstance(selection.auto(RenderingConstants(**cuda.compiled_constants())), cuda.CudaRasterizer)
+    assert isinstance(selection.auto(), cuda.CudaRasterizer)
 
 
 def test_where_cuda_is_asked_for_and_does_not_work_the_line_says_what_to_choose():

@@ -99,10 +99,11 @@ def test_numbers_of_scenes_and_resolutions_of_the_paper_are_let_in_and_one_scene
 @pytest.mark.parametrize(("samples", "table"), [(20, "full_images"), (8, "own_1")])
 def test_an_oracle_stands_beside_one_of_as_many_samples_only(runs, run, samples, table) -> None:
     several = {"samples": samples, "sampler": "DDIMScheduler", "method": "LatentDiffusion"}
-    run("a", 17.0, {"best_of_k": 18.0}, **HYDRANTS, **several)
+    run("a", 17.0, {"best_of_k": 18.0, "best_of_k_by_metric": 18.5}, **HYDRANTS, **several, criterion="psnr")
     found = made(runs)
     labels = [row["method"] for row in ours(found[table])]
-    assert f"completesplat: LatentDiffusion, {samples}-best oracle [1]" in labels
+    for chosen in ("PSNR", "each metric"):
+        assert f"completesplat: LatentDiffusion, {samples}-best oracle by {chosen} [1]" in labels
     assert ours(found["full_images"])[0]["method"] == "completesplat: LatentDiffusion, single sample [1]"
     assert ("own_1" in found) == (samples != 20)
 
