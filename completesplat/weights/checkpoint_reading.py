@@ -2,20 +2,16 @@
 
 import hashlib
 import os
-import pickletools
-import re
-import zipfile
-from collections.abc import Iterator, Mapping
-from encodings import normalize_encoding
-from encodings.aliases import aliases
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from completesplat.errors import WeightsError
+from completesplat.errors import TensorFileError, WeightsError
 from completesplat.weights import sha256_of
+from completesplat.weights.tensor_files import read_tensor_file
 
 END, END_BYTES = b"PK\5\6", 22
 """How the last record of a zip archive begins, and its length without the comment behind it."""
@@ -25,16 +21,6 @@ SHARDS, SHARDS_SUFFIX = "shards", ".shards"
 and the SHA-256 of each."""
 DIVIDED = "divided:"
 """How the name begins that stands in the place of such a tensor."""
-PLAIN = re.compile(
-    r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
-    r"|torch\.nn\.parameter Parameter|collections (OrderedDict|Counter)|builtins (set|complex)|_codecs encode"
-)
-"""What tensors, containers and bytes are made with. torch's own list has more, of which byte arrays and others are as
-large as a few bytes say."""
-OF_BYTES = {codec for codec in aliases.values() if codec.endswith("_codec")}
-"""Codecs that make bytes of bytes (hexadecimal digits): twice as many, as often as they are asked."""
-MOST_REPEATED = 2**26
-"""Bytes of a tensor that is larger than its file, because it repeats what it has."""
 
 
 def check_whole(path: Path) -> None:
@@ -70,57 +56,10 @@ def shards_of(path: Path) -> dict[str, Any]:
     if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
         return {}
     try:
-        found: dict[str, Any] = _load(path, mmap=True).get(SHARDS, {})
+        shards: dict[str, Any] = read_tensor_file(path, mmap=True).get(SHARDS, {})
     except Exception:
         return {}
-    return found
-
-
-def _load(path: Path, mmap: bool = False) -> dict[str, Any]:
-    """What `torch.save` wrote; `WeightsError` for a file that is made to take more memory than it has bytes."""
-    size = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        records = archive.infolist()
-        if sum(record.file_size for record in records) > size:
-            raise WeightsError(f"{path}: not a readable checkpoint (its parts are larger than the file)")
-        # The reader takes no notice of capitals.
-        pickles = [archive.read(record) for record in records if record.filename.lower().endswith(".pkl")]
-    if (grows := next(filter(None, map(_growing, pickles)), None)) is not None:
-        raise WeightsError(f"{path}: not a readable checkpoint (made of {grows}, not of tensors alone)")
-    contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-    if any(value.nbytes > max(size, MOST_REPEATED) for value in _tensors(contents)):
-        raise WeightsError(f"{path}: not a readable checkpoint (a tensor is larger than the file)")
-    return contents
-
-
-def _growing(pickle: bytes) -> str | None:
-    """What a pickle names that is larger in memory than in the file, if there is such a thing."""
-    operations = [(opcode.name, str(argument)) for opcode, argument, _ in pickletools.genops(pickle)]
-    named = [argument for opcode, argument in operations if opcode == "GLOBAL"]
-    if "_codecs encode" in named:
-        texts = (argument for opcode, argument in operations if opcode == "BINUNICODE")
-        named += [f"the codec {text}" for text in texts if _codec(text) in OF_BYTES]
-    return next((name for name in named if not PLAIN.fullmatch(name)), None)
-
-
-def _codec(text: str) -> str:
-    """The codec that Python finds by a name."""
-    name = normalize_encoding(text).lower().replace(".", "_")
-    return aliases.get(name, name)
-
-
-def _tensors(contents: Any) -> Iterator[Tensor]:
-    """Those in nested containers. A container may be in others many times, and is looked into once."""
-    left, seen = [contents], set[int]()
-    while left:
-        part = left.pop()
-        if id(part) in seen:
-            continue
-        seen.add(id(part))
-        if isinstance(part, Tensor):
-            yield part
-        elif isinstance(part, Mapping | list | tuple | set):
-            left.extend(part.values() if isinstance(part, Mapping) else part)
+    return shards
 
 
 def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
@@ -163,12 +102,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))
     try:
-        contents = _put_together(Path(path), _load(Path(path)))
+        contents = _put_together(Path(path), read_tensor_file(Path(path)))
         name = not_finite(contents["state_dict"])
     except WeightsError:
         raise
     except Exception as error:
-        raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
+        reason = error if isinstance(error, TensorFileError) else type(error).__name__
+        raise WeightsError(f"{path}: not a readable checkpoint ({reason})") from error
     if name is not None:
         raise WeightsError(f"{path}: {name} is not finite")
     return contents
