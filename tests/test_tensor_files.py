@@ -35,7 +35,7 @@ def clips(value: Any) -> Any:
     return [{"key": "a", "more": value}]
 
 
-def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}) -> None:  # noqa: B006
+def write(path: Path, pickled: bytes, records: Mapping[str, bytes] = {"data/0": bytes(8)}) -> None:
     """Write an archive as torch does, with a pickle and records of the test's making."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in {"data.pkl": pickled, "byteorder": b"little", "version": b"3\n", **records}.items():
@@ -80,7 +80,9 @@ def storage(key: str = "0", length: bytes = b"K\x02") -> bytes:
 def tensor(size: int) -> bytes:
     """Return instructions for a tensor that repeats one number."""
     no_hooks = named("collections.OrderedDict") + b")R"
-    return called("torch._utils._rebuild_tensor_v2", storage(), b"K\0", number(size) + b"\x85", b"K\0\x85\x89" + no_hooks)
+    return called(
+        "torch._utils._rebuild_tensor_v2", storage(), b"K\0", number(size) + b"\x85", b"K\0\x85\x89" + no_hooks
+    )
 
 
 def dictionary(size: int) -> bytes:
@@ -188,12 +190,28 @@ def test_numbers_that_the_file_does_not_have_are_refused(tmp_path):
 def test_plain_values_of_all_kinds_are_read(tmp_path):
     layer = torch.nn.Linear(2, 2).double()
     several = {
-        "tensors": [layer.weight.data, torch.zeros(1).expand(2**10), torch.tensor(1), torch.ones(2, 3, dtype=torch.bool)],
+        "tensors": [
+            layer.weight.data,
+            torch.zeros(1).expand(2**10),
+            torch.tensor(1),
+            torch.ones(2, 3, dtype=torch.bool),
+        ],
         "shared": [layer.bias.data, layer.bias.data[:1], layer.bias.data],
         "parameter": layer.weight,
         "layer": layer.state_dict(),
         "bytes": [bytes(range(256)), b"a", b"abc", b"a"],
-        "names": ["a", 1, -(2**40), 1.5, None, True, (1, (2, 3)), torch.float16, torch.device("cuda", 1), torch.Size([2])],
+        "names": [
+            "a",
+            1,
+            -(2**40),
+            1.5,
+            None,
+            True,
+            (1, (2, 3)),
+            torch.float16,
+            torch.device("cuda", 1),
+            torch.Size([2]),
+        ],
         "counts": [Counter([3, 3, 4]), OrderedDict(a=1)],
     }
     torch.save(contents(several), tmp_path / "a")
