@@ -15,7 +15,6 @@ from zlib import crc32
 import numpy as np
 import torch
 from jaxtyping import Shaped
-from torch import Tensor
 
 from completesplat.atomic import write_text, writing
 from completesplat.data.loading.augmentation import BoxMasks

@@ -129,7 +129,7 @@ def test_what_a_killed_run_leaves_does_not_open_and_is_written_over(root, cache,
     model.encoder.register_forward_hook(copy)
     encode(root, tmp_path / "cache", model, batch_size=4)
     assert len(calls) > 3
-    assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy"}
+    assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy", "checksum.npy"}
     with pytest.raises(DataError, match="no finished latent cache"):
         LatentCache(left)
     again = encode(root, left)
