@@ -17,7 +17,7 @@ from completesplat.atomic import atomic_path, write_text
 from completesplat.errors import TensorFileError, WeightsError
 from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
 from completesplat.weights import RUN_WEIGHTS, read_small
-from completesplat.weights.tensor_files import read_tensor_file
+from completesplat.weights.checkpoint_reading import read_tensor_file
 
 HUB = "szymanowiczs/splatter-image-v1"
 PREFIX = "splatter_image:"

@@ -21,7 +21,7 @@ from completesplat.data.pictures.files import decode, picture_size
 from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError, TensorFileError
-from completesplat.weights.tensor_files import read_tensor_file
+from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CHUNKS_IN_MEMORY = 2
 
