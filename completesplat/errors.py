@@ -40,6 +40,10 @@ class PlyError(CompleteSplatError):
     """A `.ply` file that is damaged, or not a finite set of Gaussians."""
 
 
+class TensorFileError(CompleteSplatError):
+    """A file of `torch.save` that is damaged, or made to take more memory than it has bytes; the path is not named."""
+
+
 class WeightsError(CompleteSplatError):
     """Weights that are missing, damaged, not finite or made for another model."""
 

@@ -33,7 +33,7 @@ from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, require_one
 from completesplat.tensors import concatenate
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
-from completesplat.weights.checkpoint_reading import read_checkpoint
+from completesplat.weights.checkpoint_reading import not_finite, read_checkpoint
 from completesplat.weights.splatter_image import is_published
 
 
@@ -202,20 +202,25 @@ class CompleteSplat(SceneModel):
                 which are a `PublishedGenerator`.
 
         Raises:
-            WeightsError: files are missing, unreadable, changed, do not belong together, or name what `parts` does not;
-                or the run is of a model that makes no scene of a photograph.
+            WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name what
+                `parts` does not; or the run is of a model that makes no scene of a photograph.
         """
-        if is_published(path):
-            return PublishedGenerator(str(path))
-        checkpoint = checkpoint_of(path)
-        place = weights_folder(path) if checkpoint is None else checkpoint
         try:
-            return _read_folder(place) if checkpoint is None else _read_checkpoint(place)
+            if is_published(path):
+                model: SceneModel = PublishedGenerator(str(path))
+            elif (checkpoint := checkpoint_of(path)) is not None:
+                model = _read_checkpoint(checkpoint)
+            else:
+                model = _read_folder(weights_folder(path))
+            name = not_finite(model.state_dict())
         except WeightsError:
             raise
         except Exception as error:
             reason = str(error).strip().splitlines()
-            raise WeightsError(f"{place}: cannot be loaded: {reason[0] if reason else type(error).__name__}") from error
+            raise WeightsError(f"{path}: cannot be loaded: {reason[0] if reason else type(error).__name__}") from error
+        if name is not None:
+            raise WeightsError(f"{path}: {name} is not finite")
+        return model
 
 
 class OneAnswer(SceneModel):

@@ -10,6 +10,7 @@ from itertools import product
 import pytest
 import torch
 from omegaconf import OmegaConf
+from published_weights import write_published
 from safetensors.torch import load_file, save
 from support import compose_config, tiny_generator
 
@@ -233,6 +234,23 @@ def test_files_that_are_damaged_missing_or_of_another_model_are_refused(folder):
         (folder / name).unlink()
         with pytest.raises(WeightsError, match=name):
             CompleteSplat.from_pretrained(folder)
+
+
+def test_weights_that_are_not_finite_are_refused(folder, tmp_path):
+    (folder / SUMS_FILE).unlink()
+    path = folder / WEIGHTS_FILE
+    weights = load_file(path)
+    for value in (torch.nan, torch.inf):
+        path.write_bytes(save(weights | {"latent_std": torch.full_like(weights["latent_std"], value)}))
+        with pytest.raises(WeightsError, match=rf"^{folder}: latent_std is not finite$"):
+            CompleteSplat.from_pretrained(folder)
+    published = write_published(tmp_path, "hydrants")
+    contents = torch.load(published, weights_only=True)
+    name = next(name for name in contents["model_state_dict"] if name.endswith("out.bias"))
+    contents["model_state_dict"][name][0] = torch.nan
+    torch.save(contents, published)
+    with pytest.raises(WeightsError, match=rf"{name} is not finite$"):
+        CompleteSplat.from_pretrained(published)
 
 
 @pytest.mark.parametrize("target", ["os.system", "completesplat.generation.torch.load"])

@@ -2,22 +2,24 @@
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import reduce
+from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
-from torch import Tensor
+from jaxtyping import Shaped
 
-from completesplat.atomic import writing
+from completesplat.atomic import write_text, writing
 from completesplat.data.loading.augmentation import BoxMasks
 from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
-from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, read_as, write_json
+from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import (
     BadAnnotation,
@@ -30,9 +32,14 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene
+from completesplat.weights import sha256_of
 
-HEADER: dict[str, str | int] = {"format": 3, "kind": "latent_cache"}
+HEADER: dict[str, str | int] = {"format": 4, "kind": "latent_cache"}
 ARRAYS = ("mean", "log_variance", "condition")
+CHECKSUMS = "checksum"
+"""The array with the CRC-32 of each row of the others. A row is checked whenever it is read, because the files may have
+hundreds of gigabytes and each process opens them; this array, and the manifest, are checked when they are opened."""
+NO_SUM = "0" * 64
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,10 @@ class Origin:
 
 @dataclass(frozen=True)
 class LatentCacheManifest:
-    """A whole store; `sequences` are those of the training set, in its order; `mean` and `std` are of a latent."""
+    """A whole store; `sequences` are those of the training set, in its order; `mean` and `std` are of a latent.
+
+    `checksums` is the SHA-256 of the array of checksums, `sha256` that of the manifest, with zeros in its place.
+    """
 
     version: str
     origin: Origin
@@ -83,11 +93,13 @@ class LatentCacheManifest:
     std: tuple[float, ...]
     arrays: dict[str, Array]
     sequences: tuple[CachedSequence, ...]
+    checksums: str
+    sha256: str = NO_SUM
 
     def __post_init__(self) -> None:
         rows, shapes = sum(len(s.stored) for s in self.sequences), {n: a.shape for n, a in self.arrays.items()}
         for true, reason in [
-            (set(shapes) == set(ARRAYS), f"arrays other than {', '.join(ARRAYS)}"),
+            (set(shapes) == {*ARRAYS, CHECKSUMS}, f"arrays other than {', '.join(ARRAYS)}, {CHECKSUMS}"),
             (all(len(s) == 4 and s[0] == rows for s in shapes.values()), f"arrays without {rows} rows of 3 axes"),
             (shapes.get("mean") == shapes.get("log_variance"), "means and log-variances of different shapes"),
             (all(0 <= s.first <= rows - len(s.stored) for s in self.sequences), "rows outside of the arrays"),
@@ -105,7 +117,16 @@ def is_latent_cache(root: Path) -> bool:
 
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
     """Finish the store."""
-    write_json(root / MANIFEST, manifest, HEADER)
+    text = json_text(manifest, HEADER)
+    write_text(root / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
+
+
+def row_checksums(rows: Mapping[str, Shaped[np.ndarray, "row _ _ _"]]) -> Shaped[np.ndarray, "row 1 1 1"]:
+    """Return the CRC-32 of each row of the arrays, one after the other."""
+    sums = [
+        reduce(lambda value, name: crc32(rows[name][i].tobytes(), value), ARRAYS, 0) for i in range(len(rows["mean"]))
+    ]
+    return np.array(sums, dtype=np.uint32).reshape(-1, 1, 1, 1)
 
 
 class ArrayWriter:
@@ -167,7 +188,7 @@ def open_array(root: Path, array: Array) -> np.memmap:
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
             raise UnreadableFile(f"damaged or no NumPy array: encode the pictures again ({error})") from None
-        if not isinstance(found, np.memmap) or found.shape != array.shape or found.dtype.name != array.dtype:
+        if not isinstance(found, np.memmap) or found.shape != array.shape or found.dtype != np.dtype(array.dtype):
             raise ChangedFile("not the array that the manifest describes: encode the pictures again")
         if path.stat().st_size != found.offset + found.nbytes:
             raise ChangedFile("longer than it was written: encode the pictures again")
@@ -189,26 +210,35 @@ class LatentCache:
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
         self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the pictures again")
+        text, digest = (folder / MANIFEST).read_text(), self.manifest.sha256
+        if sha256(text.replace(digest, NO_SUM).encode()).hexdigest() != digest:
+            raise ChangedFile("its checksum is another: encode the pictures again", str(folder / MANIFEST))
         self.origin = self.manifest.origin
         self.mean, self.std = self.manifest.mean, self.manifest.std
         self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
+        checksums = folder / self.manifest.arrays[CHECKSUMS].file
+        if sha256_of(checksums) != self.manifest.checksums:
+            raise ChangedFile("its checksum is another: encode the pictures again", str(checksums))
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
         self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
         self.holds_pictures = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
-        """The frame at a place in a sequence, without batch axis, in float32; `DataError` if it was not encoded."""
+        """Return the frame at a place in a sequence, without batch axis, in float32.
+
+        `DataError`: it was not encoded, or is not what was written.
+        """
         sequence = self.sequences[name]
         if frame not in sequence.stored:
             raise DataError("was not encoded", str(self.folder), name, frame)
         row = sequence.first + sequence.stored.index(frame)
-        mean, log_variance = self._floats("mean", row), self._floats("log_variance", row)
+        rows = {name: np.array(array[row : row + 1]) for name, array in self.arrays.items()}
+        if row_checksums(rows) != rows[CHECKSUMS]:
+            raise ChangedFile("its checksum is another: encode the pictures again", str(self.folder), name, frame)
+        mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
         if self.holds_pictures:
             # The same division as of pictures that are read, bit by bit.
-            share = np.divide(self.arrays["condition"][row], 255, dtype=np.float32)
-            condition = torch.from_numpy(np.asarray(share))
-        else:
-            condition = self._floats("condition", row)
+            condition = torch.from_numpy(np.divide(rows["condition"][0], 255, dtype=np.float32))
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
@@ -222,9 +252,6 @@ class LatentCache:
         """Refuse a store that was made from another data set, with `DataError`."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
-
-    def _floats(self, array: str, row: int) -> Float[Tensor, "_ _ _"]:
-        return torch.from_numpy(np.array(self.arrays[array][row], dtype=np.float32))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Worker processes map the files themselves; a pickled array would hold all of it.

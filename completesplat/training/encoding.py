@@ -19,6 +19,7 @@ from torch import nn
 from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.data.latent_cache import (
+    CHECKSUMS,
     Array,
     ArrayWriter,
     CachedSequence,
@@ -26,6 +27,7 @@ from completesplat.data.latent_cache import (
     LatentCacheManifest,
     Origin,
     is_latent_cache,
+    row_checksums,
     write_manifest,
 )
 from completesplat.data.loading.data_module import SceneDataModule
@@ -38,6 +40,7 @@ from completesplat.data.sequences import PosedSequence, SequenceSource, spread_p
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
+from completesplat.weights import sha256_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
 Rows = dict[str, Shaped[np.ndarray, "picture _ _ _"]]
@@ -272,7 +275,9 @@ def _write_store(
     """The first process writes what all encode; the others wait for it. `sequences` are there when `batches` end."""
     if is_first():
         arrays, moments = _write_arrays(out, blank, batches)
-        write_manifest(out, LatentCacheManifest(__version__, origin, *moments.results(), arrays, tuple(sequences)))
+        checksums = sha256_of(out / arrays[CHECKSUMS].file)
+        facts = (__version__, origin, *moments.results(), arrays, tuple(sequences), checksums)
+        write_manifest(out, LatentCacheManifest(*facts))
     else:
         deque(batches, maxlen=0)
     gathered(None)
@@ -284,10 +289,11 @@ def _write_arrays(out: Path, blank: Rows, batches: Iterator[tuple[Rows, Moments]
     with ExitStack() as files:
         writers = {
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
-            for name, rows in blank.items()
+            for name, rows in {**blank, CHECKSUMS: row_checksums(blank)}.items()
         }
         for rows, of_batch in batches:
             moments.join(of_batch)
+            rows[CHECKSUMS] = row_checksums(rows)
             for name, writer in writers.items():
                 writer.append(rows[name])
     return {name: writer.described() for name, writer in writers.items()}, moments

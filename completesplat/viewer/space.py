@@ -3,8 +3,12 @@
 `python -m completesplat.viewer.space WEIGHTS` opens it on this machine; the Space's files are in this folder's README.
 """
 
-import html
 import sys
+
+if __name__ == "__main__" and not sys.flags.safe_path:
+    del sys.path[0]  # as `python -m completesplat` does
+
+import html
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,20 +1,24 @@
-"""Checkpoints of training: told whole from damaged, and read as plain tensors, without Lightning."""
+"""Files of `torch.save`: plain tensors, in no more memory than the file has bytes; checkpoints, without Lightning.
+
+`torch.load(weights_only=True)` runs no code of a file, but what it may call can make much of a few bytes. The pickle is
+therefore read as a list of steps before it is loaded, and only the calls that `torch.save` writes are allowed.
+"""
 
 import hashlib
+import math
 import os
 import pickletools
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
-from encodings import normalize_encoding
-from encodings.aliases import aliases
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from completesplat.errors import WeightsError
+from completesplat.errors import TensorFileError, WeightsError
+from completesplat.schema import shown
 from completesplat.weights import sha256_of
 
 END, END_BYTES = b"PK\5\6", 22
@@ -25,16 +29,128 @@ SHARDS, SHARDS_SUFFIX = "shards", ".shards"
 and the SHA-256 of each."""
 DIVIDED = "divided:"
 """How the name begins that stands in the place of such a tensor."""
+ZIP = b"PK\3\4"
+MOST_REPEATED = 2**22
+"""Numbers of a tensor that has more of them than its file, because it repeats them."""
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
-    r"|torch\.nn\.parameter Parameter|collections (OrderedDict|Counter)|builtins (set|complex)|_codecs encode"
+    r"|collections (OrderedDict|Counter)|_codecs encode"
 )
-"""What tensors, containers and bytes are made with. torch's own list has more, of which byte arrays and others are as
-large as a few bytes say."""
-OF_BYTES = {codec for codec in aliases.values() if codec.endswith("_codec")}
-"""Codecs that make bytes of bytes (hexadecimal digits): twice as many, as often as they are asked."""
-MOST_REPEATED = 2**26
-"""Bytes of a tensor that is larger than its file, because it repeats what it has."""
+"""What tensors, containers and bytes are made with. torch allows more, such as byte arrays of any length."""
+NUMBERS = {"BININT", "BININT1", "BININT2", "LONG1"}
+TEXTS = {"BINUNICODE", "SHORT_BINSTRING"}
+TUPLES = {"EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
+MAPPINGS = {"EMPTY_DICT", "SETITEM", "SETITEMS"}
+CALLS = {"REDUCE", "BUILD", "NEWOBJ", "BINPERSID"}
+LONGEST_NAME = 16
+
+
+class Step(NamedTuple):
+    """An operation of a pickle, its argument, and the steps whose results it takes (kept for calls and tuples)."""
+
+    name: str
+    argument: Any = None
+    inputs: tuple[Any, ...] = ()
+
+
+def read_tensor_file(path: Path, mmap: bool = False) -> Any:
+    """Return what `torch.save` wrote to a file, on the CPU.
+
+    Args:
+        mmap: map the tensors from the file; its checksums (CRC-32) are not compared then.
+
+    Raises:
+        TensorFileError: the file is no zip archive from its first byte on, is damaged, has records or tensors that are
+            larger than itself, or holds other things than tensors and plain values.
+    """
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            # From other first bytes torch reads an older form, whatever archive is at the end.
+            if file.read(len(ZIP)) != ZIP:
+                raise TensorFileError("not an archive of torch.save")
+            file.seek(0)
+            archive = torch._C.PyTorchFileReader(file)
+            if sum(map(archive.get_record_size, archive.get_all_records())) > size:
+                raise TensorFileError("its parts are larger than the file")
+            _check_steps(archive.get_record("data.pkl"))
+        if not mmap:
+            with zipfile.ZipFile(path) as records:  # torch compares no checksums
+                whole = sum(record.file_size for record in records.infolist()) <= size and records.testzip() is None
+            if not whole:
+                raise TensorFileError("damaged: its checksum is another")
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+    except TensorFileError:
+        raise
+    except Exception as error:  # torch, zipfile and pickletools have many for a damaged file
+        raise TensorFileError(type(error).__name__) from error
+
+
+def _check_steps(pickle: bytes) -> None:
+    """Refuse a pickle with a step that may make more than the file holds."""
+    stack: list[Step] = []
+    marks: list[int] = []
+    memo: dict[Any, Step] = {}
+    for opcode, argument, _ in pickletools.genops(pickle):
+        name, before = opcode.name, opcode.stack_before
+        if name == "MARK":
+            marks.append(len(stack))
+        elif name.endswith("PUT"):
+            memo[argument] = stack[-1]
+        elif name.endswith("GET"):
+            value = memo[argument]
+            is_name = value.name == "GLOBAL" or (value.name in TEXTS and len(value.argument) <= LONGEST_NAME)
+            stack.append(value if is_name else Step(name))
+        else:
+            marked = pickletools.markobject in before
+            first = marks.pop() - before.index(pickletools.markobject) if marked else len(stack) - len(before)
+            step = Step(name, argument, tuple(stack[first:]) if name in CALLS | TUPLES else ())
+            if not _is_plain(step):
+                made = next((value.argument for value in step.inputs if value.name == "GLOBAL"), argument or name)
+                raise TensorFileError(f"made of {shown(made)}, not of tensors alone")
+            # Of a storage its length stays, of other calls their name alone.
+            length = step.inputs[0].inputs[-1].argument if name == "BINPERSID" else None
+            stack[first:] = [Step(name, length) if name in CALLS else step] * len(opcode.stack_after)
+
+
+def _is_plain(step: Step) -> bool:
+    """Whether `torch.save` writes such a step: its arguments stand beside it, so that nothing large is copied often."""
+    match step:
+        case Step("GLOBAL"):
+            return PLAIN.fullmatch(step.argument) is not None
+        case Step("BUILD", _, (_, state)):
+            return state.name in MAPPINGS
+        # The archive's reader takes no notice of capitals: other keys could name one record many times.
+        case Step("BINPERSID", _, (Step("TUPLE", _, (_, Step("GLOBAL"), key, _, length)),)):
+            return key.name in TEXTS and re.fullmatch("[0-9]+", key.argument) is not None and length.name in NUMBERS
+        case Step("REDUCE", _, (Step("GLOBAL", function), arguments)) if arguments.name in TUPLES:
+            return _is_plain_call(function, arguments.inputs)
+    return step.name not in CALLS
+
+
+def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
+    """Whether a call makes no more than what its arguments are in the file."""
+    match function.split()[1], arguments:
+        case "OrderedDict", ():
+            return True
+        case "Counter", (counts,):
+            return counts.name in MAPPINGS
+        case "Size", (sizes,):
+            return sizes.name in TUPLES
+        case "device", (place, *index):
+            return place.name in TEXTS and all(number.name in NUMBERS for number in index)
+        case "encode", (text, codec):
+            # Of other codecs some make twice as many bytes, as often as they are asked.
+            return text.name in TEXTS and codec == Step(codec.name, "latin1")
+        case "_rebuild_parameter", _:
+            return True
+        case "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_tensor_v3", (Step("BINPERSID", length), _, sizes, *_):
+            if any(size.name not in NUMBERS for size in sizes.inputs):
+                return False
+            if math.prod(size.argument for size in sizes.inputs) > max(length, MOST_REPEATED):
+                raise TensorFileError("a tensor is larger than the file")
+            return sizes.name in TUPLES
+    return False
 
 
 def check_whole(path: Path) -> None:
@@ -70,57 +186,10 @@ def shards_of(path: Path) -> dict[str, Any]:
     if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
         return {}
     try:
-        found: dict[str, Any] = _load(path, mmap=True).get(SHARDS, {})
+        shards: dict[str, Any] = read_tensor_file(path, mmap=True).get(SHARDS, {})
     except Exception:
         return {}
-    return found
-
-
-def _load(path: Path, mmap: bool = False) -> dict[str, Any]:
-    """What `torch.save` wrote; `WeightsError` for a file that is made to take more memory than it has bytes."""
-    size = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        records = archive.infolist()
-        if sum(record.file_size for record in records) > size:
-            raise WeightsError(f"{path}: not a readable checkpoint (its parts are larger than the file)")
-        # The reader takes no notice of capitals.
-        pickles = [archive.read(record) for record in records if record.filename.lower().endswith(".pkl")]
-    if (grows := next(filter(None, map(_growing, pickles)), None)) is not None:
-        raise WeightsError(f"{path}: not a readable checkpoint (made of {grows}, not of tensors alone)")
-    contents: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-    if any(value.nbytes > max(size, MOST_REPEATED) for value in _tensors(contents)):
-        raise WeightsError(f"{path}: not a readable checkpoint (a tensor is larger than the file)")
-    return contents
-
-
-def _growing(pickle: bytes) -> str | None:
-    """What a pickle names that is larger in memory than in the file, if there is such a thing."""
-    operations = [(opcode.name, str(argument)) for opcode, argument, _ in pickletools.genops(pickle)]
-    named = [argument for opcode, argument in operations if opcode == "GLOBAL"]
-    if "_codecs encode" in named:
-        texts = (argument for opcode, argument in operations if opcode == "BINUNICODE")
-        named += [f"the codec {text}" for text in texts if _codec(text) in OF_BYTES]
-    return next((name for name in named if not PLAIN.fullmatch(name)), None)
-
-
-def _codec(text: str) -> str:
-    """The codec that Python finds by a name."""
-    name = normalize_encoding(text).lower().replace(".", "_")
-    return aliases.get(name, name)
-
-
-def _tensors(contents: Any) -> Iterator[Tensor]:
-    """Those in nested containers. A container may be in others many times, and is looked into once."""
-    left, seen = [contents], set[int]()
-    while left:
-        part = left.pop()
-        if id(part) in seen:
-            continue
-        seen.add(id(part))
-        if isinstance(part, Tensor):
-            yield part
-        elif isinstance(part, Mapping | list | tuple | set):
-            left.extend(part.values() if isinstance(part, Mapping) else part)
+    return shards
 
 
 def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
@@ -163,12 +232,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))
     try:
-        contents = _put_together(Path(path), _load(Path(path)))
+        contents = _put_together(Path(path), read_tensor_file(Path(path)))
         name = not_finite(contents["state_dict"])
     except WeightsError:
         raise
     except Exception as error:
-        raise WeightsError(f"{path}: not a readable checkpoint ({type(error).__name__})") from error
+        reason = error if isinstance(error, TensorFileError) else type(error).__name__
+        raise WeightsError(f"{path}: not a readable checkpoint ({reason})") from error
     if name is not None:
         raise WeightsError(f"{path}: {name} is not finite")
     return contents

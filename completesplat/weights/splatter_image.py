@@ -14,9 +14,10 @@ import yaml
 from torch import Tensor
 
 from completesplat.atomic import atomic_path, write_text
-from completesplat.errors import WeightsError
+from completesplat.errors import TensorFileError, WeightsError
 from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
 from completesplat.weights import RUN_WEIGHTS, read_small
+from completesplat.weights.checkpoint_reading import read_tensor_file
 
 HUB = "szymanowiczs/splatter-image-v1"
 PREFIX = "splatter_image:"
@@ -88,10 +89,9 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         WeightsError: it is damaged, holds other things than plain data, or no tensors of a model.
     """
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # torch has many for a damaged file
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise WeightsError(f"{path}: damaged, or not plain numbers ({reason}); fetch it again") from error
+        checkpoint = read_tensor_file(path, mmap=True)
+    except TensorFileError as error:
+        raise WeightsError(f"{path}: damaged, or not plain numbers ({error}); fetch it again") from error
     tensors = checkpoint.get(STATE) if isinstance(checkpoint, dict) else None
     if not isinstance(tensors, dict) or not all(isinstance(value, Tensor) for value in tensors.values()):
         raise WeightsError(f"{path}: no {STATE} in it; give Splatter Image's own file")

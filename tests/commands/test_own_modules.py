@@ -82,13 +82,24 @@ def test_where_a_folder_of_settings_is_named_does_not_matter():
     assert split_config_dir(["x", "--config-dir=a=b"]) == (["--config-dir=a=b"], ["x"])
 
 
-def test_modules_of_the_working_folder_stand_in_for_no_others(command, own):
+SPACE = "completesplat.viewer.space"
+STARTED = {
+    "command": ["-c", "import sys; sys.argv[1:] = ['doctor', 'out=OUT']; from completesplat.cli import main; main()"],
+    "module": ["-m", "completesplat", "doctor", "out=OUT"],
+    "process of a launcher": ["-P", "-m", "completesplat", "doctor", "out=OUT"],
+    "Space": ["-m", SPACE, "nothing"],
+}
+
+
+@pytest.mark.parametrize("name", STARTED)
+def test_modules_of_the_working_folder_stand_in_for_no_others(own, name):
+    for module in ("rich", "torch", "hydra", "html"):
+        (own / f"{module}.py").write_text("raise RuntimeError('not the one that is installed')\n")
     (own / "json.py").write_text("raise RuntimeError('not the one of the standard library')\n")
-    (own / "rich.py").write_text("raise RuntimeError('not the one that is installed')\n")
-    program = "import sys; sys.argv[1:] = ['doctor', 'out=OUT']; from completesplat.cli import main; main()"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONSAFEPATH": "1"}
-    done = subprocess.run([sys.executable, "-c", program], cwd=own, env=environment, capture_output=True, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)} | ({"PYTHONSAFEPATH": "1"} if name == "command" else {})
+    done = subprocess.run([sys.executable, *STARTED[name]], cwd=own, env=environment, capture_output=True, text=True)
     assert "not the one" not in done.stderr
+    assert done.stderr.startswith("error: ") if name == "Space" else done.returncode == 0
 
 
 def test_what_is_begun_runs_as_it_is_written(command, own):

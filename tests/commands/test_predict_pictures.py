@@ -172,7 +172,7 @@ def test_weights_that_are_not_finite_are_refused_as_such(predict, tiny_weights, 
     for value in (torch.nan, torch.inf):
         save_file(weights | {"latent_std": torch.full_like(weights["latent_std"], value)}, folder / WEIGHTS_FILE)
         finished = predict(picture(tmp_path / "a.png"), f"weights={folder}")
-        said = f"error: {folder}: weights that are not finite in 1 tensors, such as latent_std\n"
+        said = f"error: {folder}: latent_std is not finite\n"
         assert (finished.status, finished.err) == (2, said)
 
 

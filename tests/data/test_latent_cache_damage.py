@@ -1,5 +1,7 @@
+import hashlib
 import json
 import pickle
+import random
 import shutil
 from functools import reduce
 from operator import getitem
@@ -42,6 +44,34 @@ def test_a_damaged_array_is_refused_by_its_name(copy, damage):
     assert "\n" not in str(caught.value)
 
 
+def read_all(folder: Path) -> None:
+    store = LatentCache(folder)
+    for name, sequence in store.sequences.items():
+        for frame in sequence.stored:
+            store.scene(name, frame)
+
+
+def test_every_changed_byte_of_every_file_is_refused(copy):
+    """As the manifest's standard deviations, which are read as any others."""
+    read_all(copy)
+    chance = random.Random(0)
+    for path in sorted(copy.iterdir()):
+        content = path.read_bytes()
+        begin = content.index(b"\n") + 1  # behind the header of an array
+        for place in [*chance.sample(range(begin, len(content) - 1), 6), len(content) - 2]:
+            changed = bytearray(content)
+            changed[place] ^= 1
+            path.write_bytes(changed)
+            with pytest.raises(DataError, match=r"^[^\n]*$"):
+                read_all(copy)
+        path.write_bytes(content)
+    text = (copy / "manifest.json").read_text()
+    digits = json.loads(text)["std"][0]
+    (copy / "manifest.json").write_text(text.replace(str(digits), str(digits * 2)))
+    with pytest.raises(DataError, match=r"manifest\.json: its checksum is another"):
+        read_all(copy)
+
+
 @pytest.mark.parametrize(
     ("place", "value"),
     [
@@ -60,8 +90,9 @@ def test_a_manifest_that_cannot_be_true_is_refused(copy, place, value):
     content = json.loads(path.read_text())
     taken = content["sequences"][1]["name"]
     reduce(getitem, place[:-1], content)[place[-1]] = taken if value == "taken" else value
-    path.write_text(json.dumps(content))
-    with pytest.raises(DataError):
+    text = json.dumps(content | {"sha256": "0" * 64})
+    path.write_text(text.replace("0" * 64, hashlib.sha256(text.encode()).hexdigest()))
+    with pytest.raises(DataError, match=r"^(?!.*its checksum is another)"):
         LatentCache(copy)
 
 

@@ -5,6 +5,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from fuzzing import png_of, png_parts
 from PIL import Image, ImageCms
 
 from completesplat.data.pictures import files
@@ -289,3 +290,17 @@ def test_pictures_in_memory_are_read_as_files_are(tmp_path):
 def test_pictures_in_memory_without_one_plain_meaning_are_refused(wrong, reason):
     with pytest.raises(ImageError, match=reason):
         read_photograph(wrong, SIZE)
+
+
+def test_a_png_whose_checksums_are_others_is_refused(tmp_path):
+    """Other pixels that unpack well: the checksum of their chunk alone tells."""
+    path = tmp_path / "a.png"
+    content = png(2, np.zeros((SIZE, SIZE, 3), np.uint16))
+    path.write_bytes(content)
+    read_photograph(path, SIZE)
+    chunks = png_parts(content)
+    other = png_of([(name, bytes([*data[:-1], 9]) if name == b"IDAT" else data) for name, data in chunks])
+    end = other.index(b"IEND") - 4
+    path.write_bytes(other[: end - 4] + bytes(4) + other[end:])
+    with pytest.raises(ImageError, match=r"a\.png: cannot be decoded: .*(checksum|CRC)"):
+        read_photograph(path, SIZE)

@@ -161,13 +161,12 @@ def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
     [
         ({"cameras": torch.zeros(4, 17)}, "18 columns"),
         ({"cameras": [[0.5] * 18] * 4}, "18 columns"),
-        ({"cameras": torch.zeros(4, 18).to_sparse()}, "18 columns"),
         ({"cameras": torch.zeros(3, 18)}, "4 images, 3 cameras and 4 timestamps"),
         ({"timestamps": torch.arange(4.0)}, "timestamps are not int64"),
-        ({"timestamps": large(10**12, dtype=torch.int64)}, "1000000000000 timestamps"),
+        ({"timestamps": large(10**6, dtype=torch.int64)}, "1000000 timestamps"),
         ({"timestamps": torch.tensor([0, 1, 2, 1])}, "another frame has its timestamp"),
         ({"images": [torch.zeros(9)] * 4}, "images are not a list"),
-        ({"images": [large(10**12)] * 4}, "images are not a list"),
+        ({"images": [large(10**6)] * 4}, "images are not a list"),
     ],
 )
 def test_an_entry_of_another_type_or_shape_is_refused(tmp_path, fields, part):

@@ -1,9 +1,9 @@
 """Encoding a training set: what is stored, how latents are scaled, and which caches are refused."""
 
 import itertools
-import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +15,7 @@ from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache import LatentCache
+from completesplat.data.latent_cache import LatentCache, write_manifest
 from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene
@@ -129,7 +129,7 @@ def test_what_a_killed_run_leaves_does_not_open_and_is_written_over(root, cache,
     model.encoder.register_forward_hook(copy)
     encode(root, tmp_path / "cache", model, batch_size=4)
     assert len(calls) > 3
-    assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy"}
+    assert {path.name for path in left.iterdir()} == {"mean.npy", "log_variance.npy", "condition.npy", "checksum.npy"}
     with pytest.raises(DataError, match="no finished latent cache"):
         LatentCache(left)
     again = encode(root, left)
@@ -197,8 +197,7 @@ def test_the_cache_of_this_model_and_these_data_is_accepted_and_stale_ones_are_r
 
 def test_latents_of_another_shape_are_refused(root, cache, tmp_path):
     copy = Path(shutil.copytree(cache.folder, tmp_path / "copy"))
-    content = json.loads((copy / "manifest.json").read_text())
-    content["origin"]["image_size"] = 32
-    (copy / "manifest.json").write_text(json.dumps(content))
+    origin = replace(cache.manifest.origin, image_size=32)
+    write_manifest(copy, replace(cache.manifest, origin=origin, sha256="0" * 64))
     with pytest.raises(DataError, match=r"latents of \(4, 2, 2\)"):
         check_cache(LatentCache(copy), small_autoreconstructor(), rooms(root).source("train"))

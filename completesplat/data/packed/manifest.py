@@ -134,9 +134,14 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
 
 
 def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None = None) -> None:
-    """A JSON file of a dictionary or a dataclass, there as a whole or not at all."""
+    """Write a JSON file of a dictionary or a dataclass, there as a whole or not at all."""
+    write_text(path, json_text(content, header))
+
+
+def json_text(content: Any, header: Mapping[str, str | int] | None = None) -> str:
+    """Return what `write_json` writes."""
     entries = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
-    write_text(path, json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n")
+    return json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n"
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:

@@ -22,6 +22,7 @@ from completesplat.data.pictures.exif import ORIENTATION, crop_fov, read_exif
 from completesplat.data.pictures.files import (
     EIGHT_BIT_MODES,
     SIXTEEN_BIT_MODES,
+    check_sums,
     deep_grey,
     opened,
     over_grey,
@@ -108,6 +109,8 @@ def _square(
         _check_file(Path(picture))
     with nullcontext(picture) if isinstance(picture, Image.Image) else opened(picture, FORMATS) as file:
         _check_side(*file.size)
+        if not isinstance(picture, Image.Image):
+            check_sums(file, picture)
         file.load()
         exif = read_exif(file)
     seen = upright(file, exif.get(ORIENTATION))

@@ -6,7 +6,6 @@ of JPEG files as uint8 tensors) (`real_estate_10k_tools`, `src/convert.py`). Chu
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Sequence
 from functools import partial
 from os.path import isfile
@@ -21,7 +20,8 @@ from completesplat.data.pictures.crop import Square, cut_square
 from completesplat.data.pictures.files import decode, picture_size
 from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
-from completesplat.errors import DataError
+from completesplat.errors import DataError, TensorFileError
+from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CHUNKS_IN_MEMORY = 2
 
@@ -90,24 +90,14 @@ def read_chunk(path: Path) -> Chunk:
 
     Raises:
         MissingFile: no such file.
-        UnreadableFile: no chunk, one that is damaged or would run code, or one that is much larger than its file.
+        UnreadableFile: no chunk, one that is damaged or would run code, or one that is larger than its file.
         BadAnnotation: not a list of clips, or clips with the same key.
     """
     require_file(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(record.file_size for record in archive.infolist())
-            # torch.save compresses nothing, so a chunk that says it is larger than its file is made to fill the memory.
-            # PyTorch does not look at the checksums.
-            whole = size <= path.stat().st_size and archive.testzip() is None
-            # What it reads safely may still be a byte array of any length, which a few bytes ask for.
-            names = [name for name in archive.namelist() if whole and name.lower().endswith(".pkl")]
-            whole = whole and not any(b"bytearray" in archive.read(name) for name in names)
-        content = torch.load(path, map_location="cpu", weights_only=True) if whole else None
-    except Exception as error:  # the unpickler's refusals have no common class
-        raise UnreadableFile(f"not a chunk that can be read safely ({type(error).__name__})", str(path)) from None
-    if not whole:
-        raise UnreadableFile("damaged, or asks for more memory than its file has bytes", str(path))
+        content = read_tensor_file(path)
+    except TensorFileError as error:
+        raise UnreadableFile(f"not a chunk that can be read safely ({error})", str(path)) from None
     if not isinstance(content, list) or not all(isinstance(e, dict) and isinstance(e.get("key"), str) for e in content):
         raise BadAnnotation("not a list of clips with keys", str(path))
     chunk = {entry["key"]: entry for entry in content}
