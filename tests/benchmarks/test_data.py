@@ -76,17 +76,3 @@ def test_nothing_is_left_behind_when_it_fails(command, tmp_path):
         assert finished.status == 2
         assert said in finished.err
         assert not list((tmp_path / "out").glob("*data*"))
-
-
-@pytest.mark.slow
-def test_many_clips_are_opened_and_read(command, tmp_path):
-    quick = ["write.scenes=20", "write.frames=3", "clips=[30,60]", "epochs=1", f"out={tmp_path / 'out'}"]
-    finished = command("bench", "clips", *quick)
-    assert finished.status == 0, finished.err
-    rows = strict_json(tmp_path / "out/clips.json")["rows"]
-    assert [row["clips"] for row in rows] == [30, 60]
-    for row in rows:
-        assert row["open_us"] * row["clips"] == pytest.approx(1e6 * row["open_seconds"])
-        assert row["epoch_us"] * 0.9 * row["clips"] == pytest.approx(1e6 * row["epoch_seconds"])  # a tenth validates
-    assert "A packed store of many tiny clips" in finished.out
-    assert not list((tmp_path / "out").glob("bench_clips_*"))
