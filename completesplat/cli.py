@@ -35,6 +35,10 @@ def main() -> None:
 
         print(f"completesplat {__version__}")
         return
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        sys.exit(_refuse("the working folder was removed: go to another folder"))
     if arguments[0] == "--complete":
         from completesplat.options import candidates
 

@@ -5,6 +5,7 @@ import math
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
 
@@ -77,6 +78,7 @@ class Exactly:
 
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+Seed = Annotated[int, Range(0, 2**63 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 4096)]  # of a picture, in pixels
 
@@ -204,7 +206,7 @@ def described(annotation: Any) -> str:
 def _is_a(kind: type, value: Any) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
-    return isinstance(value, int | float if kind is float else kind)
+    return isinstance(value, {int: Integral, float: Real}.get(kind, kind))  # NumPy's numbers, too
 
 
 def shown(value: Any) -> str:

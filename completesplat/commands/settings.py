@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.options import meant, options
-from completesplat.schema import Positive, Range, Share, arguments_of, check_settings, check_value
+from completesplat.schema import Positive, Range, Seed, Share, arguments_of, check_settings, check_value
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -28,9 +28,18 @@ LEVELS = (
 )
 
 
+class Trainer(TypedDict):
+    """Settings whose ranges Lightning does not check."""
+
+    accumulate_grad_batches: Positive
+    val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
+    check_val_every_n_epoch: Positive | None
+
+
 class Fit(TypedDict):
     """Of `completesplat fit`."""
 
+    trainer: Trainer
     seed: Annotated[int, Range(0, 2**32 - 1)]
     ckpt_path: str | None
     test: bool
@@ -45,7 +54,7 @@ class Predict(TypedDict):
     skip_weight: Share | None
     guidance_weight: Share
     steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**63 - 1)]
+    seed: Seed
     batch: Positive | None
     fov: float | None
     screen_space_dilation: bool
