@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import get_object, instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -235,9 +235,9 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
     return config
 
 
-def _changed(config: DictConfig, overrides: list[str]) -> DictConfig:
+def _changed(config: Any, overrides: list[str]) -> Any:
     try:
-        changed: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
+        changed = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
     except (OmegaConfBaseException, YAMLError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {reason}") from error

@@ -3,7 +3,6 @@
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from numbers import Integral
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -174,11 +173,11 @@ def draw_noise(
 
     `seed` is that of all noise, or there is one for each image; `CompleteSplatError`: another number of seeds.
     """
-    seeds = [seed] if isinstance(seed, Integral) else list(seed)
-    if not isinstance(seed, Integral) and len(seeds) != images:
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    if not isinstance(seed, int) and len(seeds) != images:
         raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
     shape = (images * samples // len(seeds), *shape)
-    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(int(one))) for one in seeds])
+    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(one)) for one in seeds])
 
 
 def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:
