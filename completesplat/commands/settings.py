@@ -78,7 +78,13 @@ class View(TypedDict):
     background: Share | Literal["remove"]
 
 
-class Test(TypedDict):
+class OfRun(TypedDict):
+    """Of every verb that reads a run."""
+
+    overrides: Sequence[str]
+
+
+class Test(OfRun):
     """Of `completesplat test`."""
 
     ckpt: str | None
@@ -98,8 +104,7 @@ def check_verb(verb: str, config: Any) -> None:
     Raises:
         CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
     """
-    if verb in OF_VERBS:
-        check_settings(OF_VERBS[verb], config)
+    check_settings(OF_VERBS.get(verb, OfRun), config)
     if verb != FIRST_A_PAGE:
         check_parts(config)
 

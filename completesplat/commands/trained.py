@@ -19,7 +19,7 @@ from completesplat.commands.settings import check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.options import conf_folder
 from completesplat.parts import read_architecture
-from completesplat.schema import check_settings, check_value, shown
+from completesplat.schema import check_value, shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
 from completesplat.weights.splatter_image import find, is_published
 
@@ -57,9 +57,6 @@ class Trained:
     rasterizer: Mapping[str, Any] | None = None
     sampler: Mapping[str, Any] | None = None
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_settings(Trained, vars(self))
 
     def configuration(self) -> Any:
         """The configuration of model and data.
@@ -237,7 +234,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
 def _changed(config: Any, overrides: list[str]) -> Any:
     try:
-        changed = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
+        changed: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
     except (OmegaConfBaseException, YAMLError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {reason}") from error

@@ -25,6 +25,8 @@ ODD = [
     ("data", "scenes=many", f"scenes=many: {WHOLE}"),
     ("data", "seed=-1", "seed=-1: must be at least 0"),
     ("data", "size=1000000", "size=1000000: must lie between 8 and 4096"),
+    ("test", "overrides=5", "overrides=5: must be a list, such as overrides=[5]"),
+    ("test", "overrides=[5]", "overrides=[5]: must be a text"),
     ("fit", "seed=abc", f"seed=abc: {WHOLE}"),
     ("fit", "seed=-1", "seed=-1: must lie between 0 and"),
     ("fit", "test=1", "test=1: must be true or false"),
@@ -60,7 +62,12 @@ ODD = [
 
 @pytest.mark.parametrize(("verb", "setting", "said"), ODD, ids=lambda one: one[:40])
 def test_an_odd_value_is_named_with_what_it_may_be(verb, setting, said):
-    given = {"predict": ["image=a.png", "weights=nowhere"], "data": ["data_task=toy"], "view": ["scene=nowhere"]}
+    given = {
+        "predict": ["image=a.png", "weights=nowhere"],
+        "data": ["data_task=toy"],
+        "test": ["ckpt=nowhere"],
+        "view": ["scene=nowhere"],
+    }
     assert said in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), setting)
 
 
