@@ -9,9 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from completesplat.errors import CompleteSplatError, DiskError
+from completesplat.names import printable
 
 NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
+BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
 PROBE_BYTES = 2**16
 BLOCK_BYTES = 512  # of `st_blocks`
 
@@ -21,7 +23,7 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
     """A temporary path beside `path` that takes its place when the block ends without an exception.
 
     The folder is not made: one that was removed while a program runs does not come back without what was in it. After
-    an exception the old file is as it was and nothing is left beside it.
+    an exception the old file is as it was and nothing is left beside it. A link at `path` is replaced, not followed.
 
     Args:
         name: of the temporary file; by default one of its own each time, with the suffix of `path`.
@@ -33,6 +35,7 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
     temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         with _asking_the_disk(path, temporary, size):
+            temporary.unlink(missing_ok=True)
             yield temporary
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
@@ -82,17 +85,29 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, if it is missing, in one that is there; `DiskError` if that is gone or the disk is full."""
+    """Make a folder, if it is missing, in one that is there.
+
+    Raises:
+        CompleteSplatError: the folder is a link, through which results would be written elsewhere.
+        DiskError: the folder above is gone, or the disk is full.
+    """
+    if folder.is_symlink():
+        raise CompleteSplatError(f"{folder}: is a link, and results are not written through links; remove it")
     with writing(folder):
         folder.mkdir(exist_ok=True)
 
 
-def disk_refusal(error: BaseException) -> DiskError | None:
-    """What to show for an error of the operating system that names the file which it has no space for, or None."""
-    if not isinstance(error, OSError) or error.errno not in {*NO_SPACE, errno.EROFS}:
+def file_refusal(error: BaseException) -> CompleteSplatError | None:
+    """Return one line for an error of the operating system with a named file: no space, or a name that cannot be used.
+
+    None for any other error.
+    """
+    name = (error.filename2 or error.filename) if isinstance(error, OSError) else None
+    if not isinstance(error, OSError) or not isinstance(name, str):
         return None
-    name = error.filename2 or error.filename
-    return _disk_error(error, Path(name)) if isinstance(name, str) else None
+    if error.errno in BAD_NAME:
+        return CompleteSplatError(f"{printable(name)}: cannot be used: {error.strerror}; choose another name")
+    return _disk_error(error, Path(name)) if error.errno in {*NO_SPACE, errno.EROFS} else None
 
 
 @contextmanager

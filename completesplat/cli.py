@@ -35,17 +35,12 @@ def main() -> None:
 
         print(f"completesplat {__version__}")
         return
-    if arguments[0] == "--complete":
-        from completesplat.options import candidates
-
-        print("\n".join(candidates(arguments[1:], VERBS)))
-        return
-    if arguments[0] == "completion":
-        from completesplat.options import SCRIPTS
-
-        if len(arguments) != 2 or arguments[1] not in SCRIPTS:
-            sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))
-        return print(SCRIPTS[arguments[1]], end="")
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        sys.exit(_refuse("the working folder was removed: go to another folder"))
+    if arguments[0] in ("--complete", "completion"):
+        return _complete(arguments[1:], script=arguments[0] == "completion")
     if arguments[0] not in VERBS:
         from completesplat.options import meant
 
@@ -68,6 +63,17 @@ def main() -> None:
         if message is None:
             raise
         sys.exit(_refuse(message, exit_status(error)))
+
+
+def _complete(words: list[str], script: bool) -> None:
+    """Print what may complete the last word, or the script by which a shell asks for that."""
+    from completesplat.options import SCRIPTS, candidates
+
+    if not script:
+        return print("\n".join(candidates(words, VERBS)))
+    if len(words) != 1 or words[0] not in SCRIPTS:
+        sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))
+    return print(SCRIPTS[words[0]], end="")
 
 
 def _refuse(message: str, status: int = 2) -> int:

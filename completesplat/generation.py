@@ -31,6 +31,7 @@ from completesplat.parts import (
 from completesplat.published import PublishedGenerator
 from completesplat.scene import Views
 from completesplat.scene_model import SceneModel, require_one
+from completesplat.schema import Positive, Seed
 from completesplat.tensors import concatenate
 from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
 from completesplat.weights.checkpoint_reading import not_finite, read_checkpoint
@@ -122,13 +123,13 @@ class CompleteSplat(SceneModel):
         images: Float[Tensor, "batch 3 height width"],
         cameras: Cameras,
         depth_range: Float[Tensor, "batch 2"],
-        samples: int = 1,
+        samples: Positive = 1,
         skip_weight: float | None = None,
         guidance_weight: float = 0.0,
         steps: int | None = None,
-        seed: int | Sequence[int] = 0,
+        seed: Seed | Sequence[Seed] = 0,
         visible: Float[Tensor, "batch 1 height width"] | None = None,
-        batch: int | None = None,
+        batch: Positive | None = None,
         on_step: Callable[[int, int, Gaussians], None] | None = None,
     ) -> Gaussians:
         """Draw `samples` scenes for each image.

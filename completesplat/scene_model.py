@@ -10,12 +10,13 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.atomic import atomic_path, make_folder, write_text
 from completesplat.data.pictures.photograph import Photograph, Picture, picture_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.scene import Views
+from completesplat.schema import check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
@@ -71,6 +72,7 @@ class SceneModel(nn.Module):
         Raises:
             CompleteSplatError: not a readable image, or what `generate` refuses.
         """
+        check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
         device = self.up.device
         scenes = self.eval().generate(
@@ -152,10 +154,11 @@ class SceneModel(nn.Module):
     def save_pretrained(self, path: Path | str) -> None:
         """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub.
 
-        `DiskError`: the disk is full.
+        Raises: those of `make_folder`.
         """
         folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         weights = {key: value.contiguous().cpu() for key, value in self.state_dict().items()}
         with atomic_path(folder / WEIGHTS_FILE, size=sum(value.nbytes for value in weights.values())) as temporary:
             save_file(weights, temporary)

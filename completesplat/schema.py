@@ -77,6 +77,7 @@ class Exactly:
 
 Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+Seed = Annotated[int, Range(0, 2**63 - 1)]
 Share = Annotated[float, Range(0, 1)]
 Side = Annotated[int, Range(8, 4096)]  # of a picture, in pixels
 

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.atomic import atomic_path, file_refusal, make_folder, write_text
+from completesplat.errors import CompleteSplatError
 
 
 def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
@@ -23,3 +24,30 @@ def test_after_an_exception_the_old_file_is_as_it_was_and_nothing_lies_beside_it
     assert caught.value.args[:2] == (path.parent, ".txt")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["x.txt", ".x.txt.unfinished"])
+def test_a_link_in_the_place_of_a_file_or_of_its_unfinished_one_is_replaced(tmp_path: Path, name: str) -> None:
+    target = tmp_path / "target"
+    target.write_text("kept")
+    (tmp_path / name).symlink_to(target)
+    with atomic_path(tmp_path / "x.txt", ".x.txt.unfinished") as temporary:
+        temporary.write_text("new")
+    assert (target.read_text(), (tmp_path / "x.txt").read_text()) == ("kept", "new")
+    assert not (tmp_path / "x.txt").is_symlink()
+
+
+def test_a_folder_that_is_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "folder").symlink_to("elsewhere")
+    with pytest.raises(CompleteSplatError, match="folder: is a link, and results are not written through links"):
+        make_folder(tmp_path / "folder")
+
+
+def test_only_errors_that_name_a_bad_file_name_are_refusals(tmp_path: Path) -> None:
+    for name, message in (("x" * 5000, "name too long"), (f"{tmp_path}", "exists"), (f"{__file__}/x", "Not a dir")):
+        with pytest.raises(OSError, match=message) as caught:
+            Path(name).mkdir()
+        assert str(file_refusal(caught.value)).startswith(name[:200])
+    assert file_refusal(FileNotFoundError(2, "No such file", "x")) is None
+    assert file_refusal(ValueError("x")) is None

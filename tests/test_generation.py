@@ -75,6 +75,26 @@ def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model
     assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": "4"}, "samples=4: must be a whole number"),
+        ({"samples": 1.5}, "samples=1.5: must be a whole number"),
+        ({"samples": 0}, "samples=0: must be at least 1"),
+        ({"batch": 0}, "batch=0: must be at least 1"),
+        ({"batch": "all"}, "batch=all: must be a whole number"),
+        ({"seed": None}, "seed=None: must be a whole number"),
+        ({"seed": 0.5}, "seed=0.5: must be a whole number"),
+        ({"seed": 2**70}, "seed=1180591620717411303424: must lie between"),
+        ({"seed": [1, 2]}, "seed=[1, 2]: 2 seeds for 1 images"),
+    ],
+)
+def test_settings_of_wrong_kinds_are_named(model, picture, settings, message):
+    with pytest.raises(CompleteSplatError) as caught:
+        model(picture, **{"samples": 1, "steps": 1} | settings)
+    assert str(caught.value).startswith(message)
+
+
 def test_samples_of_a_batch_stand_next_to_each_other(model, picture):
     photograph = model.read(picture)
     images = torch.stack([photograph.image, photograph.image.flip(-1)])

@@ -68,3 +68,10 @@ def test_a_hub_repository_in_the_cache_needs_no_network(tiny_weights, tmp_path, 
     assert weights_folder("some/splats") == repository / "snapshots" / commit
     with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
         weights_folder("other/splats")
+
+
+def test_a_name_that_is_too_long_for_a_file_is_refused_in_a_short_line():
+    for name in ("y" * 5000, "y" * 300 + "/x"):
+        with pytest.raises(WeightsError, match=r"^y{200}") as caught:
+            CompleteSplat.from_pretrained(name)
+        assert len(str(caught.value)) < 1500

@@ -17,9 +17,9 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.atomic import disk_refusal
+from completesplat.atomic import file_refusal
 from completesplat.commands import help, jobs
-from completesplat.commands.arguments import SWEEP, for_hydra, split_config_dir
+from completesplat.commands.arguments import SWEEP, behind_dashes, for_hydra
 from completesplat.commands.settings import misspelt
 from completesplat.errors import CompleteSplatError
 from completesplat.options import conf_folder, gsplat_constants
@@ -54,15 +54,15 @@ def launch(verb: str, arguments: list[str]) -> None:
         end_with(int(starter))
         with ended_by_signals():
             return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+    program, given = sys.argv[0], arguments
+    arguments = behind_dashes(arguments)
     if any(flag in arguments for flag in help.FLAGS):
         return print(help.page(verb, arguments))
-    program, given = sys.argv[0], arguments
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
     logging.raiseExceptions = False
-    flags, arguments = split_config_dir(arguments)
-    arguments = [*flags, *for_hydra(verb, arguments)]
+    arguments = for_hydra(verb, arguments)
     if any(flag in arguments for flag in SWEEP):
         arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
@@ -145,12 +145,12 @@ def exit_status(error: BaseException) -> int:
 
 
 def _own_error(error: BaseException) -> CompleteSplatError | None:
-    """What the package refused, or what a full disk did wherever it was written to."""
+    """The package's own error in a chain of causes, or one for a full disk or a bad file name."""
     chain: BaseException | None = error
     while chain is not None:
         if isinstance(chain, CompleteSplatError):
             return chain
-        if (refused := disk_refusal(chain)) is not None:
+        if (refused := file_refusal(chain)) is not None:
             return refused
         chain = chain.__cause__
     return None

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -13,9 +13,8 @@ from completesplat.names import printable
 from completesplat.options import TASKS, groups, meant, options
 
 EXPORT = "--export"
-CONFIG_DIR = ("--config-dir", "-cd")
-WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", EXPORT, *CONFIG_DIR)
-"""Flags behind which another argument belongs to them."""
+WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
+"""Hydra's flags behind which another argument belongs to them."""
 SWEEP = ("-m", "--multirun")
 MOST_SHOWN = 120  # characters of a value
 
@@ -26,21 +25,29 @@ def quoted(text: str) -> str:
     return QuotedString(text=unreferring, quote=Quote.single).with_quotes()
 
 
-def split_config_dir(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """What names a further folder of settings (`--config-dir DIR`), in one piece, and the other arguments.
+def behind_dashes(arguments: Sequence[str]) -> list[str]:
+    """Remove `--`, behind which no argument is a flag: `-name.png` becomes `./-name.png`."""
+    before = list(arguments).index("--") if "--" in arguments else len(arguments)
+    behind = [f"./{one}" if one.startswith("-") else one for one in arguments[before + 1 :]]
+    return [*arguments[:before], *behind]
 
-    Hydra takes its flags before or behind the settings, not between them. `CompleteSplatError`: no folder is named.
+
+def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Separate Hydra's flags, with the values that belong to them, from the other arguments.
+
+    Hydra takes flags before or behind the settings, not between them. `CompleteSplatError`: a flag lacks its value.
     """
     flags, others, given = [], [], iter(arguments)
     for argument in given:
-        name, equals, folder = argument.partition("=")
-        if name not in CONFIG_DIR:
+        name, equals, value = argument.partition("=")
+        if name == EXPORT or not name.startswith("-"):
             others.append(argument)
-            continue
-        folder = folder if equals else next(given, "")
-        if not folder:
-            raise CompleteSplatError(f"{name} needs a folder: {name} DIR")
-        flags.append(f"{CONFIG_DIR[0]}={folder}")
+        elif name not in WITH_VALUE:
+            flags.append(argument)
+        elif value := value if equals else next(given, ""):
+            flags.append(f"{name}={value}")
+        else:
+            raise CompleteSplatError(f"{name}: lacks its value; give {name} VALUE")
     return flags, others
 
 
@@ -84,7 +91,7 @@ def of_task(verb: str) -> Callable[[Sequence[str]], list[str]]:
     """For a verb with tasks: `TASK` as `VERB_task=TASK`, if it is the first argument."""
 
     def overrides(arguments: Sequence[str]) -> list[str]:
-        if not arguments or "=" in arguments[0] or arguments[0].startswith("-"):
+        if not arguments or "=" in arguments[0]:
             return list(arguments)
         return [f"{verb}_task={arguments[0]}", *arguments[1:]]
 
@@ -95,45 +102,29 @@ SHORT_FORMS = {"predict": of_predict, "view": of_view, "new": of_new, **{verb: o
 
 
 def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
-    """Flags and settings as hydra reads them.
+    """Return flags and settings as Hydra reads them, the flags first.
 
     The value of a setting that is the name of a file or folder as it stands is that name, whatever is in it: `a,b.jpg`.
 
     Raises:
         CompleteSplatError: a word that is no setting, a value that cannot be read, several values without `-m`.
     """
-    short_form = SHORT_FORMS.get(verb, list)
-    found = [_with_file(argument) for argument in short_form(arguments)]
-    sweep = any(flag in arguments for flag in SWEEP)
-    for argument in _settings(found):
-        _refuse_unreadable(argument, sweep)
-    return found
+    flags, others = split_flags(arguments)
+    settings = [_with_file(argument) for argument in SHORT_FORMS.get(verb, list)(others)]
+    for argument in settings:
+        _refuse_unreadable(argument, any(flag in SWEEP for flag in flags))
+    return [*flags, *settings]
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Words, which have no = or name a file, and the other arguments."""
-    given = list(_settings(arguments))
-    words = [one for one in given if not one.startswith("~") or os.path.isfile(one)]
-    words = [one for one in words if "=" not in one or os.path.isfile(one)]
-    rest = list(arguments)
-    for word in words:
-        rest.remove(word)
-    return words, rest
-
-
-def _settings(arguments: Sequence[str]) -> Iterator[str]:
-    """Arguments that are neither flags nor what belongs to these."""
-    given = iter(arguments)
-    for argument in given:
-        if argument in WITH_VALUE:
-            next(given, None)
-        elif not argument.startswith("-"):
-            yield argument
+    """Separate words, which have no = or name a file, from the other arguments."""
+    words = [one for one in arguments if ("=" not in one and not one.startswith("~")) or os.path.isfile(one)]
+    return words, [one for one in arguments if one not in words]
 
 
 def _with_file(argument: str) -> str:
     key, equals, value = argument.partition("=")
-    if not equals or argument.startswith("-") or not os.path.exists(value):
+    if not equals or not os.path.exists(value):
         return argument
     try:
         read = OverridesParser.create().parse_override(argument)

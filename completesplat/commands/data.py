@@ -5,17 +5,19 @@ import logging
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.schema import Positive
+from completesplat.schema import Filled, Positive, Range
 
 logger = logging.getLogger(__name__)
-MOST_SHOWN = 8
+
+Split = Literal["train", "val", "test"]
+Splits = Annotated[Sequence[Split], Filled()]
 
 
-def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> None:
+def check(data: Any, splits: Splits, workers: int | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
     from completesplat.data.audit import Findings, show
     from completesplat.data.audit import check as check_sources
@@ -31,7 +33,7 @@ def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> N
         sys.exit(1)
 
 
-def stats(data: Any, splits: Sequence[str], out: Path) -> None:
+def stats(data: Any, splits: Splits, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
@@ -45,12 +47,10 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
+def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
     """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
-    if not 1 <= scenes <= MOST_SHOWN or pictures < 1:
-        raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SHOWN} and 1 <= pictures")
     source = _sources(data, [split])[split]
     names = source.names
     chosen = [names[i * len(names) // scenes] for i in range(scenes)] if len(names) > scenes else names
@@ -62,7 +62,7 @@ def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
 
 def prepare(
     data: Any,
-    splits: Sequence[str],
+    splits: Splits,
     out: Path,
     codec: str,
     sequences_per_shard: Positive,

@@ -3,6 +3,7 @@
 import gc
 import hashlib
 import json
+import logging
 import math
 import os
 import platform
@@ -85,6 +86,15 @@ def is_first() -> bool:
     return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
 
 
+class LogFile(logging.FileHandler):
+    """Hydra's log of a job; a link in the place of its file is removed, not followed."""
+
+    def __init__(self, filename: str, mode: str = "a") -> None:
+        if os.path.islink(filename):
+            os.unlink(filename)
+        super().__init__(filename, mode)
+
+
 @contextmanager
 def alone_in(out: Path) -> Iterator[None]:
     """Hold the lock of a job's directory, in its first process; the lock's file names the process and the computer.
@@ -95,6 +105,8 @@ def alone_in(out: Path) -> Iterator[None]:
     if not is_first():
         yield
         return
+    if path.is_symlink() or path.is_dir():
+        raise CompleteSplatError(f"{path}: is a link or a folder, and the lock is a file; remove it")
     try:
         with writing(path):
             lock = FileLock(path).acquire(blocking=False)

@@ -76,9 +76,12 @@ def _pictures_of(path: Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path]
     try:
-        pictures = sorted(one for one in path.iterdir() if os.path.isfile(one) and one.suffix.lower() in SUFFIXES)
+        images = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES)
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
+    pictures = [one for one in images if os.path.isfile(one)]
+    if left_out := [printable(one.name) for one in images if not os.path.isfile(one)]:
+        log.warning("%s: left out, because they are no files: %s", printable(str(path)), ", ".join(left_out))
     if not pictures:
         raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
     return pictures
@@ -105,7 +108,8 @@ def wanted_files(config: Any) -> Wanted:
 
 def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
     """One name or a list of them, each once."""
-    names = [value] if isinstance(value, str) else list(value or [])
+    several = not value or (isinstance(value, Sequence) and not isinstance(value, str))
+    names = list(value or []) if several else [value]
     for one in names:
         if one not in choice:
             raise CompleteSplatError(f"{name}={one}: choose from {', '.join(choice)}")

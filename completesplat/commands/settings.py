@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.options import meant, options
-from completesplat.schema import Positive, Range, Share, arguments_of, check_settings, check_value
+from completesplat.schema import Positive, Range, Seed, Share, arguments_of, check_settings, check_value
 
 REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
@@ -28,9 +28,18 @@ LEVELS = (
 )
 
 
+class Trainer(TypedDict):
+    """Settings whose ranges Lightning does not check."""
+
+    accumulate_grad_batches: Positive
+    val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
+    check_val_every_n_epoch: Positive | None
+
+
 class Fit(TypedDict):
     """Of `completesplat fit`."""
 
+    trainer: Trainer
     seed: Annotated[int, Range(0, 2**32 - 1)]
     ckpt_path: str | None
     test: bool
@@ -45,7 +54,7 @@ class Predict(TypedDict):
     skip_weight: Share | None
     guidance_weight: Share
     steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**63 - 1)]
+    seed: Seed
     batch: Positive | None
     fov: float | None
     screen_space_dilation: bool
@@ -69,7 +78,13 @@ class View(TypedDict):
     background: Share | Literal["remove"]
 
 
-class Test(TypedDict):
+class OfRun(TypedDict):
+    """Of every verb that reads a run."""
+
+    overrides: Sequence[str]
+
+
+class Test(OfRun):
     """Of `completesplat test`."""
 
     ckpt: str | None
@@ -89,8 +104,7 @@ def check_verb(verb: str, config: Any) -> None:
     Raises:
         CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
     """
-    if verb in OF_VERBS:
-        check_settings(OF_VERBS[verb], config)
+    check_settings(OF_VERBS.get(verb, OfRun), config)
     if verb != FIRST_A_PAGE:
         check_parts(config)
 

@@ -11,12 +11,15 @@ from typing import Any
 
 from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from completesplat.commands.protocol import checkpoint_facts
+from completesplat.commands.settings import check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.options import conf_folder
 from completesplat.parts import read_architecture
-from completesplat.schema import shown
+from completesplat.schema import check_value, shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
 from completesplat.weights.splatter_image import find, is_published
 
@@ -204,13 +207,14 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
+        CompleteSplatError: the changes cannot be read, or do not fit.
     """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    config = OmegaConf.merge(_read_config(path, trust), OmegaConf.from_dotlist(overrides))
+    config = _changed(_read_config(path, trust), overrides)
     # The weights come from this checkpoint.
     for key in ONLY_FOR_TRAINING:
         parent, _, name = key.rpartition(".")
@@ -221,6 +225,18 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
         if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
             OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
     return config
+
+
+def _changed(config: Any, overrides: list[str]) -> Any:
+    try:
+        changed: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {reason}") from error
+    for part in OF_A_RUN:
+        check_value(part, Mapping[str, Any], changed[part])
+    check_parts(changed)
+    return changed
 
 
 def _read_config(path: Path, trust: bool) -> Any:

@@ -144,6 +144,7 @@ class ArrayWriter:
 
     def __enter__(self) -> "ArrayWriter":
         with writing(self.path):
+            self.path.unlink(missing_ok=True)  # it may be a link
             self._file = self.path.open("wb")
             self._begin = self._write_header()
         return self

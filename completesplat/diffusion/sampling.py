@@ -171,14 +171,13 @@ def draw_noise(
 ) -> Float[Tensor, "latent _ _ _"]:
     """Noise of this shape for several samples of each image, those of one image next to each other.
 
-    `seed` is that of all noise, or there is one for each image.
+    `seed` is that of all noise, or there is one for each image; `CompleteSplatError`: another number of seeds.
     """
-    if isinstance(seed, int):
-        return torch.randn((images * samples, *shape), generator=torch.Generator().manual_seed(seed))
-    drawn = [torch.randn((samples, *shape), generator=torch.Generator().manual_seed(own)) for own in seed]
-    if len(drawn) != images:
-        raise ValueError(f"{images} images, but {len(drawn)} seeds")
-    return torch.cat(drawn)
+    seeds = [seed] if isinstance(seed, int) else list(seed)
+    if not isinstance(seed, int) and len(seeds) != images:
+        raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
+    shape = (images * samples // len(seeds), *shape)
+    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(one)) for one in seeds])
 
 
 def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:

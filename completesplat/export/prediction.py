@@ -137,7 +137,8 @@ def write_fitted_scene(
 
     `CompleteSplatError`: nothing of the scene can be stored.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
+    make_folder(folder)
     stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     shown = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
+from completesplat.atomic import make_folder
 from completesplat.export.pictures import color_depth, image_grid, surface_depth
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
@@ -59,7 +60,7 @@ class SceneTable:
         up = module.completesplat.up if isinstance(module, LatentDiffusion) else None
         pivot = seen_center(module.rasterizer, gaussians, reference)
         frames, _ = orbit_views(module.rasterizer, gaussians, reference, pivot, FRAMES, module.background, up)
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folder(self.folder)
         path = self.folder / f"{len(self.rows):02}.mp4"
         write_video(path, frames.float())
         return path

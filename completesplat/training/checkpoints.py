@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, make_folder
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
 from completesplat.schema import Positive
@@ -104,7 +104,7 @@ class Checkpoints(Checkpoint):
         begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
         last = self.folder / LAST
         if trainer.is_global_zero:
-            self.folder.mkdir(parents=True, exist_ok=True)  # once: a run whose folder is removed is not to go on
+            make_folder(self.folder)  # once: a run whose folder is removed is not to go on
         if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
             link(begun, last)  # in the place of a damaged one, which is not to become the one before
         keep_signals(True)
@@ -181,7 +181,6 @@ class Checkpoints(Checkpoint):
 def link(source: Path, target: Path) -> None:
     """Give a file a second name, which may belong to another file until then; a copy where there are no hard links."""
     with _replaced(target) as unfinished:
-        unfinished.unlink(missing_ok=True)
         try:
             os.link(source, unfinished)
         except OSError:

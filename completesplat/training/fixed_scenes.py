@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import WandbLogger
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import write_text
+from completesplat.atomic import make_folder, write_text
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.export.cleaning import storable, with_screen_space_dilation
 from completesplat.export.pictures import SheetCell, color_depth, picture_sheet, write_png
@@ -62,7 +62,7 @@ class DrawsFixedScenes(Callback):
         self.scenes: list[SceneBatch] = []
         self.drawn = trainer.global_step
         if trainer.is_global_zero:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -161,7 +161,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     The JSON holds `step`, `up`, and for each file its name, its `scene` and its `reference_camera`. Gaussians are as in
     predictions. A scene of which nothing can be stored is left out.
     """
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     described = []
     for index, name in enumerate(scenes.names):
         scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")

@@ -161,7 +161,7 @@ class WandbRun(WandbLogger):
     def _id_of_folder(self) -> str:
         path = Path(self._save_dir) / "wandb_id"  # type: ignore[arg-type]
         if not (path.is_file() and path.read_text().strip()):
-            path.write_text(secrets.token_hex(4) + "\n")
+            write_text(path, secrets.token_hex(4) + "\n")
         return path.read_text().strip()
 
     @rank_zero_only

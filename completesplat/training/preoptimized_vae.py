@@ -15,7 +15,7 @@ from rich.progress import track
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
+from completesplat.atomic import atomic_path, make_folder
 from completesplat.baselines.sparse_vae import SparseVAE
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import SceneStore
@@ -45,7 +45,7 @@ class FittedScenes:
     def __init__(
         self, folder: Path, stores: Sequence[SceneStore], fit: Callable[[SceneBatch], Gaussians], settings: str
     ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.folder = folder
         self.stores = {name: store for store in stores for name in store.names}
         self.fit = fit

@@ -5,12 +5,14 @@ have a model card too, `README.md`.
 """
 
 import hashlib
+import os
 import re
 from pathlib import Path
 from urllib.parse import urlparse
 
 from completesplat.atomic import write_text
 from completesplat.errors import WeightsError
+from completesplat.names import printable
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
@@ -28,7 +30,7 @@ def checkpoint_of(weights: Path | str) -> Path | None:
     Of a run without checkpoints, because it has nothing to train, the place where it would be.
     """
     path = Path(str(weights)).expanduser()
-    if str(weights) in in_the_box() or not path.exists():
+    if str(weights) in in_the_box() or not os.path.exists(path):  # `Path.exists` raises where a name is too long
         return None
     if path.is_file():
         return path
@@ -82,12 +84,13 @@ def _locate(weights: str) -> Path:
     if weights in in_the_box():
         return BOX / weights
     local = Path(weights).expanduser()
-    if local.exists():
+    if os.path.exists(local):
         of_run = not (local / CONFIG_FILE).is_file() and (local / RUN_WEIGHTS / CONFIG_FILE).is_file()
         return local / RUN_WEIGHTS if of_run else local
     if HUB_ID.fullmatch(weights):
         return _download(weights)
-    raise WeightsError(f"{weights}: no such folder; with the package come {', '.join(in_the_box()) or 'no weights'}")
+    included = ", ".join(in_the_box()) or "no weights"
+    raise WeightsError(f"{printable(weights)}: no such folder; with the package come {included}")
 
 
 def _download(hub_id: str) -> Path:

@@ -4,6 +4,7 @@
 checkpoint of torch with `model_state_dict`. The weights of objects of all kinds are `model_latest.pth` there.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.atomic import atomic_path, make_folder, write_text
 from completesplat.errors import TensorFileError, WeightsError
 from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
 from completesplat.weights import RUN_WEIGHTS, read_small
@@ -69,7 +70,7 @@ class Published(NamedTuple):
 def is_published(weights: Path | str) -> bool:
     """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
     path = Path(str(weights)).expanduser()
-    return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (path.is_dir() and bool(_models_in(path)))
+    return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (os.path.isdir(path) and bool(_models_in(path)))
 
 
 def find(weights: str) -> Published:
@@ -100,7 +101,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 def write_trained(folder: Path, weights: Path, tensors: Mapping[str, Tensor]) -> None:
     """Write weights that were trained on, as their authors' files: their settings go with them as they are."""
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     config = _config_beside(weights)
     write_text(folder / config.name, read_small(config))
     with atomic_path(folder / weights.name) as temporary:

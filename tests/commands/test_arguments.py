@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from support import compose_config
 
-from completesplat.commands.arguments import for_hydra
+from completesplat.commands.arguments import behind_dashes, for_hydra
 from completesplat.errors import CompleteSplatError
 
 NAMES = [
@@ -68,9 +68,11 @@ def test_numbers_and_lists_stay_what_they_are_beside_files_of_their_names(tmp_pa
     ("verb", "typed", "given"),
     [
         ("predict", ["a.png", "samples=1"], ["image='a.png'", "samples=1"]),
-        ("predict", ["-m", "a.png", "seed=0,1"], ["image='a.png'", "-m", "seed=0,1"]),
-        ("predict", ["--cfg", "job", "a.png"], ["image='a.png'", "--cfg", "job"]),
+        ("predict", ["-m", "a.png", "seed=0,1"], ["-m", "image='a.png'", "seed=0,1"]),
+        ("predict", ["--cfg", "job", "a.png"], ["--cfg=job", "image='a.png'"]),
         ("view", ["image=a.png", "weights=b"], ["image=a.png", "weights=b"]),
+        ("fit", ["experiment=toy_var", "-m", "seed=0,1"], ["-m", "experiment=toy_var", "seed=0,1"]),
+        ("data", ["-m", "toy", "seed=0,1"], ["-m", "data_task=toy", "seed=0,1"]),
         ("view", ["--help"], ["--help"]),
         ("data", ["toy", "kind=rooms"], ["data_task=toy", "kind=rooms"]),
         ("new", ["loss", "mine"], ["kind='loss'", "name='mine'"]),
@@ -86,6 +88,7 @@ def test_words_and_flags_become_settings(verb, typed, given):
         ("predict", ["a.png", "image=b.png"], "give pictures by their names or as image=, not both: a.png"),
         ("view", ["a.ply", "b.ply"], "give one path to look at, not a.ply b.ply"),
         ("view", ["a.ply", "--export"], "--export needs a file: --export page.html"),
+        ("fit", ["--config-dir"], "--config-dir: lacks its value; give --config-dir VALUE"),
         ("new", ["loss", "a", "b"], "give one kind and one name, not loss a b"),
         ("fit", ["nonsense"], "nonsense: no setting, which are given as key=value"),
         ("data", ["toy", "rooms"], "rooms: no setting, which are given as key=value"),
@@ -104,6 +107,15 @@ def test_what_cannot_be_read_is_named_with_what_can(verb, typed, said):
     with pytest.raises(CompleteSplatError) as caught:
         for_hydra(verb, typed)
     assert str(caught.value).startswith(said)
+
+
+def test_no_argument_behind_two_dashes_is_a_flag(command, tmp_path):
+    assert behind_dashes(["-m", "a.png", "--", "-b.png", "c.png", "--", "-m"]) == [
+        *("-m", "a.png", "./-b.png", "c.png", "./--", "./-m"),
+    ]
+    assert behind_dashes(["a.png", "-m"]) == ["a.png", "-m"]
+    missing = command("predict", "weights=toy_objects", "rasterizer=reference", "out=OUT", "--", "-h")
+    assert (missing.status, missing.err) == (2, "error: -h: no such file\n")
 
 
 def test_pictures_are_given_by_their_names(command, tiny_weights, tmp_path):

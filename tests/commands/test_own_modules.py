@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 from written_commands import ROOT
 
-from completesplat.commands.arguments import split_config_dir
+from completesplat.commands.arguments import split_flags
 from completesplat.commands.jobs import composed
 
 MINE = """
@@ -78,8 +78,8 @@ def test_the_packages_settings_come_first_and_those_of_the_working_folder_are_fo
 
 
 def test_where_a_folder_of_settings_is_named_does_not_matter():
-    assert split_config_dir(["a=1", "-cd", "b", "c=2"]) == (["--config-dir=b"], ["a=1", "c=2"])
-    assert split_config_dir(["x", "--config-dir=a=b"]) == (["--config-dir=a=b"], ["x"])
+    assert split_flags(["a=1", "-cd", "b", "c=2"]) == (["-cd=b"], ["a=1", "c=2"])
+    assert split_flags(["x", "--config-dir=a=b"]) == (["--config-dir=a=b"], ["x"])
 
 
 SPACE = "completesplat.viewer.space"

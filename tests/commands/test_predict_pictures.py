@@ -53,6 +53,15 @@ def picture(path: Path, color: str = "red") -> Path:
     return path
 
 
+def test_what_a_folder_has_that_is_no_file_is_named(tmp_path, caplog):
+    picture(tmp_path / "photos/a.png")
+    os.mkfifo(tmp_path / "photos/pipe.png")
+    (tmp_path / "photos/link.png").symlink_to("nowhere")
+    (tmp_path / "photos/same.png").symlink_to("a.png")
+    assert [path.name for path in find_pictures(str(tmp_path / "photos"))] == ["a.png", "same.png"]
+    assert caplog.messages == [f"{tmp_path}/photos: left out, because they are no files: link.png, pipe.png"]
+
+
 def test_a_folder_is_its_pictures_sorted_and_not_those_of_its_folders(tmp_path):
     for name in ("b.jpg", "a.PNG"):
         picture(tmp_path / "photos" / name)

@@ -11,7 +11,9 @@ import pytest
 from omegaconf import OmegaConf
 from support import SMALL, script, strict_json
 
+from completesplat.commands.jobs import alone_in
 from completesplat.data.toy import write_objects
+from completesplat.errors import CompleteSplatError
 from completesplat.training.reconstruction import ReconstructionModule
 
 # Its child, as a loader's worker, outlives it for a while.
@@ -56,6 +58,52 @@ def test_a_second_process_is_refused_until_the_first_is_gone(command, toy_root, 
     for _ in range(2):  # also after a process that ended by itself
         assert command(*given).status == 0
     assert (tmp_path / "run/.lock").read_text().split()[0] == str(os.getpid())
+
+
+@pytest.mark.parametrize("out", ["file", "file/below", "/dev/null", "x" * 300])
+def test_what_cannot_be_a_folder_is_refused_as_one(command, tmp_path, out):
+    (tmp_path / "file").write_text("kept")
+    refused = command("data", "toy", "scenes=1", "size=16", f"out={out}")
+    assert (refused.status, refused.err.count("\n")) == (2, 1)
+    assert refused.err.startswith(f"error: {out}: cannot be used: ")
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize("kind", ["folder", "link", "link to nothing"])
+def test_a_lock_that_is_no_file_is_refused(tmp_path, kind):
+    lock, target = tmp_path / "run/.lock", tmp_path / "target"
+    lock.parent.mkdir()
+    if kind == "folder":
+        lock.mkdir()
+    else:
+        lock.symlink_to(target)
+    if kind == "link":
+        target.write_text("kept")
+    with pytest.raises(CompleteSplatError, match=r"run/\.lock: is a link or a folder"), alone_in(lock.parent):
+        pass
+    assert (target.read_text() == "kept") if kind == "link" else not target.exists()
+
+
+def test_a_removed_working_folder_is_named(command, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    for given in (["data", "toy"], ["fit", "--help"], ["--complete", "fit", "experiment="]):
+        refused = command(*given)
+        assert (refused.status, refused.err) == (2, "error: the working folder was removed: go to another folder\n")
+
+
+def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
+    run, kept = tmp_path / "run", tmp_path / "kept"
+    run.mkdir()
+    kept.write_text("kept")
+    written = ["commands.log", "config.yaml", "run.json", "stats.json", "stats.png"]
+    for name in written:
+        (run / name).symlink_to(kept)
+    given = ["data", "stats", "data=toy_objects", f"data.root={toy_root}", "splits=[val]", f"out={run}"]
+    assert command(*given).status == 0
+    assert kept.read_text() == "kept"
+    assert not any((run / name).is_symlink() for name in written)
 
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=4", "trainer.log_every_n_steps=1"]

@@ -20,7 +20,13 @@ ODD = [
     ("predict", "weights=[a]", "weights=['a']: must be a text"),
     ("view", "port=none", f"port=none: {WHOLE}"),
     ("view", "samples=1.5", f"samples=1.5: {WHOLE}"),
+    ("predict", "video=1", "video=1: choose from orbit, swipe, wobble"),
+    ("predict", "formats=5", "formats=5: choose from ply, "),
     ("data", "scenes=many", f"scenes=many: {WHOLE}"),
+    ("data", "seed=-1", "seed=-1: must be at least 0"),
+    ("data", "size=1000000", "size=1000000: must lie between 8 and 4096"),
+    ("test", "overrides=5", "overrides=5: must be a list, such as overrides=[5]"),
+    ("test", "overrides=[5]", "overrides=[5]: must be a text"),
     ("fit", "seed=abc", f"seed=abc: {WHOLE}"),
     ("fit", "seed=-1", "seed=-1: must lie between 0 and"),
     ("fit", "test=1", "test=1: must be true or false"),
@@ -38,6 +44,10 @@ ODD = [
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
     ("fit", "trainer.max_steps=abc", f"trainer.max_steps=abc: {WHOLE}"),
+    ("fit", "trainer.val_check_interval=0", "trainer.val_check_interval=0: must be at least "),
+    ("fit", "trainer.accumulate_grad_batches=0", "trainer.accumulate_grad_batches=0: must be at least 1"),
+    ("fit", "trainer.accumulate_grad_batches=-1", "trainer.accumulate_grad_batches=-1: must be at least 1"),
+    ("fit", "trainer.check_val_every_n_epoch=0", "trainer.check_val_every_n_epoch=0: must be at least 1"),
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
     ("fit", "trainer.accelerator=abacus", "trainer: "),
     ("fit", "loss.terms.mse.weight=abc", f"loss.terms.mse.weight=abc: {NUMBER}"),
@@ -52,7 +62,12 @@ ODD = [
 
 @pytest.mark.parametrize(("verb", "setting", "said"), ODD, ids=lambda one: one[:40])
 def test_an_odd_value_is_named_with_what_it_may_be(verb, setting, said):
-    given = {"predict": ["image=a.png", "weights=nowhere"], "data": ["data_task=toy"], "view": ["scene=nowhere"]}
+    given = {
+        "predict": ["image=a.png", "weights=nowhere"],
+        "data": ["data_task=toy"],
+        "test": ["ckpt=nowhere"],
+        "view": ["scene=nowhere"],
+    }
     assert said in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), setting)
 
 

@@ -169,6 +169,20 @@ def test_what_is_to_be_scored_is_said_once():
             Trained(**given).configuration()
 
 
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["data.image_size=nan"], "data.image_size=nan: must be a whole number"),
+        (["data.image_size=["], "overrides=['data.image_size=[']: cannot be applied: "),
+        (["data"], "data=None: must be a mapping"),
+    ],
+)
+def test_changes_to_a_run_s_settings_that_do_not_fit_are_named(pipeline, overrides, message):
+    with pytest.raises(CompleteSplatError) as caught:
+        Trained(str(pipeline.var / "checkpoints/last.ckpt"), overrides).open()
+    assert str(caught.value).startswith(message)
+
+
 def test_a_sampler_for_a_model_without_samples_is_refused(pipeline):
     with pytest.raises(CompleteSplatError, match="a diffusion model is needed"):
         Trained(str(pipeline.var / "checkpoints/last.ckpt"), sampler={"steps": 2}).open()

@@ -271,6 +271,8 @@ def test_pictures_in_memory_are_read_as_files_are(tmp_path):
     bright = pixels((share * 255).round().astype(np.uint8))
     for of_floats in (share, share.astype(np.float64), torch.from_numpy(share).permute(2, 0, 1)):
         np.testing.assert_allclose(pixels(of_floats), bright, atol=1 / 255)
+    rounded = torch.from_numpy(share).permute(2, 0, 1).bfloat16()
+    np.testing.assert_array_equal(pixels(rounded), pixels(rounded.float()))
     np.testing.assert_array_equal(pixels(share, 40), share[:, 8:48])  # not resized: not rounded either
 
 

@@ -98,7 +98,7 @@ class SceneDataModule(LightningDataModule):
         on_bad: Annotated[str, OneOf(("skip", "raise"))] = "skip",
         max_bad_fraction: Share = 0.1,
         allow_changed: bool = False,
-        seed: int = 0,
+        seed: Natural = 0,
     ) -> None:
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip

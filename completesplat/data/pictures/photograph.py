@@ -164,7 +164,9 @@ def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "he
     channel = 0 if isinstance(picture, Tensor) else -1
     if picture.ndim != 3 or picture.shape[channel] != 3:
         raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
-    values = picture.detach().cpu().movedim(0, -1).numpy() if isinstance(picture, Tensor) else picture
+    if isinstance(picture, Tensor):  # NumPy has no bfloat16
+        picture = picture.float() if picture.is_floating_point() else picture
+    values = picture.movedim(0, -1).numpy(force=True) if isinstance(picture, Tensor) else picture
     if values.dtype == np.uint8:
         return Image.fromarray(values)
     if not np.issubdtype(values.dtype, np.floating):
