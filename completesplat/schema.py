@@ -16,13 +16,15 @@ KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 @dataclass(frozen=True)
 class Range:
-    """A rule for `Annotated`: a number lies between two others, both included."""
+    """A rule for `Annotated`: a number is finite and lies between two others, both included."""
 
     least: float
     most: float = math.inf
 
     def refusal(self, value: Any) -> str | None:
         """Why the value is refused; None if it is not."""
+        if value == math.inf:
+            return "must be finite"
         if self.least <= value <= self.most:
             return None
         limited = f"lie between {self.least:g} and {self.most:g}"

@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 MOST_SHOWN = 8
 
 
-def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> None:
+def check(data: Any, splits: Sequence[str], workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
     from completesplat.data.audit import Findings, show
     from completesplat.data.audit import check as check_sources
@@ -23,7 +23,7 @@ def check(data: Any, splits: Sequence[str], workers: int | None, out: Path) -> N
     try:
         findings = check_sources(_sources(data, splits), workers)
     except DataError as error:  # the data set as a whole
-        findings = Findings(0, 0, [error], {})
+        findings = Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
     show(findings)
     if not findings.sequences:
@@ -66,7 +66,7 @@ def prepare(
     out: Path,
     codec: str,
     sequences_per_shard: Positive,
-    workers: int | None,
+    workers: Positive | None,
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:

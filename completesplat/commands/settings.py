@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.errors import HydraException, MissingConfigException
-from hydra.utils import get_object
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -28,6 +28,12 @@ LEVELS = (
 )
 
 
+class Training(TypedDict):
+    """Settings of Lightning's trainer with a range that it does not check."""
+
+    gradient_clip_val: Annotated[float, Range(0)] | None
+
+
 class Fit(TypedDict):
     """Of `completesplat fit`."""
 
@@ -35,6 +41,7 @@ class Fit(TypedDict):
     ckpt_path: str | None
     test: bool
     optimized_metric: str | None
+    trainer: Training
 
 
 class Predict(TypedDict):
@@ -151,6 +158,17 @@ def check_image_size(config: Any) -> None:
         near = max(multiple, round(size / multiple) * multiple)
         said = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
         raise CompleteSplatError(f"data.image_size={size}: {said}")
+
+
+def check_optimizer(config: Any) -> None:
+    """Raise `CompleteSplatError` for settings that an optimizer refuses, if there is one, before there is a model."""
+    from torch import nn, zeros
+
+    try:
+        if config is not None:
+            instantiate(config, _convert_="all")([nn.Parameter(zeros(1))])
+    except (ValueError, TypeError) as error:
+        raise CompleteSplatError(f"optimizer: {error}") from error
 
 
 def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:

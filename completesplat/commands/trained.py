@@ -13,6 +13,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import OmegaConf
 
 from completesplat.commands.protocol import checkpoint_facts
+from completesplat.commands.settings import check_image_size, check_optimizer, check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.options import conf_folder
 from completesplat.parts import read_architecture
@@ -209,13 +210,21 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
+        CompleteSplatError: a change that `fit` refuses, too.
     """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    config = OmegaConf.merge(_read_config(path, trust), OmegaConf.from_dotlist(overrides))
+    changes = OmegaConf.from_dotlist(overrides)
+    for key in [key for key in changes if key not in OF_A_RUN]:
+        raise CompleteSplatError(f"{key}: no setting of a run's model or data, which overrides= changes")
+    config = OmegaConf.merge(_read_config(path, trust), changes)
+    if overrides:
+        check_parts(config)
+        check_image_size(config)
+        check_optimizer(config.model.get("optimizer"))
     # The weights come from this checkpoint.
     for key in ONLY_FOR_TRAINING:
         parent, _, name = key.rpartition(".")

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from completesplat.atomic import write_text
 from completesplat.data.processes import map_in_processes
-from completesplat.data.sequences import SequenceSource
+from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
 
@@ -47,12 +47,14 @@ class Findings:
     Attributes:
         refused: each thing once, in the order of the data set.
         splits: the same two numbers for each split alone.
+        shared: the sequences that two splits share, see `shared_names`.
     """
 
     sequences: int
     frames: int
     refused: list[DataError]
     splits: dict[str, dict[str, int]]
+    shared: dict[str, list[str]]
 
     def by_kind(self) -> dict[str, list[DataError]]:
         """The refusals by what is wrong, and those left out by their reason; the most frequent first."""
@@ -70,6 +72,7 @@ class Findings:
             "refused": [{part: getattr(error, part) for part in parts} for error in self.refused],
             "counts": {kind: len(errors) for kind, errors in self.by_kind().items()},
             "splits": self.splits,
+            "shared": self.shared,
         }
 
     def write(self, path: Path) -> None:
@@ -104,6 +107,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
             split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
             for split in sources
         },
+        shared=shared_names({split: source.names for split, source in sources.items()}),
     )
 
 
@@ -119,6 +123,8 @@ def show(findings: Findings) -> None:
             examples = "\n".join(_printable(str(error)) for error in errors[:EXAMPLES])
             table.add_row(Text(_printable(kind)), str(len(errors)), Text(examples))
         console.print(table)
+    for overlap in overlaps(findings.shared):
+        console.print(Text(_printable(overlap)), soft_wrap=True)
     splits = ", ".join(f"{split} {n['sequences']} and {n['frames']}" for split, n in findings.splits.items())
     usable = f"usable sequences: {findings.sequences}, their usable frames: {findings.frames} ({splits})"
     console.print(Text(usable), soft_wrap=True)

@@ -53,7 +53,8 @@ class BadSteps(Callback):
     which look for the loss's scale.
 
     Args:
-        most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`.
+        most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`. So does the end of a shorter
+            run whose steps were all bad.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -62,6 +63,7 @@ class BadSteps(Callback):
         self.most_bad_steps = most_bad_steps
         self.total = self.in_a_row = 0
         self.losses: list[Tensor] = []
+        self.divergence = "all steps had a loss or gradients that are not finite"
 
     def state_dict(self) -> dict[str, int]:
         return {"total": self.total, "in_a_row": self.in_a_row}
@@ -82,15 +84,21 @@ class BadSteps(Callback):
             self.in_a_row = 0
         else:
             self.total, self.in_a_row = self.total + 1, self.in_a_row + 1
+            self.divergence = _divergence(trainer, pl_module, self.in_a_row)
             if self.in_a_row == self.most_bad_steps:
-                raise DivergenceError(_divergence(trainer, pl_module, self.in_a_row))
+                raise DivergenceError(self.divergence)
             for parameter in pl_module.parameters():
                 parameter.grad = None  # which optimizers pass over
         pl_module.log(BAD_STEPS, float(self.total), prog_bar=True, batch_size=1)
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Raise `DivergenceError` if no step changed the weights, before a checkpoint of them is written."""
+        if 0 < self.total == trainer.global_step:
+            raise DivergenceError(self.divergence)
+
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
-    """Where it came to in the run, the loss term and the first layer with gradients that are not finite."""
+    """Return the step, the loss term and the first layer with gradients that are not finite."""
     logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
     terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms

@@ -14,9 +14,22 @@ from completesplat.data.co3d.splits import Filters, SeededSplit, SplitMembers, r
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_targets_that_no_sequence_has_are_refused_before_training_and_short_sequences_are_skipped(tmp_path, spread):
+    settings = {"image_size": 8, "batch_size": 1, "spread_targets": spread, "max_bad_fraction": 10.0}
+    write_tree(tmp_path, {"a": 3, "b": 5, "v": 5, "t": 5}, {"train": "ab", "val": "v", "test": "t"})
+    with pytest.raises(CompleteSplatError, match=r"^data\.targets=5: .* at most 5 frames"):
+        CO3DDataModule(str(tmp_path), CATEGORY, targets=5, **settings).setup("fit")
+    data = CO3DDataModule(str(tmp_path), CATEGORY, targets=4, **settings)
+    data.setup("fit")
+    loader = data.train_dataloader()
+    assert {name for batch in loader for name in batch.names} == {"b"}
+    assert {(error.kind, error.sequence) for error in loader.refused} == {("too few frames", "a")}
 
 
 def module(root: Path, **settings) -> CO3DDataModule:

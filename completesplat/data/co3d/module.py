@@ -26,8 +26,8 @@ class CO3DDataModule(SceneDataModule):
         category: a folder below `root`, such as "hydrant".
         subset: the set list that splits the frames, which is named after what is tested (Splatter Image:
             `fewview_dev`); None: split by seed.
-        allow_shared_sequences: take a set list also where it tests on training sequences, as CO3D's `fewview_train`
-            does, and as all do that divide the frames of one sequence (`manyview_...`, an imported capture).
+        allow_shared_sequences: take a set list also where it tests on sequences of training, as CO3D's `fewview_train`
+            does, or of validation; all lists that divide the frames of one sequence do (`manyview_...`, `imported`).
         val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.

@@ -4,6 +4,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,11 +24,12 @@ from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.remote import local_root
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import at
+from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.schema import Natural, OneOf, Positive, Share, Side
+from completesplat.schema import Natural, OneOf, Positive, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # by default
+WORKERS_OF_A_CORE = 4  # at most
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
 logger = logging.getLogger(__name__)
@@ -40,16 +42,17 @@ def _check_settings(
     latent_cache: str | None,
     augmented: bool,
     on_bad: str,
+    workers: int | None,
 ) -> None:
     """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
-    if on_bad not in ("skip", "raise"):
-        raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of skip, raise")
-    if targets < 0:
-        raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
+    hints, cores = hints_of(SceneDataModule.__init__), os.cpu_count() or 1
+    for name, value in {"on_bad": on_bad, "targets": targets, "background": background, "workers": workers}.items():
+        check_value(f"data.{name}", hints[name], value)
+    if workers is not None and workers > WORKERS_OF_A_CORE * cores:
+        said = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
+        raise CompleteSplatError(f"data.workers={workers}: {said}")
     if mask_threshold is not None and not 0 < mask_threshold <= 1:
         raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
-    if background is not None and not 0 <= background <= 1:
-        raise CompleteSplatError(f"data.background={background}: must lie between 0 and 1")
     if latent_cache == "":
         raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
     if latent_cache is not None and (augmented or background is not None):
@@ -104,7 +107,7 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip
-        _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad)
+        _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad, workers)
         self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -164,13 +167,13 @@ class SceneDataModule(LightningDataModule):
 
         Raises:
             DataError: missing or malformed files, no sequences for this stage, or a latent cache of other data.
+            CompleteSplatError: training data that `batch_size` or `targets` ask too much of.
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
         if stage == "fit":
             _ = self.trained_on  # as they are now, whatever becomes of the files while the run lasts
-        if stage == "fit" and self.latent_cache is not None:
-            self._training_scenes()  # what is wrong with the cache is an error before training starts
+            self._check_training()  # what is wrong is an error before training starts
 
     def source(self, split: str) -> SequenceSource:
         """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
@@ -218,8 +221,30 @@ class SceneDataModule(LightningDataModule):
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
+    def _check_training(self) -> None:
+        """Raise if an epoch has fewer scenes than a batch, or each sequence fewer frames than a scene."""
+        scenes, most = self._training_scenes(), 0
+        names = scenes.store.names
+        if self.batch_size > len(scenes):
+            counted = f"{len(scenes)} scenes (data.references_per_sequence={scenes.references} of {len(names)} sequences)"
+            raise CompleteSplatError(f"data.batch_size={self.batch_size}: an epoch has {counted}; lower it")
+        for name in names if self.targets else ():
+            with suppress(DataError):
+                most = max(most, len(scenes.store.source.read(name).frames))
+            if most > self.targets:
+                return
+        if most:
+            said = f"a scene needs {self.targets + 1} frames, training sequences have at most {most} frames"
+            raise CompleteSplatError(f"data.targets={self.targets}: {said}")
+
+    def _drawn_views(self, frames: int, rng: np.random.Generator) -> Choice:
+        """Return `training_views` of a sequence; `TooFewFrames` if some of its targets would be the same."""
+        if frames <= self.targets:
+            raise TooFewFrames(f"{frames}, data.targets={self.targets} needs {self.targets + 1}")
+        return self.training_views(frames, rng)
+
     def _training_scenes(self) -> TrainingScenes:
-        drawing = self.store("train"), self.training_views
+        drawing = self.store("train"), self._drawn_views
         counting = self.references_per_sequence, self.seed
         if self.latent_cache is not None:
             return CachedTrainingScenes(self.cached_latents, *drawing, self.box_masks, *counting)

@@ -7,6 +7,7 @@ from pathlib import Path
 from completesplat.data.toy.objects import write_objects
 from completesplat.data.toy.rooms import write_rooms
 from completesplat.errors import DataError
+from completesplat.schema import Positive
 
 KINDS: dict[str, Callable[..., Path]] = {
     "objects": write_objects,
@@ -16,7 +17,9 @@ KINDS: dict[str, Callable[..., Path]] = {
 }
 
 
-def write(kind: str, out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None) -> Path:
+def write(
+    kind: str, out: Path, scenes: int, frames: int, size: int, seed: int, workers: Positive | None = None
+) -> Path:
     """Write scenes of a kind (a key of `KINDS`); returns their folder.
 
     Raises:
