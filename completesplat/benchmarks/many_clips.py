@@ -15,7 +15,7 @@ from completesplat.benchmarks.reading import opening_figures
 from completesplat.commands.protocol import write_json
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
-from completesplat.schema import Filled, Positive, Range
+from completesplat.schema import Entries, Positive, Range
 
 CODEC = "bmp"
 COLUMNS: list[Column] = [
@@ -32,7 +32,7 @@ COLUMNS: list[Column] = [
 def run(
     write: Callable[..., Path],
     data: Callable[..., Any],
-    clips: Annotated[Sequence[Annotated[int, Range(2)]], Filled()],
+    clips: Annotated[Sequence[Annotated[int, Range(2)]], Entries(1)],
     epochs: Positive,
     out: Path,
 ) -> None:

@@ -5,14 +5,13 @@ import logging
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.schema import Positive
+from completesplat.schema import Positive, Range
 
 logger = logging.getLogger(__name__)
-MOST_SHOWN = 8
 
 
 def check(data: Any, splits: Sequence[str], workers: Positive | None, out: Path) -> None:
@@ -45,12 +44,10 @@ def stats(data: Any, splits: Sequence[str], out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: str, scenes: int, pictures: int, out: Path) -> None:
+def show(data: Any, split: str, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
     """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
-    if not 1 <= scenes <= MOST_SHOWN or pictures < 1:
-        raise CompleteSplatError(f"needs 1 <= scenes <= {MOST_SHOWN} and 1 <= pictures")
     source = _sources(data, [split])[split]
     names = source.names
     chosen = [names[i * len(names) // scenes] for i in range(scenes)] if len(names) > scenes else names

@@ -28,9 +28,8 @@ LEVELS = (
 )
 
 
+# Settings of Lightning's trainer whose range it does not check.
 class Training(TypedDict):
-    """Settings of Lightning's trainer with a range that it does not check."""
-
     gradient_clip_val: Annotated[float, Range(0)] | None
 
 
@@ -44,36 +43,34 @@ class Fit(TypedDict):
     trainer: Training
 
 
-class Predict(TypedDict):
-    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+class Drawing(TypedDict):
+    """Settings that `completesplat predict` and `view` share."""
 
     weights: str
-    samples: Annotated[int, Range(1, 1000)]
     skip_weight: Share | None
     guidance_weight: Share
     steps: Annotated[int, Range(1, 1000)] | None
-    seed: Annotated[int, Range(0, 2**63 - 1)]
-    batch: Positive | None
     fov: float | None
-    screen_space_dilation: bool
     frames: Annotated[int, Range(1, 1000)]
     background: Share | Literal["remove"]
+
+
+class Predict(Drawing):
+    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+
+    samples: Annotated[int, Range(1, 1000)]
+    seed: Annotated[int, Range(0, 2**63 - 1)]
+    batch: Positive | None
+    screen_space_dilation: bool
     maps: bool
 
 
-class View(TypedDict):
+class View(Drawing):
     """Of `completesplat view`."""
 
-    weights: str
     samples: Annotated[int, Range(1, 8)]
-    skip_weight: Share | None
-    guidance_weight: Share
-    steps: Annotated[int, Range(1, 1000)] | None
     seed: Annotated[int, Range(0, 2**31)]
-    fov: float | None
     port: Annotated[int, Range(1, 65535)]
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share | Literal["remove"]
 
 
 class Test(TypedDict):
@@ -86,27 +83,18 @@ class Test(TypedDict):
 
 
 OF_VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
-# It has a page to show before what parts are made of is imported, and holds them against their annotations itself.
-FIRST_A_PAGE = "view"
 
 
 def check_verb(verb: str, config: Any) -> None:
-    """Hold the settings of a verb and of all parts that it has against their annotations; of `view` not the parts.
-
-    Raises:
-        CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
-    """
+    """Raise `CompleteSplatError` for the first setting of a verb or of its parts (not `view`'s) that does not fit."""
     if verb in OF_VERBS:
         check_settings(OF_VERBS[verb], config)
-    if verb != FIRST_A_PAGE:
+    if verb != "view":  # which shows its page before it imports torch, and checks its parts later
         check_parts(config)
 
 
 def check_parts(config: Any, place: str = "") -> None:
-    """Hold each mapping with a `_target_` against what that class or function is called with, and what is below it.
-
-    `CompleteSplatError`: as `check_verb`.
-    """
+    """Check each mapping with a `_target_`, and what is below it, against the arguments of that class or function."""
     hints, complete = _arguments(config)
     name: Any
     for name in config if isinstance(config, DictConfig) else range(len(config)):
@@ -172,11 +160,7 @@ def check_optimizer(config: Any) -> None:
 
 
 def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:
-    """What hydra refused, with the nearest names that there are; None for what is no wrong name.
-
-    Args:
-        compose: from a verb and its settings to its configuration.
-    """
+    """Return hydra's refusal with the nearest names; None if no name is wrong. `compose` gives a verb's config."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
         named = [name for name in error.options or () if not name.startswith("_")]

@@ -202,7 +202,7 @@ def diffusion_of(module: Any) -> Any:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
-    """Model and data in the configuration saved beside a checkpoint's folder, with changes.
+    """Return model and data of the configuration saved beside a checkpoint's folder, with changes that `fit` takes.
 
     The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
     run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
@@ -218,8 +218,8 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
     changes = OmegaConf.from_dotlist(overrides)
-    for key in [key for key in changes if key not in OF_A_RUN]:
-        raise CompleteSplatError(f"{key}: no setting of a run's model or data, which overrides= changes")
+    if others := [str(key) for key in changes if key not in OF_A_RUN]:
+        raise CompleteSplatError(f"{others[0]}: no setting of a run's model or data, which overrides= changes")
     config = OmegaConf.merge(_read_config(path, trust), changes)
     if overrides:
         check_parts(config)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
@@ -17,10 +17,11 @@ from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
+from completesplat.names import printable
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16
-EXAMPLES, LONGEST_EXAMPLE = 3, 400
+EXAMPLES = 3
 
 Sources = Mapping[str, SequenceSource]
 # Names, each with the splits that have it.
@@ -29,15 +30,6 @@ _Batch = list[tuple[str, list[str]]]
 
 class LeftOut(DataError, kind="left out"):
     """A sequence in which nothing is broken, but which the settings leave out."""
-
-
-@runtime_checkable
-class Verifiable(Protocol):
-    """A source that has checksums of its files."""
-
-    def verify(self) -> list[DataError]:
-        """The files that are no longer what their checksums were taken of."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -120,11 +112,11 @@ def show(findings: Findings) -> None:
         table.add_column("count", justify="right", no_wrap=True)
         table.add_column(f"the first {EXAMPLES}", overflow="fold")
         for kind, errors in findings.by_kind().items():
-            examples = "\n".join(_printable(str(error)) for error in errors[:EXAMPLES])
-            table.add_row(Text(_printable(kind)), str(len(errors)), Text(examples))
+            examples = "\n".join(printable(str(error)) for error in errors[:EXAMPLES])
+            table.add_row(Text(printable(kind)), str(len(errors)), Text(examples))
         console.print(table)
     for overlap in overlaps(findings.shared):
-        console.print(Text(_printable(overlap)), soft_wrap=True)
+        console.print(Text(printable(overlap)), soft_wrap=True)
     splits = ", ".join(f"{split} {n['sequences']} and {n['frames']}" for split, n in findings.splits.items())
     usable = f"usable sequences: {findings.sequences}, their usable frames: {findings.frames} ({splits})"
     console.print(Text(usable), soft_wrap=True)
@@ -144,8 +136,7 @@ def _before_reading(source: SequenceSource) -> Iterator[DataError]:
     yield from source.refused
     for reason, names in source.left_out.items():
         yield from (LeftOut(reason, sequence=name) for name in names)
-    if isinstance(source, Verifiable):
-        yield from source.verify()
+    yield from source.verify()
 
 
 def _batches(sources: Sources) -> list[_Batch]:
@@ -185,9 +176,3 @@ def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
 def _numbers(usable: list[set[int]]) -> dict[str, int]:
     frames = [len(frames) for frames in usable if len(frames) >= FEWEST_FRAMES]
     return {"sequences": len(frames), "frames": sum(frames)}
-
-
-def _printable(text: str) -> str:
-    """One line without control characters, which names of files may hold, and not too long (`check.json` has it)."""
-    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return plain if len(plain) <= LONGEST_EXAMPLE else f"{plain[: LONGEST_EXAMPLE - 3]}..."

@@ -67,6 +67,10 @@ class SequenceSource(Protocol):
         """Indices into `names` of the sequences that are best read one after the other; by default any order does."""
         return [list(range(len(names)))]
 
+    def verify(self) -> Sequence[DataError]:
+        """Return the files that differ from their checksums; by default there are no checksums."""
+        return []
+
     def fingerprint(self) -> str:
         """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
         ...

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
-from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.errors import DivergenceError
 from completesplat.schema import Positive, Share
 from completesplat.training.sharding import own_part, whole
 
@@ -28,8 +28,7 @@ logger = logging.getLogger(__name__)
 class StepSeeds(Callback):
     """Seeds torch's global generators anew before every training batch.
 
-    What is drawn then depends on (seed, epoch, batch, process) alone: a run that is resumed, in the middle of an epoch
-    too, draws what it would have drawn. (Several batches share an optimizer step where gradients are accumulated.)
+    What is drawn then depends on (seed, epoch, batch, process) alone, also in a run that is resumed within an epoch.
     """
 
     def __init__(self, seed: int) -> None:
@@ -53,13 +52,10 @@ class BadSteps(Callback):
     which look for the loss's scale.
 
     Args:
-        most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`. So does the end of a shorter
-            run whose steps were all bad.
+        most_bad_steps: so many in a row, or all steps of a shorter run, end the run with `DivergenceError`.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
-        if most_bad_steps < 1:
-            raise CompleteSplatError(f"callbacks.bad_steps.most_bad_steps={most_bad_steps}: must be at least 1")
         self.most_bad_steps = most_bad_steps
         self.total = self.in_a_row = 0
         self.losses: list[Tensor] = []

@@ -49,6 +49,9 @@ ODD = [
     ("data", "workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
+    ("data", "data_task=import hold_out=1", "hold_out=1: must be at least 2"),
+    ("data", "data_task=import quality=101", "quality=101: must lie between 1 and 100"),
+    ("data", "data_task=import most_missing=1.5", "most_missing=1.5: must lie between 0 and 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
     ("data", "kind=rooms frames=1001 size=8 scenes=2", "toy_rooms: frames=1001: must lie between 2 and 1000"),
     ("fit", "loss.terms=null", "loss.terms=None: must be a mapping"),
@@ -56,6 +59,13 @@ ODD = [
     ("fit", "sampler.steps=0", "sampler.steps=0: must lie between 1 and 10000"),
     ("fit", "model.background=2", "model.background=2: must lie between 0 and 1"),
     ("fit", "callbacks.checkpoint.every_n_train_steps=0", "every_n_train_steps=0: must be at least 1"),
+    ("fit", "callbacks.bad_steps.most_bad_steps=0", "most_bad_steps=0: must be at least 1"),
+    (
+        "fit",
+        "data=co3d_category data.root=x data.category=y data.min_frames=1",
+        "data.min_frames=1: must be at least 2",
+    ),
+    ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
     ("fit", "evaluation.scoring.samples=abc", f"evaluation.scoring.samples=abc: {WHOLE}"),
 ]
 

@@ -10,7 +10,7 @@ from lightning.pytorch.demos.boring_classes import BoringModel
 from small_runs import Batches
 from support import SMALL, strict_json
 
-from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.errors import DivergenceError
 from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
 from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 from completesplat.training.reconstruction import ReconstructionModule
@@ -110,8 +110,6 @@ def test_so_many_in_a_row_end_the_run_and_name_step_term_and_layer():
     ):
         train(module)
     assert all(x.isfinite().all() for x in module.parameters())
-    with pytest.raises(CompleteSplatError, match="most_bad_steps=0: must be at least 1"):
-        BadSteps(0)
 
 
 @pytest.mark.parametrize("steps", [1, 5])

@@ -21,8 +21,6 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import DataError
 
-FEWEST_SEQUENCES = 3
-
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
 
@@ -102,7 +100,7 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
 
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
     """Whole sequences for each split; `DataError` if there are fewer than three."""
-    if len(frames) < FEWEST_SEQUENCES:
+    if len(frames) < 3:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
     # The rest's hashes lie above the test fraction, so the next share of them is validation's.

@@ -26,7 +26,7 @@ from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.schema import Natural, OneOf, Positive, Share, Side, check_value, hints_of
+from completesplat.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # by default
 WORKERS_OF_A_CORE = 4  # at most
@@ -35,27 +35,17 @@ SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test
 logger = logging.getLogger(__name__)
 
 
-def _check_settings(
-    targets: int,
-    mask_threshold: float | None,
-    background: float | None,
-    latent_cache: str | None,
-    augmented: bool,
-    on_bad: str,
-    workers: int | None,
-) -> None:
+def _check_settings(settings: Mapping[str, Any], latent_cache: str | None, augmented: bool) -> None:
     """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
-    hints, cores = hints_of(SceneDataModule.__init__), os.cpu_count() or 1
-    for name, value in {"on_bad": on_bad, "targets": targets, "background": background, "workers": workers}.items():
+    hints, workers, cores = hints_of(SceneDataModule.__init__), settings["workers"], os.cpu_count() or 1
+    for name, value in settings.items():
         check_value(f"data.{name}", hints[name], value)
     if workers is not None and workers > WORKERS_OF_A_CORE * cores:
         said = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
         raise CompleteSplatError(f"data.workers={workers}: {said}")
-    if mask_threshold is not None and not 0 < mask_threshold <= 1:
-        raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
     if latent_cache == "":
         raise CompleteSplatError("data.latent_cache is needed: give data.latent_cache=DIR, which `data latents` wrote")
-    if latent_cache is not None and (augmented or background is not None):
+    if latent_cache is not None and (augmented or settings["background"] is not None):
         unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
@@ -92,7 +82,7 @@ class SceneDataModule(LightningDataModule):
         targets: Natural = 3,
         evaluation_batch_size: Positive = 4,
         references_per_sequence: Positive = 1,
-        mask_threshold: float | None = None,
+        mask_threshold: Annotated[float, Range(1e-6, 1)] | None = None,
         background: Share | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
@@ -107,7 +97,8 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip
-        _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad, workers)
+        ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
+        _check_settings(ranged | {"workers": workers, "on_bad": on_bad}, latent_cache, augmented)
         self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -223,18 +214,18 @@ class SceneDataModule(LightningDataModule):
 
     def _check_training(self) -> None:
         """Raise if an epoch has fewer scenes than a batch, or each sequence fewer frames than a scene."""
-        scenes, most = self._training_scenes(), 0
+        scenes, frames = self._training_scenes(), [1]
         names = scenes.store.names
         if self.batch_size > len(scenes):
-            counted = f"{len(scenes)} scenes (data.references_per_sequence={scenes.references} of {len(names)} sequences)"
+            counted = f"{len(scenes)} scenes (data.references_per_sequence of each of {len(names)} sequences)"
             raise CompleteSplatError(f"data.batch_size={self.batch_size}: an epoch has {counted}; lower it")
-        for name in names if self.targets else ():
-            with suppress(DataError):
-                most = max(most, len(scenes.store.source.read(name).frames))
-            if most > self.targets:
+        for name in names:
+            if max(frames) > self.targets:
                 return
-        if most:
-            said = f"a scene needs {self.targets + 1} frames, training sequences have at most {most} frames"
+            with suppress(DataError):
+                frames.append(len(scenes.store.source.read(name).frames))
+        if 1 < max(frames) <= self.targets:
+            said = f"a scene needs {self.targets + 1} frames, training sequences have at most {max(frames)} frames"
             raise CompleteSplatError(f"data.targets={self.targets}: {said}")
 
     def _drawn_views(self, frames: int, rng: np.random.Generator) -> Choice:
