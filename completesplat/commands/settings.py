@@ -29,7 +29,7 @@ LEVELS = (
 
 
 # Settings of Lightning's trainer whose range it does not check.
-class Training(TypedDict):
+class TrainerSettings(TypedDict):
     gradient_clip_val: Annotated[float, Range(0)] | None
 
 
@@ -40,10 +40,10 @@ class Fit(TypedDict):
     ckpt_path: str | None
     test: bool
     optimized_metric: str | None
-    trainer: Training
+    trainer: TrainerSettings
 
 
-class Drawing(TypedDict):
+class SceneSettings(TypedDict):
     """Settings that `completesplat predict` and `view` share."""
 
     weights: str
@@ -55,7 +55,7 @@ class Drawing(TypedDict):
     background: Share | Literal["remove"]
 
 
-class Predict(Drawing):
+class Predict(SceneSettings):
     """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
 
     samples: Annotated[int, Range(1, 1000)]
@@ -65,7 +65,7 @@ class Predict(Drawing):
     maps: bool
 
 
-class View(Drawing):
+class View(SceneSettings):
     """Of `completesplat view`."""
 
     samples: Annotated[int, Range(1, 8)]
