@@ -121,7 +121,7 @@ def test_evaluation_goes_from_the_first_frame_to_all_others_or_to_as_many_as_ask
 
 
 def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
-    write_tree(tmp_path, dict(zip("abcd", (4, 3, 4, 4), strict=True)), {"train": "d", "val": "ac", "test": "ab"})
+    write_tree(tmp_path, dict(zip("abcde", (4, 3, 4, 4, 4), strict=True)), {"train": "d", "val": "ce", "test": "ab"})
     data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, evaluation_batch_size=2)
     assert [batch.targets.images.shape[:2] for batch in data.test_dataloader()] == [(1, 3), (1, 2)]
     assert [batch.targets.images.shape[:2] for batch in data.val_dataloader()] == [(2, 3)]

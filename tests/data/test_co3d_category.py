@@ -128,7 +128,7 @@ def test_the_single_sequence_form_divides_the_frames_of_one_sequence(tmp_path):
     (category / "set_lists").mkdir()
     (category / "set_lists/set_lists_manyview_dev_0.json").write_text(json.dumps(listed))
     which = {"subset": "manyview_dev_0", "allow_shared_sequences": True}
-    data = CO3DDataModule(str(tmp_path), CATEGORY, **which, image_size=8, on_bad="raise")
+    data = CO3DDataModule(str(tmp_path), CATEGORY, **which, image_size=8, batch_size=1, on_bad="raise")
     data.setup("fit")
     data.setup("test")
     assert {s: {n: data.source(s).read(n).frames for n in data.source(s).names} for s in SPLITS} == {

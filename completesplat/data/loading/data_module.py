@@ -231,7 +231,7 @@ class SceneDataModule(LightningDataModule):
     def _drawn_views(self, frames: int, rng: np.random.Generator) -> Choice:
         """Return `training_views` of a sequence; `TooFewFrames` if some of its targets would be the same."""
         if frames <= self.targets:
-            raise TooFewFrames(f"{frames}, data.targets={self.targets} needs {self.targets + 1}")
+            raise TooFewFrames(f"{frames} frames, data.targets={self.targets} needs {self.targets + 1}")
         return self.training_views(frames, rng)
 
     def _training_scenes(self) -> TrainingScenes:
