@@ -32,7 +32,7 @@ from completesplat.diffusion.conditioning import LearnedConditioning, StableDiff
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.schema import AtMost, Exactly, Range, Share, hints_of, refused, shown
+from completesplat.schema import Entries, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, RUN_CONFIG_FILE, SCENES, read_small
 
@@ -71,8 +71,8 @@ class TrainingPictures(TypedDict, total=False):
     """
 
     box_masks: Share
-    picture_mean: Annotated[Sequence[Share], Exactly(8)]
-    picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Exactly(8)]
+    picture_mean: Annotated[Sequence[Share], Entries(8, 8)]
+    picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 
 
 class Needed(TypedDict):
@@ -111,7 +111,7 @@ class SchedulerSettings(TypedDict, total=False):
     beta_start: Share
     beta_end: Share
     beta_schedule: Literal["linear", "scaled_linear", "squaredcos_cap_v2"]
-    trained_betas: Annotated[Sequence[Share], AtMost(10_000)] | None
+    trained_betas: Annotated[Sequence[Share], Entries(most=10_000)] | None
     prediction_type: Literal["epsilon", "sample", "v_prediction", "flow_prediction"]
     rescale_betas_zero_snr: bool
     timestep_spacing: Literal["leading", "linspace", "trailing"]
@@ -129,7 +129,7 @@ class SchedulerSettings(TypedDict, total=False):
     euler_at_final: bool
     final_sigmas_type: Literal["zero", "sigma_min"]
     predict_x0: bool
-    disable_corrector: Annotated[Sequence[Annotated[int, Range(0, 10_000)]], AtMost(10_000)]
+    disable_corrector: Annotated[Sequence[Annotated[int, Range(0, 10_000)]], Entries(most=10_000)]
     use_karras_sigmas: bool
     use_exponential_sigmas: bool
     use_beta_sigmas: bool

@@ -16,13 +16,15 @@ KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 @dataclass(frozen=True)
 class Range:
-    """A rule for `Annotated`: a number lies between two others, both included."""
+    """A rule for `Annotated`: a number is finite and lies between two others, both included."""
 
     least: float
     most: float = math.inf
 
     def refusal(self, value: Any) -> str | None:
         """Why the value is refused; None if it is not."""
+        if value == math.inf:
+            return "must be finite"
         if self.least <= value <= self.most:
             return None
         limited = f"lie between {self.least:g} and {self.most:g}"
@@ -45,34 +47,19 @@ class OneOf:
 
 
 @dataclass(frozen=True)
-class Filled:
-    """A rule for `Annotated`: a list has at least one entry."""
+class Entries:
+    """A rule for `Annotated`: a list has at least and at most so many entries."""
+
+    least: int = 0
+    most: float = math.inf
 
     def refusal(self, value: Any) -> str | None:
         """Why the value is refused; None if it is not."""
-        return None if value else "must not be empty"
-
-
-@dataclass(frozen=True)
-class AtMost:
-    """A rule for `Annotated`: a list has no more entries."""
-
-    entries: int
-
-    def refusal(self, value: Any) -> str | None:
-        """Why the value is refused; None if it is not."""
-        return None if len(value) <= self.entries else f"must have at most {self.entries} entries"
-
-
-@dataclass(frozen=True)
-class Exactly:
-    """A rule for `Annotated`: a list has this many entries."""
-
-    entries: int
-
-    def refusal(self, value: Any) -> str | None:
-        """Why the value is refused; None if it is not."""
-        return None if len(value) == self.entries else f"must have {self.entries} entries"
+        if self.least <= len(value) <= self.most:
+            return None
+        if math.isinf(self.most):
+            return "must not be empty"
+        return f"must have {'' if self.least == self.most else 'at most '}{self.most} entries"
 
 
 Positive = Annotated[int, Range(1)]
@@ -83,8 +70,8 @@ Side = Annotated[int, Range(8, 4096)]  # of a picture, in pixels
 
 # Sizes of networks. Their bounds lie beyond what anyone trains; they hold off configurations that strangers wrote.
 Width = Annotated[int, Range(1, 8192)]
-Widths = Annotated[Sequence[Width], Filled(), AtMost(8)]
-Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], AtMost(8)]
+Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
+Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
 
@@ -99,7 +86,7 @@ class Refused(NamedTuple):
 def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
     """Hold settings against the annotations of the same names: of a function's arguments, or in a `TypedDict`.
 
-    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf`, `Filled` and `AtMost`; any
+    Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Entries`; any
     other annotation accepts everything.
 
     Raises:

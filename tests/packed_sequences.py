@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.data.validation import BadPicture, TooFewFrames
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, look_at
@@ -45,7 +45,7 @@ def _read(name: str, seed: int, masked: bool, bad: tuple[int, ...], index: int) 
 
 
 @dataclass
-class ListedSource:
+class ListedSource(SequenceSource):
     """Sequences made on the spot; some can fail. The person at the keyboard has enough when `stop_after` are read."""
 
     names: list[str]

@@ -22,7 +22,8 @@ from completesplat.gaussians import Gaussians
 from completesplat.generation import CompleteSplat
 
 NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
-SMALL = ["data.image_size=32", "data.batch_size=2", "data.evaluation_targets=2", "callbacks.progress=null", *NETWORKS]
+SMALL = ["data.image_size=32", "data.batch_size=2", "data.targets=3", "data.evaluation_targets=2", *NETWORKS]
+SMALL += ["callbacks.progress=null"]
 SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_interval=2", "limit_val_batches=1")]
 
 

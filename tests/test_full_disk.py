@@ -93,7 +93,7 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "last.ckpt": checkpoint,
     "metrics.csv": rows,
     "metrics.json": lambda path: write_text(path, "figures " * 500),
-    "check.json": lambda path: Findings(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}).write(path),
+    "check.json": lambda path: Findings(1, 1, [], {"left out": dict.fromkeys("ab" * 50, 1)}, {}).write(path),
     "sheet.png": picture,
     "sample.ply": lambda path: write_ply(path, gaussians(100)),
     "sample.splat": lambda path: write_splat(path, gaussians(100)),

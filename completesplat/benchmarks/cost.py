@@ -9,7 +9,7 @@ from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, table
-from completesplat.schema import Filled, Positive
+from completesplat.schema import Entries, Positive
 
 DAY_MS = 24 * 3600 * 1000
 
@@ -22,7 +22,7 @@ class WholeTraining(TypedDict):
 
 
 def run(
-    measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Filled()], out: Path
+    measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Entries(1)], out: Path
 ) -> None:
     """Write `cost.json`, and print the days that each training takes on so many GPUs.
 

@@ -21,7 +21,7 @@ from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.errors import DataError
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, Table, table
-from completesplat.schema import Filled, Natural, OneOf, Positive, Range
+from completesplat.schema import Entries, Natural, OneOf, Positive, Range
 
 
 class Opening(TypedDict):
@@ -35,9 +35,9 @@ def run(
     objects: Mapping[str, Any],
     rooms: Mapping[str, Any] | Literal[False],
     opening: Opening | Literal[False],
-    workers: Annotated[Sequence[Natural], Filled()],
+    workers: Annotated[Sequence[Natural], Entries(1)],
     repeats: Positive,
-    codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Filled()],
+    codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Entries(1)],
     keep: bool,
     out: Path,
 ) -> None:
@@ -160,7 +160,7 @@ def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeDa
 
 
 @dataclass
-class RepeatedSource:
+class RepeatedSource(SequenceSource):
     """`count` sequences: those of another source again and again, under new names. See `SequenceSource`."""
 
     source: SequenceSource

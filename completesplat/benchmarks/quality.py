@@ -20,7 +20,7 @@ from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
-from completesplat.schema import Filled, Natural, Positive, Range
+from completesplat.schema import Entries, Natural, Positive, Range
 
 INTERVAL = 20  # steps from one row of speeds to the next
 SPEED, WAITING, PSNR = "speed/scenes_per_second", "speed/data_wait", "val/psnr_novel"
@@ -68,7 +68,7 @@ def run(
     minutes: Annotated[float, Range(0.01)],
     points: Positive,
     probe: Annotated[int, Range(4 * INTERVAL)],
-    seeds: Annotated[Sequence[Natural], Filled()],
+    seeds: Annotated[Sequence[Natural], Entries(1)],
     out: Path,
 ) -> None:
     """Train each for so long, in a process of its own; write `quality.json` and `quality.png`, print a table.

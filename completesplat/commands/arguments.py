@@ -150,6 +150,8 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     if read.is_sweep_override() and not sweep:
         said = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
         raise CompleteSplatError(f"{_shown(argument)}: {_shown(said)}")
+    if read.key_or_group == "out" and not read.is_sweep_override() and read.value() in ("", None):
+        raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
 
 
 def _readable(value: str) -> str:

@@ -9,15 +9,15 @@ from typing import Annotated, Any, Literal
 
 from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.schema import Filled, Positive, Range
+from completesplat.schema import Entries, Positive, Range
 
 logger = logging.getLogger(__name__)
 
 Split = Literal["train", "val", "test"]
-Splits = Annotated[Sequence[Split], Filled()]
+Splits = Annotated[Sequence[Split], Entries(1)]
 
 
-def check(data: Any, splits: Splits, workers: int | None, out: Path) -> None:
+def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
     from completesplat.data.audit import Findings, show
     from completesplat.data.audit import check as check_sources
@@ -25,7 +25,7 @@ def check(data: Any, splits: Splits, workers: int | None, out: Path) -> None:
     try:
         findings = check_sources(_sources(data, splits), workers)
     except DataError as error:  # the data set as a whole
-        findings = Findings(0, 0, [error], {})
+        findings = Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
     show(findings)
     if not findings.sequences:
@@ -66,7 +66,7 @@ def prepare(
     out: Path,
     codec: str,
     sequences_per_shard: Positive,
-    workers: int | None,
+    workers: Positive | None,
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:

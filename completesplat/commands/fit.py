@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
@@ -18,7 +17,7 @@ from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
-from completesplat.commands.settings import check_image_size
+from completesplat.commands.settings import check_image_size, check_optimizer
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import OneAnswer
@@ -144,14 +143,6 @@ def check_published_size(module: Any, config: Any) -> None:
     if isinstance(network, PublishedSplatterImage) and config.data.image_size != network.image_size:
         said = f"{network.file.name} wants {network.image_size}"
         raise CompleteSplatError(f"data.image_size={config.data.image_size}: {said}")
-
-
-def check_optimizer(config: Any) -> None:
-    """`CompleteSplatError`: the optimizer refuses its settings, which it sees when the model is there, without this."""
-    try:
-        instantiate(config, _convert_="all")([nn.Parameter(torch.zeros(1))])
-    except (ValueError, TypeError) as error:
-        raise CompleteSplatError(f"optimizer: {error}") from error
 
 
 def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:

@@ -15,7 +15,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, Column, table
 from completesplat.scene import SceneBatch
-from completesplat.schema import Filled, Positive, Range
+from completesplat.schema import Entries, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
@@ -23,7 +23,7 @@ from completesplat.studies import stage1 as stage1_study
 from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
-Numbers = Annotated[Sequence[float], Filled()]
+Numbers = Annotated[Sequence[float], Entries(1)]
 
 
 class Run(TypedDict):
@@ -42,7 +42,7 @@ class Run(TypedDict):
 
 def samplers(
     samplers: Mapping[str, Mapping[str, Any]],
-    steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Filled()]],
+    steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
     skip_weight: float,
     guidance_weight: float,
     out: Path,
@@ -139,7 +139,7 @@ def views(
     overrides: Sequence[str],
     trust: bool,
     scenes: Positive,
-    counts: Annotated[Sequence[Positive], Filled()],
+    counts: Annotated[Sequence[Positive], Entries(1)],
     out: Path,
 ) -> None:
     """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings.

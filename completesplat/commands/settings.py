@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.errors import HydraException, MissingConfigException
-from hydra.utils import get_object
+from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -34,6 +34,7 @@ class Trainer(TypedDict):
     accumulate_grad_batches: Positive
     val_check_interval: Annotated[float, Range(1e-6)] | str | Mapping[str, int] | None
     check_val_every_n_epoch: Positive | None
+    gradient_clip_val: Annotated[float, Range(0)] | None
 
 
 class Fit(TypedDict):
@@ -46,36 +47,34 @@ class Fit(TypedDict):
     optimized_metric: str | None
 
 
-class Predict(TypedDict):
-    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+class SceneSettings(TypedDict):
+    """Settings that `completesplat predict` and `view` share."""
 
     weights: str
-    samples: Annotated[int, Range(1, 1000)]
     skip_weight: Share | None
     guidance_weight: Share
     steps: Annotated[int, Range(1, 1000)] | None
-    seed: Seed
-    batch: Positive | None
     fov: float | None
-    screen_space_dilation: bool
     frames: Annotated[int, Range(1, 1000)]
     background: Share | Literal["remove"]
+
+
+class Predict(SceneSettings):
+    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+
+    samples: Annotated[int, Range(1, 1000)]
+    seed: Seed
+    batch: Positive | None
+    screen_space_dilation: bool
     maps: bool
 
 
-class View(TypedDict):
+class View(SceneSettings):
     """Of `completesplat view`."""
 
-    weights: str
     samples: Annotated[int, Range(1, 8)]
-    skip_weight: Share | None
-    guidance_weight: Share
-    steps: Annotated[int, Range(1, 1000)] | None
     seed: Annotated[int, Range(0, 2**31)]
-    fov: float | None
     port: Annotated[int, Range(1, 65535)]
-    frames: Annotated[int, Range(1, 1000)]
-    background: Share | Literal["remove"]
 
 
 class OfRun(TypedDict):
@@ -94,26 +93,17 @@ class Test(OfRun):
 
 
 OF_VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test": Test}
-# It has a page to show before what parts are made of is imported, and holds them against their annotations itself.
-FIRST_A_PAGE = "view"
 
 
 def check_verb(verb: str, config: Any) -> None:
-    """Hold the settings of a verb and of all parts that it has against their annotations; of `view` not the parts.
-
-    Raises:
-        CompleteSplatError: names the first setting that does not fit, and what it may be; or that no part has.
-    """
+    """Raise `CompleteSplatError` for the first setting of a verb or of its parts (not `view`'s) that does not fit."""
     check_settings(OF_VERBS.get(verb, OfRun), config)
-    if verb != FIRST_A_PAGE:
+    if verb != "view":  # which shows its page before it imports torch, and checks its parts later
         check_parts(config)
 
 
 def check_parts(config: Any, place: str = "") -> None:
-    """Hold each mapping with a `_target_` against what that class or function is called with, and what is below it.
-
-    `CompleteSplatError`: as `check_verb`.
-    """
+    """Check each mapping with a `_target_`, and what is below it, against the arguments of that class or function."""
     hints, complete = _arguments(config)
     name: Any
     for name in config if isinstance(config, DictConfig) else range(len(config)):
@@ -167,12 +157,19 @@ def check_image_size(config: Any) -> None:
         raise CompleteSplatError(f"data.image_size={size}: {said}")
 
 
-def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:
-    """What hydra refused, with the nearest names that there are; None for what is no wrong name.
+def check_optimizer(config: Any) -> None:
+    """Raise `CompleteSplatError` for settings that an optimizer refuses, if there is one, before there is a model."""
+    from torch import nn, zeros
 
-    Args:
-        compose: from a verb and its settings to its configuration.
-    """
+    try:
+        if config is not None:
+            instantiate(config, _convert_="all")([nn.Parameter(zeros(1))])
+    except (ValueError, TypeError) as error:
+        raise CompleteSplatError(f"optimizer: {error}") from error
+
+
+def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:
+    """Return hydra's refusal with the nearest names; None if no name is wrong. `compose` gives a verb's config."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
         named = [name for name in error.options or () if not name.startswith("_")]

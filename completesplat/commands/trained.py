@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from completesplat.commands.protocol import checkpoint_facts
-from completesplat.commands.settings import check_parts
+from completesplat.commands.settings import check_image_size, check_optimizer, check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.options import conf_folder
 from completesplat.parts import read_architecture
@@ -199,7 +199,7 @@ def diffusion_of(module: Any) -> Any:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
-    """Model and data in the configuration saved beside a checkpoint's folder, with changes.
+    """Return model and data of the configuration saved beside a checkpoint's folder, with changes that `fit` takes.
 
     The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
     run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
@@ -207,7 +207,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
-        CompleteSplatError: the changes cannot be read, or do not fit.
+        CompleteSplatError: the changes cannot be read, or `fit` refuses them, too.
     """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
@@ -229,13 +229,19 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
 
 def _changed(config: Any, overrides: list[str]) -> Any:
     try:
-        changed: Any = OmegaConf.merge(config, OmegaConf.from_dotlist(overrides))
+        changes = OmegaConf.from_dotlist(overrides)
+        if others := [str(key) for key in changes if key not in OF_A_RUN]:
+            raise CompleteSplatError(f"{others[0]}: no setting of a run's model or data, which overrides= changes")
+        changed: Any = OmegaConf.merge(config, changes)
     except (OmegaConfBaseException, YAMLError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {reason}") from error
     for part in OF_A_RUN:
         check_value(part, Mapping[str, Any], changed[part])
-    check_parts(changed)
+    if overrides:
+        check_parts(changed)
+        check_image_size(changed)
+        check_optimizer(changed.model.get("optimizer"))
     return changed
 
 

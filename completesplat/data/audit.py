@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
@@ -14,13 +14,14 @@ from rich.text import Text
 
 from completesplat.atomic import write_text
 from completesplat.data.processes import map_in_processes
-from completesplat.data.sequences import SequenceSource
+from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
+from completesplat.names import printable
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16
-EXAMPLES, LONGEST_EXAMPLE = 3, 400
+EXAMPLES = 3
 
 Sources = Mapping[str, SequenceSource]
 # Names, each with the splits that have it.
@@ -31,15 +32,6 @@ class LeftOut(DataError, kind="left out"):
     """A sequence in which nothing is broken, but which the settings leave out."""
 
 
-@runtime_checkable
-class Verifiable(Protocol):
-    """A source that has checksums of its files."""
-
-    def verify(self) -> list[DataError]:
-        """The files that are no longer what their checksums were taken of."""
-        ...
-
-
 @dataclass(frozen=True)
 class Findings:
     """What reading everything showed: the numbers of usable sequences (of two usable frames or more) and their frames.
@@ -47,12 +39,14 @@ class Findings:
     Attributes:
         refused: each thing once, in the order of the data set.
         splits: the same two numbers for each split alone.
+        shared: the sequences that two splits share, see `shared_names`.
     """
 
     sequences: int
     frames: int
     refused: list[DataError]
     splits: dict[str, dict[str, int]]
+    shared: dict[str, list[str]]
 
     def by_kind(self) -> dict[str, list[DataError]]:
         """The refusals by what is wrong, and those left out by their reason; the most frequent first."""
@@ -70,6 +64,7 @@ class Findings:
             "refused": [{part: getattr(error, part) for part in parts} for error in self.refused],
             "counts": {kind: len(errors) for kind, errors in self.by_kind().items()},
             "splits": self.splits,
+            "shared": self.shared,
         }
 
     def write(self, path: Path) -> None:
@@ -104,6 +99,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
             split: _numbers([sequence.usable & sequence.frames.get(split, set()) for sequence in sequences])
             for split in sources
         },
+        shared=shared_names({split: source.names for split, source in sources.items()}),
     )
 
 
@@ -116,9 +112,11 @@ def show(findings: Findings) -> None:
         table.add_column("count", justify="right", no_wrap=True)
         table.add_column(f"the first {EXAMPLES}", overflow="fold")
         for kind, errors in findings.by_kind().items():
-            examples = "\n".join(_printable(str(error)) for error in errors[:EXAMPLES])
-            table.add_row(Text(_printable(kind)), str(len(errors)), Text(examples))
+            examples = "\n".join(printable(str(error)) for error in errors[:EXAMPLES])
+            table.add_row(Text(printable(kind)), str(len(errors)), Text(examples))
         console.print(table)
+    for overlap in overlaps(findings.shared):
+        console.print(Text(printable(overlap)), soft_wrap=True)
     splits = ", ".join(f"{split} {n['sequences']} and {n['frames']}" for split, n in findings.splits.items())
     usable = f"usable sequences: {findings.sequences}, their usable frames: {findings.frames} ({splits})"
     console.print(Text(usable), soft_wrap=True)
@@ -138,8 +136,7 @@ def _before_reading(source: SequenceSource) -> Iterator[DataError]:
     yield from source.refused
     for reason, names in source.left_out.items():
         yield from (LeftOut(reason, sequence=name) for name in names)
-    if isinstance(source, Verifiable):
-        yield from source.verify()
+    yield from source.verify()
 
 
 def _batches(sources: Sources) -> list[_Batch]:
@@ -179,9 +176,3 @@ def _read(sources: Sources, name: str, splits: list[str]) -> _Sequence:
 def _numbers(usable: list[set[int]]) -> dict[str, int]:
     frames = [len(frames) for frames in usable if len(frames) >= FEWEST_FRAMES]
     return {"sequences": len(frames), "frames": sum(frames)}
-
-
-def _printable(text: str) -> str:
-    """One line without control characters, which names of files may hold, and not too long (`check.json` has it)."""
-    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return plain if len(plain) <= LONGEST_EXAMPLE else f"{plain[: LONGEST_EXAMPLE - 3]}..."

@@ -1,8 +1,9 @@
 """Sequences of pictures with cameras: what a data set is, once its own files and conventions are behind it."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float, UInt8
@@ -66,9 +67,24 @@ class SequenceSource(Protocol):
         """Indices into `names` of the sequences that are best read one after the other; by default any order does."""
         return [list(range(len(names)))]
 
+    def verify(self) -> Sequence[DataError]:
+        """Return the files that differ from their checksums; by default there are no checksums."""
+        return []
+
     def fingerprint(self) -> str:
         """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
         ...
+
+
+def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
+    """Return the names that two splits share, by pair: "train and val". Pairs that share nothing are left out."""
+    pairs = {f"{one} and {other}": sorted({*splits[one]} & {*splits[other]}) for one, other in combinations(splits, 2)}
+    return {pair: names for pair, names in pairs.items() if names}
+
+
+def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return a sentence for each pair of `shared_names`."""
+    return [f"{len(names)} sequences are in both {pair}: {shortened(names)}" for pair, names in shared.items()]
 
 
 def shortened(names: Sequence[str], most: int = 5) -> str:

@@ -58,7 +58,7 @@ class TooFewFrames(DataError, kind="too few frames"):
 
 
 class SharedSequences(DataError, kind="shared sequence"):
-    """A list of sequences to train on that names some to test on."""
+    """A list of sequences to train or validate on that names some to test on."""
 
 
 class ChangedFile(DataError, kind="changed file"):

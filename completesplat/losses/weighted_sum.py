@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, TypedDict
+from typing import Annotated, Any, NamedTuple, Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -12,7 +12,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.scene import Views
-from completesplat.schema import Natural
+from completesplat.schema import Natural, Range
 from completesplat.tensors import TensorDataclass
 
 
@@ -42,7 +42,7 @@ class Weighted(NamedTuple):
 class Term(TypedDict, total=False):
     """The settings of a `Weighted`."""
 
-    weight: float
+    weight: Annotated[float, Range(0)]
     term: Any
     start_step: Natural
 

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
-from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.errors import DivergenceError
 from completesplat.schema import Positive, Share
 from completesplat.training.sharding import own_part, whole
 
@@ -28,8 +28,7 @@ logger = logging.getLogger(__name__)
 class StepSeeds(Callback):
     """Seeds torch's global generators anew before every training batch.
 
-    What is drawn then depends on (seed, epoch, batch, process) alone: a run that is resumed, in the middle of an epoch
-    too, draws what it would have drawn. (Several batches share an optimizer step where gradients are accumulated.)
+    What is drawn then depends on (seed, epoch, batch, process) alone, also in a run that is resumed within an epoch.
     """
 
     def __init__(self, seed: int) -> None:
@@ -53,15 +52,14 @@ class BadSteps(Callback):
     which look for the loss's scale.
 
     Args:
-        most_bad_steps: so many in a row (at least 1) end the run, with `DivergenceError`.
+        most_bad_steps: so many in a row, or all steps of a shorter run, end the run with `DivergenceError`.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
-        if most_bad_steps < 1:
-            raise CompleteSplatError(f"callbacks.bad_steps.most_bad_steps={most_bad_steps}: must be at least 1")
         self.most_bad_steps = most_bad_steps
         self.total = self.in_a_row = 0
         self.losses: list[Tensor] = []
+        self.divergence = "all steps had a loss or gradients that are not finite"
 
     def state_dict(self) -> dict[str, int]:
         return {"total": self.total, "in_a_row": self.in_a_row}
@@ -82,15 +80,21 @@ class BadSteps(Callback):
             self.in_a_row = 0
         else:
             self.total, self.in_a_row = self.total + 1, self.in_a_row + 1
+            self.divergence = _divergence(trainer, pl_module, self.in_a_row)
             if self.in_a_row == self.most_bad_steps:
-                raise DivergenceError(_divergence(trainer, pl_module, self.in_a_row))
+                raise DivergenceError(self.divergence)
             for parameter in pl_module.parameters():
                 parameter.grad = None  # which optimizers pass over
         pl_module.log(BAD_STEPS, float(self.total), prog_bar=True, batch_size=1)
 
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Raise `DivergenceError` if no step changed the weights, before a checkpoint of them is written."""
+        if 0 < self.total == trainer.global_step:
+            raise DivergenceError(self.divergence)
+
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
-    """Where it came to in the run, the loss term and the first layer with gradients that are not finite."""
+    """Return the step, the loss term and the first layer with gradients that are not finite."""
     logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
     terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from completesplat.atomic import atomic_path, make_folder
 from completesplat.data.loading.distributed import gathered
-from completesplat.errors import CompleteSplatError, DivergenceError, WeightsError
+from completesplat.errors import DivergenceError, WeightsError
 from completesplat.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
@@ -80,9 +80,6 @@ class Checkpoints(Checkpoint):
         every_minutes: float | None = None,
         keep_every: Positive | None = None,
     ) -> None:
-        for name, steps in (("every_n_train_steps", every_n_train_steps), ("keep_every", keep_every)):
-            if steps is not None and steps < 1:
-                raise CompleteSplatError(f"callbacks.checkpoint.{name}={steps}: must be at least 1")
         self.folder = Path(folder)
         self.every_n_train_steps = every_n_train_steps
         self.every_minutes = every_minutes

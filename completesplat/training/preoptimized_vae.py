@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.scene import SceneBatch
+from completesplat.schema import Range
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import stack
 from completesplat.training.per_scene import Preoptimized
@@ -106,8 +107,8 @@ class PreoptimizedVAE(Preoptimized):
         vae: SparseVAE,
         folder: str,
         normalization_batches: int,
-        opacity_weight: float,
-        kl_weight: float,
+        opacity_weight: Annotated[float, Range(0)],
+        kl_weight: Annotated[float, Range(0)],
         **preoptimized: Any,
     ) -> None:
         super().__init__(vae.reconstructor.parameterization, **preoptimized)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from completesplat.atomic import atomic_path, make_folder, write_text
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.schema import AtMost, Few, Natural, Range, Width, refused, shown
+from completesplat.schema import Entries, Few, Natural, Range, Width, refused, shown
 from completesplat.weights import RUN_WEIGHTS, read_small
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
@@ -44,7 +44,7 @@ class Network(TypedDict):
     name: Literal["SingleUNet"]
     base_dim: Width
     num_blocks: Few
-    attention_resolutions: Annotated[Sequence[Natural], AtMost(8)]
+    attention_resolutions: Annotated[Sequence[Natural], Entries(most=8)]
     max_sh_degree: Literal[1]
     network_with_offset: Literal[True]
     isotropic: Literal[False]

@@ -71,7 +71,7 @@ def test_parts_can_be_left_out_and_files_kept(quick):
 
 def test_nothing_is_left_behind_when_it_fails(command, tmp_path):
     codecs = ("codecs=[png,webp]", "error: codecs=['png', 'webp']: choose one of png, jpeg, bmp\n")
-    for setting, said in (("objects.write.frames=1", "toy_objects need "), codecs):
+    for setting, said in (("objects.write.frames=1", "toy_objects: frames=1: must lie between 2 and 1000"), codecs):
         finished = command(*QUICK, setting, f"out={tmp_path / 'out'}")
         assert finished.status == 2
         assert said in finished.err

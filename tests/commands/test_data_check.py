@@ -67,9 +67,9 @@ def damaged(intact: Path, tmp_path: Path) -> Path:
     return shutil.copytree(intact, tmp_path / "data/set") / "toy_objects"
 
 
-def checked(command, root: Path, out: Path) -> tuple[Any, Any]:
+def checked(command, root: Path, out: Path, *more: str) -> tuple[Any, Any]:
     settings = ["data=co3d_category", f"data.root={root}", "data.category=toy_objects", "data.subset=fewview_train"]
-    finished = command("data", "check", *settings, "data.image_size=16", "workers=1", f"out={out}")
+    finished = command("data", "check", *settings, "data.image_size=16", "workers=1", *more, f"out={out}")
     return finished, strict_json(out / "check.json")
 
 
@@ -118,3 +118,13 @@ def test_where_nothing_is_usable_the_status_is_1(command, damaged, tmp_path, dam
     assert found["refused"][-1]["file"].endswith(file)
     assert reason in found["refused"][-1]["reason"]
     assert all(kind in finished.out for kind in found["counts"])
+
+
+def test_validation_on_test_sequences_is_reported(command, damaged, tmp_path):
+    edit(damaged / SET_LIST, lambda lists: lists.update(val=lists["test"]))
+    finished, found = checked(command, damaged.parent, tmp_path / "out")
+    assert finished.status == 1
+    assert "1 sequences are in both val and test" in found["refused"][-1]["reason"]
+    finished, found = checked(command, damaged.parent, tmp_path / "allowed", "data.allow_shared_sequences=true")
+    assert (finished.status, list(found["shared"])) == (0, ["val and test"])
+    assert len(found["shared"]["val and test"]) == 1

@@ -51,11 +51,31 @@ ODD = [
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
     ("fit", "trainer.accelerator=abacus", "trainer: "),
     ("fit", "loss.terms.mse.weight=abc", f"loss.terms.mse.weight=abc: {NUMBER}"),
+    ("fit", "loss.terms.kl.weight=-1", "loss.terms.kl.weight=-1: must be at least 0"),
+    ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
+    ("fit", "model=preoptimized_vae model.kl_weight=-1", "model.kl_weight=-1: must be at least 0"),
+    ("fit", "trainer.gradient_clip_val=-1", "trainer.gradient_clip_val=-1: must be at least 0"),
+    ("fit", "data.workers=4000", "data.workers=4000: must not be above 4 for each of "),
+    ("data", "workers=-1", "workers=-1: must be at least 1"),
+    ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
+    ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
+    ("data", "data_task=import hold_out=1", "hold_out=1: must be at least 2"),
+    ("data", "data_task=import quality=101", "quality=101: must lie between 1 and 100"),
+    ("data", "data_task=import most_missing=1.5", "most_missing=1.5: must lie between 0 and 1"),
+    ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
+    ("data", "kind=rooms frames=1001 size=8 scenes=2", "toy_rooms: frames=1001: must lie between 2 and 1000"),
     ("fit", "loss.terms=null", "loss.terms=None: must be a mapping"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
     ("fit", "sampler.steps=0", "sampler.steps=0: must lie between 1 and 10000"),
     ("fit", "model.background=2", "model.background=2: must lie between 0 and 1"),
     ("fit", "callbacks.checkpoint.every_n_train_steps=0", "every_n_train_steps=0: must be at least 1"),
+    ("fit", "callbacks.bad_steps.most_bad_steps=0", "most_bad_steps=0: must be at least 1"),
+    (
+        "fit",
+        "data=co3d_category data.root=x data.category=y data.min_frames=1",
+        "data.min_frames=1: must be at least 2",
+    ),
+    ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
     ("fit", "evaluation.scoring.samples=abc", f"evaluation.scoring.samples=abc: {WHOLE}"),
 ]
 
@@ -68,7 +88,7 @@ def test_an_odd_value_is_named_with_what_it_may_be(verb, setting, said):
         "test": ["ckpt=nowhere"],
         "view": ["scene=nowhere"],
     }
-    assert said in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), setting)
+    assert said in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 
 
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
@@ -125,3 +145,11 @@ def test_a_mistyped_name_is_answered_with_the_nearest(command, typed, said):
     assert (finished.status, finished.err.count("\n")) == (2, 1)
     assert re.match(f"error: {said}", finished.err), finished.err
     assert len(finished.err) < 700
+
+
+@pytest.mark.parametrize("empty", ["out=", "out=''", "out=null"])
+def test_an_empty_folder_to_write_into_is_refused_and_the_working_folder_stays_empty(command, tmp_path, empty):
+    for verb in ("fit", "data toy"):
+        finished = command(*verb.split(), empty)
+        assert (finished.status, finished.err) == (2, f"error: {empty}: names no folder; give out=DIR\n")
+    assert not list(tmp_path.iterdir())

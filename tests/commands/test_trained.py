@@ -12,7 +12,7 @@ from support import compose_config
 from completesplat.commands import conf_folder
 from completesplat.commands.jobs import use_working_folder
 from completesplat.commands.trained import GROUPS, config_of_run
-from completesplat.errors import WeightsError
+from completesplat.errors import CompleteSplatError, WeightsError
 
 MINE = """
 import json
@@ -182,6 +182,24 @@ def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_nee
     with_targets = {path.parent.name for path in conf_folder().glob("*/*.yaml") if "_target_: " in path.read_text()}
     others = {one for one in with_targets if one.endswith("_task")} | {"callbacks", "evaluation", "logger", "trainer"}
     assert with_targets - others <= GROUPS
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("data.batch_size=-1", "data.batch_size=-1: must be at least 1"),
+        ("data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
+        ("model.background=2", "model.background=2: must lie between 0 and 1"),
+        ("model.loss.terms.kl.weight=.inf", "model.loss.terms.kl.weight=inf: must be finite"),
+        ("model.optimizer.lr=-1", "model.optimizer.lr=-1: must be at least 0"),
+        ("model.optimizer.adam_betas=[2,2]", "optimizer: "),
+        ("data.image_size=50", "data.image_size=50: must be a multiple of 8 "),
+        ("seed=3", "seed: no setting of a run's model or data"),
+    ],
+)
+def test_changes_are_held_to_what_fit_takes(run, change, said):
+    with pytest.raises(CompleteSplatError, match=re.escape(said)):
+        configuration(run, change)
 
 
 @pytest.mark.parametrize("value", ["${oc.env:HOME}", "${hydra:runtime.cwd}", "${data.root}", "a ${x}"])

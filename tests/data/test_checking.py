@@ -57,6 +57,7 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     findings.write(tmp_path / "check.json")
     written = strict_json(tmp_path / "check.json")
     assert written == findings.json()
+    assert written["shared"] == {"train and val": ["b"]}
     assert written["usable"] == {"sequences": 3, "frames": 2 + 4 + 2}
     assert {"sequence": "a", "frame": 2, "file": "a/2.jpg", "reason": "truncated"} in written["refused"]
     assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
@@ -64,6 +65,7 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     assert written["counts"] == {"unusable picture": 3, "left out: score below 0.5": 2, **others}
     show(findings)
     shown = capsys.readouterr().out
+    assert "1 sequences are in both train and val: b\n" in shown
     for text in ("left out: score below 0.5", "unusable picture", "a/2.jpg, a, frame 2: truncated"):
         assert text in shown
     assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"

@@ -14,9 +14,22 @@ from completesplat.data.co3d.splits import Filters, SeededSplit, SplitMembers, r
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.toy import write_objects
 from completesplat.data.toy.objects import SUBSET
-from completesplat.errors import DataError
+from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
+
+
+@pytest.mark.parametrize("spread", [False, True])
+def test_targets_that_no_sequence_has_are_refused_before_training_and_short_sequences_are_skipped(tmp_path, spread):
+    settings = {"image_size": 8, "batch_size": 1, "spread_targets": spread, "max_bad_fraction": 10.0}
+    write_tree(tmp_path, {"a": 3, "b": 5, "v": 5, "t": 5}, {"train": "ab", "val": "v", "test": "t"})
+    with pytest.raises(CompleteSplatError, match=r"^data\.targets=5: .* at most 5 frames"):
+        CO3DDataModule(str(tmp_path), CATEGORY, targets=5, **settings).setup("fit")
+    data = CO3DDataModule(str(tmp_path), CATEGORY, targets=4, **settings)
+    data.setup("fit")
+    loader = data.train_dataloader()
+    assert {name for batch in loader for name in batch.names} == {"b"}
+    assert {(error.kind, error.sequence) for error in loader.refused} == {("too few frames", "a")}
 
 
 def module(root: Path, **settings) -> CO3DDataModule:
@@ -108,7 +121,7 @@ def test_evaluation_goes_from_the_first_frame_to_all_others_or_to_as_many_as_ask
 
 
 def test_evaluation_scenes_of_unequal_length_come_one_by_one(tmp_path):
-    write_tree(tmp_path, dict(zip("abcd", (4, 3, 4, 4), strict=True)), {"train": "d", "val": "ac", "test": "ab"})
+    write_tree(tmp_path, dict(zip("abcde", (4, 3, 4, 4, 4), strict=True)), {"train": "d", "val": "ce", "test": "ab"})
     data = CO3DDataModule(str(tmp_path), CATEGORY, image_size=8, evaluation_batch_size=2)
     assert [batch.targets.images.shape[:2] for batch in data.test_dataloader()] == [(1, 3), (1, 2)]
     assert [batch.targets.images.shape[:2] for batch in data.val_dataloader()] == [(2, 3)]

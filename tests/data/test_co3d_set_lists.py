@@ -48,6 +48,25 @@ def test_a_list_that_tests_on_training_sequences_is_refused_unless_asked_for(tmp
     assert "allowed" not in module(tmp_path).describe()["split"]
 
 
+@pytest.mark.parametrize("val", ["h", "gh"])
+def test_a_list_that_validates_on_test_sequences_is_refused_unless_asked_for(tmp_path, val):
+    """Whoever chooses by validation would choose by the test."""
+    category = write_tree(tmp_path, COUNTS, APART | {"val": val})
+    for stage in ("fit", "test"):
+        with pytest.raises(DataError, match=r"1 sequences are in both val and test: h; .*allow_shared") as caught:
+            module(tmp_path).setup(stage)
+        assert caught.value.file == str(category / SET_LIST)
+    assert module(tmp_path, allow_shared_sequences=True).source("val").names == list(val)
+
+
+def test_a_refusal_names_the_overlap_of_all_three(tmp_path):
+    write_tree(tmp_path, COUNTS, {"train": "abc", "val": "cde", "test": "aef"})
+    with pytest.raises(DataError) as caught:
+        module(tmp_path).setup("fit")
+    for pair in ("train and val: c", "train and test: a", "val and test: e"):
+        assert f"1 sequences are in both {pair}" in caught.value.reason
+
+
 def test_validation_leaves_out_what_is_trained_on(tmp_path):
     write_tree(tmp_path, COUNTS, APART | {"val": "abg"})
     source = module(tmp_path).source("val")

@@ -160,7 +160,7 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
         module(tmp_path).setup("fit")
     with pytest.raises(DataError, match="no train sequences"):
         module(write_tree(tmp_path, "text", TRAIN[:1], TEST)).setup("fit")
-    for setting in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"crop": "left"}, {"scale": -1.0}, {"targets": -1}):
+    for setting in ({"min_gap": 0}, {"min_gap": 5}, {"near": 0.0}, {"scale": -1.0}, {"targets": -1}):
         with pytest.raises(CompleteSplatError, match="data"):
             module(tmp_path, **setting)
 

@@ -330,7 +330,9 @@ def test_two_chunks_in_memory_and_each_read_once_an_epoch(tmp_path, loads):
     del found
     for split in ("train", "test"):
         write_chunk_form(tmp_path / split, [make_clip(f"{i:02}", frames=3) for i in range(18)], clips_per_chunk=3)
-    data = RE10KDataModule(str(tmp_path), image_size=8, batch_size=4, references_per_sequence=2, val_fraction=0.0)
+    data = RE10KDataModule(
+        str(tmp_path), image_size=8, batch_size=4, targets=2, references_per_sequence=2, val_fraction=0.0
+    )
     loader = data.train_dataloader()
     names.clear()
     assert sum(len(batch.names) for batch in epoch(loader, 0)) == 34

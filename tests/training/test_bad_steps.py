@@ -10,7 +10,7 @@ from lightning.pytorch.demos.boring_classes import BoringModel
 from small_runs import Batches
 from support import SMALL, strict_json
 
-from completesplat.errors import CompleteSplatError, DivergenceError
+from completesplat.errors import DivergenceError
 from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
 from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
 from completesplat.training.reconstruction import ReconstructionModule
@@ -110,8 +110,15 @@ def test_so_many_in_a_row_end_the_run_and_name_step_term_and_layer():
     ):
         train(module)
     assert all(x.isfinite().all() for x in module.parameters())
-    with pytest.raises(CompleteSplatError, match="most_bad_steps=0: must be at least 1"):
-        BadSteps(0)
+
+
+@pytest.mark.parametrize("steps", [1, 5])
+def test_a_run_too_short_for_so_many_ends_too_if_all_its_steps_were_bad(tmp_path, steps):
+    module = Faulty(FAULTS["a loss that is NaN"], batches=range(5))
+    with pytest.raises(DivergenceError, match=rf"^step {steps - 1}: {steps} steps in a row"):
+        train(module, Checkpoints(str(tmp_path)), steps=steps, most=10)
+    assert not list(tmp_path.iterdir())
+    assert train(module, steps=6, most=10).total == 5
 
 
 def test_the_count_goes_on_in_a_continued_run(tmp_path):
@@ -196,6 +203,16 @@ def test_a_run_that_diverges_ends_with_one_line_and_keeps_its_checkpoint(command
     weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(value.isfinite().all() for value in weights.values())
     assert "Traceback" not in finished.err
+
+
+def test_two_steps_that_are_both_bad_end_a_run_with_status_1_and_leave_no_weights(
+    command, toy_root, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(ReconstructionModule, "training_step", lambda self, *_: NAN * next(self.parameters()).sum())
+    finished = fit(command, toy_root, tmp_path / "run")
+    assert finished.status == 1
+    assert finished.err.splitlines()[-1].startswith("error: step 1: 2 steps in a row")
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.suffix in (".ckpt", ".safetensors")]
 
 
 def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root, tmp_path, monkeypatch):

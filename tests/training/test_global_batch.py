@@ -40,6 +40,14 @@ def test_the_share_of_a_process():
             batch_per_process(32, *shared)
 
 
+def test_a_batch_that_is_larger_than_an_epoch_is_refused_before_training(toy_root):
+    """Its steps would see fewer scenes than the setting says. Two sequences, eight times each."""
+    assert [len(batch) for batch in epoch_of(str(toy_root), 16)] == [16]
+    config = compose_config("fit", f"data.root={toy_root}", *SETTINGS, "data.batch_size=17").data
+    with pytest.raises(CompleteSplatError, match=r"^data\.batch_size=17: an epoch has 16 scenes .* 2 sequences"):
+        instantiate(config, _convert_="all").setup("fit")
+
+
 def test_accumulated_batches_share_it_and_what_a_process_gets_is_recorded(command, toy_root, tmp_path, monkeypatch):
     counts, step = [], ReconstructionModule.training_step
 

@@ -1,7 +1,7 @@
 """One category of CO3D v2 (Reizenstein et al., ICCV 2021), or of anything in its layout, as a data module."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
 from completesplat.data.sequences import PosedSequence
-from completesplat.errors import CompleteSplatError
-from completesplat.schema import Natural, Positive, Share
+from completesplat.schema import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(SceneDataModule):
@@ -26,8 +25,8 @@ class CO3DDataModule(SceneDataModule):
         category: a folder below `root`, such as "hydrant".
         subset: the set list that splits the frames, which is named after what is tested (Splatter Image:
             `fewview_dev`); None: split by seed.
-        allow_shared_sequences: take a set list also where it tests on training sequences, as CO3D's `fewview_train`
-            does, and as all do that divide the frames of one sequence (`manyview_...`, an imported capture).
+        allow_shared_sequences: take a set list also where it tests on sequences of training, as CO3D's `fewview_train`
+            does, or of validation; all lists that divide the frames of one sequence do (`manyview_...`, `imported`).
         val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
@@ -48,7 +47,7 @@ class CO3DDataModule(SceneDataModule):
         val_fraction: Share = 0.05,
         test_fraction: Share = 0.1,
         split_seed: Natural = 0,
-        min_frames: Positive = 2,
+        min_frames: Annotated[int, Range(2)] = 2,
         min_viewpoint_quality: float | None = None,
         min_point_cloud_quality: float | None = None,
         most_training_sequences: Positive | None = None,
@@ -60,8 +59,6 @@ class CO3DDataModule(SceneDataModule):
         **settings: Any,
     ) -> None:
         super().__init__(root, **settings)
-        if min_frames < 2:
-            raise CompleteSplatError(f"data.min_frames={min_frames}: a scene needs at least 2")
         self.category = category
         self.subset = subset
         self.allow_shared_sequences = allow_shared_sequences

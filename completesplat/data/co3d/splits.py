@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from completesplat.data.co3d.annotations import CO3DFrame, CO3DVideo, read_frames, read_videos
-from completesplat.data.sequences import SPLITS, shortened, split_by_hash
+from completesplat.data.sequences import SPLITS, overlaps, shared_names, split_by_hash
 from completesplat.data.validation import (
     BadAnnotation,
     Refuse,
@@ -20,8 +20,6 @@ from completesplat.data.validation import (
     refused_to,
 )
 from completesplat.errors import DataError
-
-FEWEST_SEQUENCES = 3
 
 Listed = dict[str, set[tuple[str, int]]]
 """(sequence name, frame number) of each split."""
@@ -73,23 +71,20 @@ def read_set_list(path: Path, refuse: Refuse) -> Listed:
 
 
 def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
-    """A set list whose training sequences are neither validated nor tested on.
+    """Return a set list whose splits share no sequence, and the names that validation lost for that.
 
     CO3D's `fewview_train` tests on all that it trains on (facebookresearch/co3d, issue 49); Splatter Image takes
     `fewview_dev` (`data_preprocessing/preprocess_co3d.py`). Validation loses what is in training too. Where it then
-    has nothing, a seeded share of the training sequences is its.
-
-    Returns the lists, and the names that validation lost.
+    has nothing, it gets a seeded share of the training sequences.
 
     Raises:
-        SharedSequences: some sequences are trained on and tested.
+        SharedSequences: some sequences are tested that are trained on, or that validation chooses a model by.
     """
     names = {split: {name for name, _ in listed[split]} for split in SPLITS}
-    shared = sorted(names["train"] & names["test"])
-    if shared:
-        said = f"{len(shared)} sequences are trained on and tested: {shortened(shared)}"
+    shared = shared_names(names)
+    if any("test" in pair for pair in shared):
         advice = "choose another data.subset, or set data.allow_shared_sequences=true"
-        raise SharedSequences(f"{said}; {advice}", str(path))
+        raise SharedSequences("; ".join([*overlaps(shared), advice]), str(path))
     lost = names["train"] & names["val"]
     train, val = listed["train"], {frame for frame in listed["val"] if frame[0] not in lost}
     if not val and len(names["train"]) > 1:
@@ -105,7 +100,7 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
 
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
     """Whole sequences for each split; `DataError` if there are fewer than three."""
-    if len(frames) < FEWEST_SEQUENCES:
+    if len(frames) < 3:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
     # The rest's hashes lie above the test fraction, so the next share of them is validation's.
@@ -167,7 +162,7 @@ def read_category(
 
     Raises:
         DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
-            `root`; or training sequences are tested.
+            `root`; or sequences are tested that are in another split.
     """
     folder = inside(root, category)
     if not os.path.isdir(folder):

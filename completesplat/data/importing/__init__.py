@@ -4,13 +4,14 @@ import logging
 import re
 import shlex
 from pathlib import Path
+from typing import Annotated
 
 from completesplat.atomic import atomic_folder
-from completesplat.data.importing.capture import Capture
 from completesplat.data.importing.colmap import read_colmap
 from completesplat.data.importing.layout import SUBSET, CaptureWriter, Written
 from completesplat.data.importing.transforms_json import read_transforms
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.schema import Range, Share
 
 logger = logging.getLogger(__name__)
 
@@ -23,9 +24,9 @@ def import_capture(
     images: Path | str | None = None,
     masks: Path | str | None = None,
     sequence: str | None = None,
-    hold_out: int = 8,
-    quality: int = 95,
-    most_missing: float = 0.5,
+    hold_out: Annotated[int, Range(2)] = 8,
+    quality: Annotated[int, Range(1, 100)] = 95,
+    most_missing: Share = 0.5,
     progress: bool = True,
 ) -> Path:
     """Write a capture to `out`/`category`, as the only sequence of that category; all of it or nothing.
@@ -45,10 +46,6 @@ def import_capture(
         raise CompleteSplatError("give either transforms=FILE or colmap=FOLDER images=FOLDER")
     if (images is None) != (colmap is None) or (masks is not None and colmap is None):
         raise CompleteSplatError("colmap=FOLDER goes with images=FOLDER (masks=FOLDER), transforms=FILE with neither")
-    if hold_out < 2 or not 1 <= quality <= 100:
-        raise CompleteSplatError(f"hold_out must be at least 2 and quality 1 to 100, not {hold_out} and {quality}")
-    if not 0 <= most_missing <= 1:
-        raise CompleteSplatError(f"most_missing={most_missing:g}: must lie between 0 and 1")
     if category is None:
         raise CompleteSplatError("category is needed: give category=NAME")
     for what, given in {"category": category, "sequence": "capture" if sequence is None else sequence}.items():
@@ -63,13 +60,10 @@ def import_capture(
         capture = read_transforms(Path(str(transforms)), most_missing)
     plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", capture.name)
     name = str(sequence) if sequence is not None else plain.lstrip(".-") or "capture"
-    _report(folder, name, _write_whole(folder, name, capture, hold_out, quality, progress))
-    return folder
-
-
-def _write_whole(folder: Path, sequence: str, capture: Capture, hold_out: int, quality: int, progress: bool) -> Written:
     with atomic_folder(folder) as unfinished:
-        return CaptureWriter(unfinished, folder.name, sequence, quality).write(capture, hold_out, progress)
+        written = CaptureWriter(unfinished, folder.name, name, quality).write(capture, hold_out, progress)
+    _report(folder, name, written)
+    return folder
 
 
 def _report(folder: Path, sequence: str, written: Written) -> None:

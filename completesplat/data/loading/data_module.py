@@ -4,6 +4,7 @@ import logging
 import os
 from abc import abstractmethod
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,34 +24,26 @@ from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.data.packed.remote import local_root
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import at
+from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.schema import Natural, OneOf, Positive, Share, Side
+from completesplat.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # by default
+WORKERS_OF_A_CORE = 4  # at most
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
 
 logger = logging.getLogger(__name__)
 
 
-def _check_settings(
-    targets: int,
-    mask_threshold: float | None,
-    background: float | None,
-    latent_cache: str | None,
-    augmented: bool,
-    on_bad: str,
-) -> None:
+def _check_settings(settings: Mapping[str, Any], latent_cache: str | None, augmented: bool) -> None:
     """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
-    if on_bad not in ("skip", "raise"):
-        raise CompleteSplatError(f"data.on_bad={on_bad}: choose one of skip, raise")
-    if targets < 0:
-        raise CompleteSplatError(f"data.targets={targets}: must be 0 or more")
-    if mask_threshold is not None and not 0 < mask_threshold <= 1:
-        raise CompleteSplatError(f"data.mask_threshold={mask_threshold}: must lie above 0 and not above 1")
-    if background is not None and not 0 <= background <= 1:
-        raise CompleteSplatError(f"data.background={background}: must lie between 0 and 1")
-    if latent_cache is not None and (augmented or background is not None):
+    hints, workers, cores = hints_of(SceneDataModule.__init__), settings["workers"], os.cpu_count() or 1
+    for name, value in settings.items():
+        check_value(f"data.{name}", hints[name], value)
+    if workers is not None and workers > WORKERS_OF_A_CORE * cores:
+        said = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
+        raise CompleteSplatError(f"data.workers={workers}: {said}")
+    if latent_cache is not None and (augmented or settings["background"] is not None):
         unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
@@ -87,7 +80,7 @@ class SceneDataModule(LightningDataModule):
         targets: Natural = 3,
         evaluation_batch_size: Positive = 4,
         references_per_sequence: Positive = 1,
-        mask_threshold: float | None = None,
+        mask_threshold: Annotated[float, Range(1e-6, 1)] | None = None,
         background: Share | None = None,
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
@@ -102,7 +95,8 @@ class SceneDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         augmented = color_jitter is not None or horizontal_flip
-        _check_settings(targets, mask_threshold, background, latent_cache, augmented, on_bad)
+        ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
+        _check_settings(ranged | {"workers": workers, "on_bad": on_bad}, latent_cache, augmented)
         self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -162,13 +156,13 @@ class SceneDataModule(LightningDataModule):
 
         Raises:
             DataError: missing or malformed files, no sequences for this stage, or a latent cache of other data.
+            CompleteSplatError: training data that `batch_size` or `targets` ask too much of.
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
         if stage == "fit":
             _ = self.trained_on  # as they are now, whatever becomes of the files while the run lasts
-        if stage == "fit" and self.latent_cache is not None:
-            self._training_scenes()  # what is wrong with the cache is an error before training starts
+            self._check_training()  # what is wrong is an error before training starts
 
     def source(self, split: str) -> SequenceSource:
         """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
@@ -216,8 +210,30 @@ class SceneDataModule(LightningDataModule):
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
+    def _check_training(self) -> None:
+        """Raise if an epoch has fewer scenes than a batch, or each sequence fewer frames than a scene."""
+        scenes, frames = self._training_scenes(), [1]
+        names = scenes.store.names
+        if self.batch_size > len(scenes):
+            counted = f"{len(scenes)} scenes (data.references_per_sequence of each of {len(names)} sequences)"
+            raise CompleteSplatError(f"data.batch_size={self.batch_size}: an epoch has {counted}; lower it")
+        for name in names:
+            if max(frames) > self.targets:
+                return
+            with suppress(DataError):
+                frames.append(len(scenes.store.source.read(name).frames))
+        if 1 < max(frames) <= self.targets:
+            said = f"a scene needs {self.targets + 1} frames, training sequences have at most {max(frames)} frames"
+            raise CompleteSplatError(f"data.targets={self.targets}: {said}")
+
+    def _drawn_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Return `training_views` of a sequence; `TooFewFrames` if some of its targets would be the same."""
+        if frames <= self.targets:
+            raise TooFewFrames(f"{frames} frames, data.targets={self.targets} needs {self.targets + 1}")
+        return self.training_views(frames, epoch, rng)
+
     def _training_scenes(self) -> TrainingScenes:
-        drawing = self.store("train"), self.training_views
+        drawing = self.store("train"), self._drawn_views
         counting = self.references_per_sequence, self.seed
         if self.latent_cache is not None:
             return CachedTrainingScenes(self.cached_latents, *drawing, self.box_masks, *counting)

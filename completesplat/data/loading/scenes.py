@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import draws
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.data.validation import at
 from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
@@ -131,8 +132,10 @@ class TrainingScenes(Dataset[Loaded]):
         rng = draws(self.seed, epoch, index)
         refused: list[DataError] = []
         for _ in range(ATTEMPTS):
+            name = self.store.names[index // self.references]
             try:
-                return Loaded(self.draw(self.store.names[index // self.references], epoch, rng), tuple(refused))
+                with at(sequence=name):
+                    return Loaded(self.draw(name, epoch, rng), tuple(refused))
             except DataError as error:
                 refused.append(error)
                 index = int(rng.integers(len(self)))

@@ -25,7 +25,7 @@ class EvaluationIndex:
     views: dict[str, list[Choice]]
 
 
-class ChosenSource:
+class ChosenSource(SequenceSource):
     """Clips under the names of their tests: the clip's, or `KEY#1`, `KEY#2` ... where one has several.
 
     `views` are reference and targets by name, where an index gives them; see `SequenceSource` for the rest.

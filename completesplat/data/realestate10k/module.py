@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from completesplat.data.sequences import Picture, PosedSequence, SequenceSource,
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
-from completesplat.schema import Natural, Positive, Share
+from completesplat.schema import Natural, OneOf, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
@@ -49,7 +49,7 @@ def open_clips(folder: Path) -> Clips:
     raise DataError("no RealEstate10K clips there: neither index.json (with *.torch) nor *.txt", str(folder))
 
 
-class RE10KSource:
+class RE10KSource(SequenceSource):
     """Some clips of one folder; see `SequenceSource`. The clips may be shared by several sources."""
 
     def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
@@ -127,7 +127,7 @@ class RE10KDataModule(SceneDataModule):
         evaluation_gap: Positive | None = None,
         evaluation_index: str | None = None,
         scene_list: str | None = None,
-        crop: str = "center",
+        crop: Annotated[str, OneOf(CROPS)] = "center",
         near: float = 0.7,
         far: float = 10.0,
         scale: float = 1.0,
@@ -141,8 +141,6 @@ class RE10KDataModule(SceneDataModule):
             raise CompleteSplatError("data: needs 1 <= min_gap <= max_gap")
         if not 0 < near < far or not scale > 0:
             raise CompleteSplatError("data: needs 0 < near < far and 0 < scale")
-        if crop not in CROPS:
-            raise CompleteSplatError(f"data.crop={crop}: choose one of {', '.join(CROPS)}")
         self.min_gap = min_gap
         self.evaluation = evaluation_targets, evaluation_gap or self.max_gap.last
         self.evaluation_index = Path(evaluation_index) if evaluation_index else None

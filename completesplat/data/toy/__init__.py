@@ -7,7 +7,7 @@ from pathlib import Path
 from completesplat.data.toy.objects import write_objects
 from completesplat.data.toy.rooms import write_rooms
 from completesplat.errors import DataError
-from completesplat.schema import Natural, Side
+from completesplat.schema import Natural, Positive, Side
 
 KINDS: dict[str, Callable[..., Path]] = {
     "objects": write_objects,
@@ -18,7 +18,7 @@ KINDS: dict[str, Callable[..., Path]] = {
 
 
 def write(
-    kind: str, out: Path, scenes: int, frames: int, size: Side, seed: Natural, workers: int | None = None
+    kind: str, out: Path, scenes: int, frames: int, size: Side, seed: Natural, workers: Positive | None = None
 ) -> Path:
     """Write scenes of a kind (a key of `KINDS`); returns their folder.
 

@@ -11,8 +11,10 @@ from rich.progress import track
 from completesplat.atomic import atomic_folder
 from completesplat.data.processes import map_in_processes
 from completesplat.errors import DataError
+from completesplat.schema import Range
 
 FORMAT_VERSION = 2
+MOST_FRAMES = 1000
 
 Result = TypeVar("Result")
 
@@ -24,13 +26,12 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
     with the same numbers is kept as it is.
 
     Raises:
-        DataError: a number that is too small, or the folder holds something else.
+        DataError: a number out of its range, or the folder holds something else.
         DiskError: the disk is full.
     """
-    least = {"scenes": fewest, "frames": 2, "size": 8}
-    if any(numbers[name] < number for name, number in least.items()):
-        needed = ", ".join(f"{name} >= {number}" for name, number in least.items())
-        raise DataError(f"{folder.name} need {needed}, not {', '.join(str(numbers[name]) for name in least)}")
+    for name, rule in {"scenes": Range(fewest), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
+        if (reason := rule.refusal(numbers[name])) is not None:
+            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
     parameters = {"format": FORMAT_VERSION, **numbers}
     if folder.exists():
         try:

@@ -53,10 +53,7 @@ class ToyObjectsDataModule(CO3DDataModule):
         **reading: Any,
     ) -> None:
         super().__init__(root, category, subset, depth_before=depth_before, **reading)
-        self.make = make
-        self.scenes = scenes
-        self.frames = frames
-        self.data_seed = data_seed
+        self.make, self.making = make, (scenes, frames, self.image_size, data_seed)
 
     def describe(self) -> dict[str, str | None]:
         return super().describe() | {"data_set": self.category}
@@ -64,8 +61,7 @@ class ToyObjectsDataModule(CO3DDataModule):
     def prepare_data(self) -> None:
         """Write the scenes where there are none; `MissingFile` as `_must_make`."""
         if _must_make(self.root, self.root / self.category, self.make):
-            numbers = self.scenes, self.frames, self.image_size, self.data_seed
-            write_objects(self.root, *numbers, category=self.category)
+            write_objects(self.root, *self.making, category=self.category)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
         """The test scenes with every colour that the patch on the back could have had; see `ToyHiddenModes`."""

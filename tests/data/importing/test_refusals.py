@@ -107,9 +107,6 @@ def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
     [
         ({}, "either transforms=FILE or colmap=FOLDER"),
         ({"transforms": "a", "images": "c"}, "colmap=FOLDER goes with images=FOLDER"),
-        ({"transforms": "a", "hold_out": 1}, "hold_out must be at least 2"),
-        ({"transforms": "a", "quality": 101}, "quality 1 to 100"),
-        ({"transforms": "a", "most_missing": 1.5}, "most_missing=1.5: must lie between 0 and 1"),
         ({"transforms": "a", "category": None}, "category is needed: give category=NAME"),
         ({"transforms": "a", "category": "a/b"}, "category must be a name"),
         ({"transforms": "nowhere.json"}, r"nowhere\.json: no such file"),
