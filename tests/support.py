@@ -5,6 +5,8 @@ import functools
 import json
 import math
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,19 @@ from completesplat.generation import CompleteSplat
 NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
 SMALL = ["data.image_size=32", "data.batch_size=2", "data.evaluation_targets=2", "callbacks.progress=null", *NETWORKS]
 SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_interval=2", "limit_val_batches=1")]
+
+LIMIT = 900.0
+"""Seconds that a test waits for a state: a busy machine may take minutes for the work of a second."""
+
+
+def waited_for(state: Callable[[], object], seconds: float = LIMIT) -> bool:
+    """Wait until a state holds, and return whether it did before the limit."""
+    end = time.monotonic() + seconds
+    while not state():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:

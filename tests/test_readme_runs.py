@@ -11,7 +11,7 @@ import co3d_trees
 import numpy as np
 import pytest
 from PIL import Image
-from support import SMALL, write_capture
+from support import LIMIT, SMALL, write_capture
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
 # Appended to make them short; everything else is as printed.
@@ -79,7 +79,7 @@ def run(command: str, folder) -> subprocess.CompletedProcess[str]:
     program = [sys.executable, "-m", "completesplat", *arguments, *brief]
     if arguments[0] == "view" and not any("export=" in argument for argument in arguments):
         return _served(program, folder)
-    return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=600)
+    return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=LIMIT)
 
 
 def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
@@ -91,7 +91,7 @@ def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
         said.append(line)
         if "http://127.0.0.1" in line:
             process.send_signal(signal.SIGINT)
-            process.wait(timeout=60)
+            process.wait(timeout=LIMIT)
             return subprocess.CompletedProcess(program, 0)
     return subprocess.CompletedProcess(program, process.wait(), stderr="".join(said))
 
