@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +85,8 @@ def refused(verb: str, *overrides: object) -> str:
     return refusal(caught.value) or ""
 
 
-def write_capture(folder: Path, frames: int) -> None:
-    """`transforms.json` with pictures from a circle around the origin, looking at it."""
+def write_capture(folder: Path, frames: int, names: Sequence[str] = ()) -> None:
+    """Write `transforms.json` and images from a circle around the origin, looking at it; the first have these names."""
     folder.mkdir(exist_ok=True)
     listed = []
     for number in range(frames):
@@ -94,8 +94,9 @@ def write_capture(folder: Path, frames: int) -> None:
         back, right = np.array([math.sin(angle), 0, math.cos(angle)]), np.array([math.cos(angle), 0, -math.sin(angle)])
         pose = np.eye(4)  # OpenGL's axes: the camera looks along -z
         pose[:3] = np.stack([right, [0, 1, 0], back, 3 * back], axis=1)
-        Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / f"frame{number}.png")
-        listed.append({"file_path": f"frame{number}.png", "transform_matrix": pose.tolist()})
+        name = names[number] if number < len(names) else f"frame{number}.png"
+        Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / name)
+        listed.append({"file_path": name, "transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": listed}))
 
 
