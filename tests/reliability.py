@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from importlib import import_module
 from itertools import chain, product
@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import pandas
 import torch
-from support import SMALL, script, strict_json
+from support import SMALL, script, strict_json, waited_for
 
 from completesplat import cli
 from completesplat.commands.jobs import LOCK
@@ -100,15 +100,6 @@ def must_work(folder: Path, *arguments: str) -> float:
     if status:
         raise RuntimeError(f"status {status} of {' '.join(arguments)}\n{(folder / 'log.txt').read_text()[-3000:]}")
     return time.monotonic() - begun
-
-
-def waited_for(condition: Callable[[], bool], seconds: float) -> bool:
-    until = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.01)
-    return True
 
 
 # kill -9

@@ -5,6 +5,8 @@ import functools
 import json
 import math
 import sys
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,19 @@ NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels
 SMALL = ["data.image_size=32", "data.batch_size=2", "data.targets=3", "data.evaluation_targets=2", *NETWORKS]
 SMALL += ["callbacks.progress=null"]
 SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_interval=2", "limit_val_batches=1")]
+
+LIMIT = 900.0
+"""Seconds that a test waits for a state: a busy machine may take minutes for the work of a second."""
+
+
+def waited_for(state: Callable[[], object], seconds: float = LIMIT) -> bool:
+    """Wait until a state holds, and return whether it did before the limit."""
+    end = time.monotonic() + seconds
+    while not state():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
@@ -71,8 +86,8 @@ def refused(verb: str, *overrides: object) -> str:
     return refusal(caught.value) or ""
 
 
-def write_capture(folder: Path, frames: int) -> None:
-    """`transforms.json` with pictures from a circle around the origin, looking at it."""
+def write_capture(folder: Path, frames: int, names: Sequence[str] = ()) -> None:
+    """Write `transforms.json` and images from a circle around the origin, looking at it; the first have these names."""
     folder.mkdir(exist_ok=True)
     listed = []
     for number in range(frames):
@@ -80,8 +95,9 @@ def write_capture(folder: Path, frames: int) -> None:
         back, right = np.array([math.sin(angle), 0, math.cos(angle)]), np.array([math.cos(angle), 0, -math.sin(angle)])
         pose = np.eye(4)  # OpenGL's axes: the camera looks along -z
         pose[:3] = np.stack([right, [0, 1, 0], back, 3 * back], axis=1)
-        Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / f"frame{number}.png")
-        listed.append({"file_path": f"frame{number}.png", "transform_matrix": pose.tolist()})
+        name = names[number] if number < len(names) else f"frame{number}.png"
+        Image.new("RGB", (16, 12), (30 * number,) * 3).save(folder / name)
+        listed.append({"file_path": name, "transform_matrix": pose.tolist()})
     (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": listed}))
 
 

@@ -11,7 +11,7 @@ import co3d_trees
 import numpy as np
 import pytest
 from PIL import Image
-from support import SMALL, write_capture
+from support import LIMIT, SMALL, write_capture
 from written_commands import CARDS, DOCUMENTS, arguments_of, block_commands
 
 # Appended to make them short; everything else is as printed.
@@ -22,9 +22,16 @@ BRIEF = {
     "predict": ["frames=2", "steps=2"],
     "test": ["trainer.accelerator=cpu"],
     **{f"report {study}": ["scenes=1", "samples=2"] for study in ("samplers", "controls", "masked", "depth")},
+    **{f"report {study}": ["scenes=1"] for study in ("views", "layers")},
 }
-# What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one).
-NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1", "TABLE_OF_A")
+# Stage 2 has as many levels as the small stage 1.
+BRIEF |= {
+    f"fit experiment=toy_{of}_diffusion": [*BRIEF["fit"], "conditioning.channels=[8,8,16,16]"]
+    for of in ("minis", "views")
+}
+# What they need cannot be made here: CO3D, eight GPUs, VGG16 (`test_sweeps` has these two sweeps with a random one),
+# Splatter Image's published weights (`test_published` has made-up ones).
+NEEDS_MORE = ("evaluation=co3d", "trainer.devices=8", "PART1", "TABLE_OF_A", "splatter_image:", "model_hydrants.pth")
 TAKES_MINUTES = ("completesplat bench",)
 
 
@@ -58,28 +65,28 @@ def named_in(command: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A photograph, a folder of them, a mask's picture, a capture, and CO3D's hydrants (in its layout)."""
+    """A photograph, a folder of two with their cameras, a capture, and CO3D's hydrants (in its layout)."""
     place = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(0)
-    (place / "FOLDER").mkdir()
-    for name in ("photo.jpg", "FOLDER/photo.jpg", "FOLDER/other.png"):
-        Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / name)
+    Image.fromarray(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)).save(place / "photo.jpg")
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(co3d_trees, "CATEGORY", "hydrant")
         names = [f"{index}_2_3" for index in range(4)]
         splits = {"train": names[:2], "val": names[2:3], "test": names[3:]}
         co3d_trees.write_tree(place / "ROOT", dict.fromkeys(names, 6), splits)
-    write_capture(place, frames=6)
+    write_capture(place, frames=6, names=("a.jpg", "b.jpg"))
+    write_capture(place / "FOLDER", frames=2, names=("photo.jpg", "other.png"))
     return place
 
 
 def run(command: str, folder) -> subprocess.CompletedProcess[str]:
     arguments = arguments_of(command)
-    brief = next((extra for start, extra in BRIEF.items() if " ".join(arguments).startswith(start)), [])
+    starts = [start for start in BRIEF if " ".join(arguments).startswith(start)]
+    brief = BRIEF[max(starts, key=len)] if starts else []
     program = [sys.executable, "-m", "completesplat", *arguments, *brief]
     if arguments[0] == "view" and not any("export=" in argument for argument in arguments):
         return _served(program, folder)
-    return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=600)
+    return subprocess.run(program, cwd=folder, capture_output=True, text=True, timeout=LIMIT)
 
 
 def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
@@ -91,7 +98,7 @@ def _served(program: list[str], folder) -> subprocess.CompletedProcess[str]:
         said.append(line)
         if "http://127.0.0.1" in line:
             process.send_signal(signal.SIGINT)
-            process.wait(timeout=60)
+            process.wait(timeout=LIMIT)
             return subprocess.CompletedProcess(program, 0)
     return subprocess.CompletedProcess(program, process.wait(), stderr="".join(said))
 

@@ -2,7 +2,7 @@
 
 import pytest
 from reliability import ALONE, FIRST, SECOND, TWICE, make, signalled
-from support import script
+from support import LIMIT, script
 
 pytestmark = pytest.mark.slow
 
@@ -28,4 +28,4 @@ def material(tmp_path_factory):
     ],
 )
 def test_a_signal_ends_all_processes_and_leaves_nothing_half_written(material, place, kind, who):
-    assert signalled(material, place, kind, who, seconds=60) == []
+    assert signalled(material, place, kind, who, seconds=LIMIT) == []

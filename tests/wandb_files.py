@@ -2,12 +2,13 @@
 
 import json
 import struct
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
+
+from support import waited_for
 
 BLOCK, FILE_HEADER, CHUNK_HEADER = 2**15, 7, 7
 TYPES = {"image": "image-file", "histogram": "histogram", "table": "table-file", "video": "videos"}
@@ -53,12 +54,12 @@ def _finished(path: Path) -> OfflineRun:
     """W&B's process may write the file a moment after the run was closed."""
     from wandb.proto.wandb_internal_pb2 import Record
 
-    for _ in range(300):
-        records = [Record.FromString(record) for record in raw_records(path.read_bytes())]
-        if any(record.WhichOneof("record_type") == "exit" for record in records):
-            return OfflineRun(path.parent, records)
-        time.sleep(0.1)
-    raise AssertionError(f"{path}: never finished")
+    def records() -> list[Any]:
+        return [Record.FromString(record) for record in raw_records(path.read_bytes())]
+
+    ended = lambda: any(record.WhichOneof("record_type") == "exit" for record in records())  # noqa: E731
+    assert waited_for(ended), f"{path} has no end"
+    return OfflineRun(path.parent, records())
 
 
 def raw_records(data: bytes) -> Iterator[bytes]:

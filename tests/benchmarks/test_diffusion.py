@@ -120,6 +120,7 @@ def test_only_some_are_measured_and_an_unknown_one_is_refused():
 @pytest.mark.parametrize("stubborn", [False, True])
 def test_compiling_that_takes_too_long_is_given_up(monkeypatch, stubborn):
     """Even where it handles the error that ends it."""
+    ended = []
 
     def sleep(*_: object) -> None:
         try:
@@ -128,16 +129,16 @@ def test_compiling_that_takes_too_long_is_given_up(monkeypatch, stubborn):
             if not stubborn:
                 raise
             time.sleep(60)
+        ended.append(True)
 
     def compile(network: nn.Module) -> nn.Module:
         network.register_forward_pre_hook(sleep)
         return network
 
     monkeypatch.setattr(torch, "compile", compile)
-    start = time.monotonic()
     with pytest.raises(NotMeasured, match=r"took longer than compile_limit=0\.2 s"):
         compiled_vs_eager(tiny_generator(), 1, "32-true", 0.2)
-    assert time.monotonic() - start < 30
+    assert ended == []
 
 
 @pytest.fixture(scope="module")

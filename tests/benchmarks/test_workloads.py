@@ -1,7 +1,6 @@
 """The scenes that are timed, and the time and memory of one rendering."""
 
 import threading
-import time
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
+from support import waited_for
 
 from completesplat.benchmarks import workloads
 from completesplat.benchmarks.workloads import (
@@ -218,9 +218,13 @@ def test_the_peak_is_what_work_adds_whether_it_keeps_it_or_not(monkeypatch: pyte
     kept = [np.ones(FLOATS, np.float32)]  # what was there before does not count
     assert peak_megabytes(lambda: None, "cpu") < 5
 
+    readings, read = [], Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda self: readings.append(self) or read(self))
+
     def give_back() -> None:
         array = np.ones(FLOATS, np.float32)
-        time.sleep(0.05)  # many samples
+        before = len(readings)
+        assert waited_for(lambda: len(readings) > before + 1)  # the first of them has ended
         del array
 
     def take_from_the_kernels() -> None:

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from support import SMALL, refused, strict_json
+from support import LIMIT, SMALL, refused, strict_json
 
 from completesplat.data.latent_cache import LatentCache
 
@@ -34,7 +34,7 @@ def test_two_processes_write_what_one_writes(command, pipeline, packed_toys, tmp
     assert command("data", "latents", *given, f"out={tmp_path / 'one'}").status == 0
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--nproc_per_node=2", "--standalone"]
     program = [*torchrun, "-m", "completesplat", "data", "latents", *given, f"out={tmp_path / 'two'}"]
-    subprocess.run(program, check=True, timeout=600, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    subprocess.run(program, check=True, timeout=LIMIT, env=os.environ | {"OMP_NUM_THREADS": "1"})
     one, two = (LatentCache(tmp_path / name) for name in ("one", "two"))
     assert (one.origin, one.mean, one.std, one.sequences) == (two.origin, two.mean, two.std, two.sequences)
     for name in ("mean", "log_variance", "condition"):

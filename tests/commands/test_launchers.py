@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from support import SMALL, script, strict_json
+from support import LIMIT, SMALL, script, strict_json
 
 PYTHON = f"#!{sys.executable}\n"
 SBATCH = '''"""Start all jobs of an array, or the one job, of the script of the last argument, and print the number.
@@ -27,7 +27,9 @@ for task in range(int(first), int(last) + 1):
     told |= {"SLURM_NTASKS_PER_NODE": tasks, "SLURM_NNODES": options["nodes"], "SLURM_JOB_NUM_NODES": "1"}
     if "array" in options:
         told |= {"SLURM_ARRAY_JOB_ID": number, "SLURM_ARRAY_TASK_ID": str(task)}
-    run = ["bash", "-c", f"sleep 5; exec bash {script}"]
+    job = f"{number}_{task}" if "array" in options else number
+    waiting = f"[ ! -e {os.path.dirname(script)}/{job}/{job}_submitted.pkl ] && kill -0 {os.getppid()}"
+    run = ["bash", "-c", f"while {waiting}; do sleep 0.1; done; exec bash {script}"]
     silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     subprocess.Popen(run, env=os.environ | told, start_new_session=True, **silent)
 print("Submitted batch job", number)
@@ -67,7 +69,7 @@ def sweep(root: Path, folder: Path, *settings: str) -> Path:
     given += ["experiment=toy_var", "rasterizer=reference", f"out={folder / 'sweep'}", *settings]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     program = [sys.executable, str(script(folder)), "fit", "-m", *given]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=900, cwd=folder)
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=LIMIT, cwd=folder)
     logs = "".join(path.read_text()[-2000:] for path in folder.glob("sweep/.submitit/*/*_log.err"))
     assert done.returncode == 0, done.stderr[-3000:] + logs
     return folder / "sweep"

@@ -8,7 +8,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from PIL import Image
 from published_weights import write_published
-from support import SMALL, compose_config, strict_json
+from support import LIMIT, SMALL, compose_config, strict_json
 
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -176,7 +176,7 @@ def test_the_page_has_no_sliders_for_one_answer(tmp_path):
     settings = [f"weights={weights}", f"image={image}", f"export={export}", "rasterizer=reference"]
     page = make_page(start_server(0), compose_config("view", *settings), tmp_path)
     try:
-        assert page.worker.wait(60)
+        assert page.worker.wait(LIMIT)
         assert [sample.gaussians.count for sample in page.stage.samples] == [16 * 16]
         handles = page.server.gui._gui_input_handle_from_uuid.values()
         shown = [getattr(handle, "label", "") for handle in handles if handle.visible]

@@ -23,10 +23,10 @@ from pathlib import Path
 from completesplat.commands.jobs import alone_in
 with alone_in(Path(sys.argv[1])):
     if os.fork() == 0:
-        time.sleep(60)
+        time.sleep(900)
         os._exit(0)
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(900)
 """
 
 

@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import script, strict_json
+from support import LIMIT, script, strict_json
 
 
 def scores(checkpoint: Path, out: Path, folder: Path, *settings: str) -> dict:
     command = [sys.executable, str(script(folder)), "test", f"ckpt={checkpoint}", f"out={out}", *settings]
-    subprocess.run(command, check=True, timeout=300, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    subprocess.run(command, check=True, timeout=LIMIT, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"})
     metrics = strict_json(out / "metrics.json")
     assert metrics["protocol"]["scenes"] == metrics["model"]["scenes"]
     del metrics["protocol"], metrics["model"]["seconds"]

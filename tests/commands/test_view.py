@@ -10,7 +10,7 @@ from urllib.request import ProxyHandler, build_opener
 import pytest
 import torch
 from scenes_for_training import scene_batch
-from support import compose_config
+from support import LIMIT, compose_config
 from viewer_scenes import balls
 from written_commands import ROOT
 
@@ -23,8 +23,6 @@ from completesplat.scene_model import SceneModel
 from completesplat.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
 from completesplat.viewer.sample import UP
-
-SECONDS = 60
 
 
 def folder(path, *names: str):
@@ -149,13 +147,13 @@ def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
             address = process.stdout.readline().split(" ")[0]
             assert address.startswith("http:")
             assert process.stdout.readline() == "torch\n"
-            assert build_opener(ProxyHandler({})).open(address, timeout=SECONDS).status == 200
+            assert build_opener(ProxyHandler({})).open(address, timeout=LIMIT).status == 200
             place, protocol = urlsplit(address), f"viser-v{viser.__version__}"
             socket = connect(
                 address.replace("http:", "ws:"), origin=f"http://{place.netloc}", subprotocols=[protocol], proxy=None
             )
             with socket:
-                page = socket.recv(timeout=SECONDS)  # behind its size, before and after compression
+                page = socket.recv(timeout=LIMIT)  # behind its size, before and after compression
             assert LOADING.encode() in _infra.zstandard.ZstdDecompressor().decompressobj().decompress(page[16:])
         finally:
             process.kill()

@@ -64,11 +64,11 @@ from pathlib import Path
 from completesplat.data.validation import UnreadableFile, read_json
 def peak():
     return int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) // 1024
-before, start = peak(), time.perf_counter()
+before, start = peak(), time.process_time()
 try:
     read_json(Path(sys.argv[1]))
 except UnreadableFile as error:
-    print(peak() - before, time.perf_counter() - start, error)
+    print(peak() - before, time.process_time() - start, error)
 """
 
 

@@ -143,10 +143,10 @@ def test_broken_files_are_refused_in_one_line_and_at_once(tmp_path, written):
         assert good.count(old) == 1
     for data in [*broken, *(good.replace(old, new) for old, new in REPLACED)]:
         path.write_bytes(data)
-        start = time.perf_counter()
+        start = time.thread_time()
         with pytest.raises(PlyError, match=re.escape(str(path))) as caught:
             read_ply(path)
-        assert time.perf_counter() - start < 1
+        assert time.thread_time() - start < 1
         assert "\n" not in str(caught.value)
     for nothing in (tmp_path / "missing.ply", tmp_path):
         with pytest.raises(PlyError, match="no such file"):

@@ -90,8 +90,8 @@ def test_a_failure_is_one_line_and_leaves_the_older_file(bin_folder, tmp_path, s
 
 def test_what_takes_too_long_is_ended_with_all_that_it_started(bin_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(splat_transform, "LIMIT_SECONDS", 0.3)
-    # Would write the file after a second, and holds the pipes open until then.
-    program = install(bin_folder, "splat-transform", f"(sleep 1; touch {tmp_path / 'late'}) & sleep 100")
+    # Would write the file after a minute, and holds the pipes open until then.
+    program = install(bin_folder, "splat-transform", f"(sleep 60; touch {tmp_path / 'late'}) & sleep 100")
     with pytest.raises(CompleteSplatError, match=r"splat-transform has not finished within 0\.3 seconds"):
         SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
     assert not (tmp_path / "late").exists()

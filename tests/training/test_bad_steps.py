@@ -8,7 +8,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
 from small_runs import Batches
-from support import SMALL, strict_json
+from support import LIMIT, SMALL, strict_json
 
 from completesplat.errors import DivergenceError
 from completesplat.training.callbacks import BadSteps, ExponentialMovingAverage
@@ -177,7 +177,7 @@ def test_two_processes_leave_out_the_same_steps(tmp_path, request):
     program, folders = tmp_path / "program.py", request.path.parents[:2]
     program.write_text(TWO_PROCESSES)
     command = [sys.executable, str(program), *map(str, folders)]
-    finished = subprocess.run(command, timeout=300, capture_output=True, text=True)
+    finished = subprocess.run(command, timeout=LIMIT, capture_output=True, text=True)
     assert finished.returncode == 0, finished.stderr
 
 

@@ -2,7 +2,7 @@
 
 import itertools
 import logging
-import time
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import pytest
@@ -13,73 +13,90 @@ from lightning.pytorch.loggers.logger import Logger
 from scenes_for_training import scene_batch
 from torch.utils.data import DataLoader
 
+from completesplat.training import throughput
 from completesplat.training.callbacks import Progress, StepSeeds, step_seed
 from completesplat.training.throughput import Throughput
 
-NAP = 0.03
 QUIET = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
 QUIET["accelerator"] = "cpu"
 
 
+class Clock:
+    """Stands still but for what naps on it."""
+
+    def __init__(self) -> None:
+        self.seconds = 100.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+    def nap(self, seconds: float) -> None:
+        self.seconds += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(throughput, "now", made)
+    monkeypatch.setattr(throughput, "time", SimpleNamespace(perf_counter=made))
+    return made
+
+
 class Sleeper(BoringModel):
-    def __init__(self, training: float = 0, validation: float = 0) -> None:
+    def __init__(self, clock: Clock, training: float = 0, validation: float = 0) -> None:
         super().__init__()
-        self.naps = training, validation
+        self.clock, self.naps = clock, (training, validation)
 
     def training_step(self, batch, index):
-        time.sleep(self.naps[0])
+        self.clock.nap(self.naps[0])
         return super().training_step(torch.ones(1, 32), index)
 
     def validation_step(self, batch, index):
-        time.sleep(self.naps[1])
+        self.clock.nap(self.naps[1])
 
 
-def loader(nap: float = 0) -> DataLoader:
-    return DataLoader(range(8), collate_fn=lambda _: time.sleep(nap) or scene_batch())
-
-
-def speeds(module: Sleeper, batches: DataLoader, **options) -> list[dict[str, float]]:
+def speeds(module: Sleeper, nap: float = 0, **options) -> list[dict[str, float]]:
+    """Rows of an epoch of eight batches of two scenes, each of which takes a nap to load."""
     memory = MagicMock(spec=Logger)
     surroundings = {"logger": memory, "callbacks": [Throughput()], "log_every_n_steps": 2, "num_sanity_val_steps": 0}
     trainer = Trainer(max_epochs=1, **surroundings, **QUIET, **options)
     profiler = trainer.profiler
-    trainer.fit(module, batches, loader() if "val_check_interval" in options else None)
+    batches = DataLoader(range(8), collate_fn=lambda _: module.clock.nap(nap) or scene_batch())
+    trainer.fit(module, batches, DataLoader(range(8)) if "val_check_interval" in options else None)
     assert trainer.profiler is profiler
     rows = [call.kwargs["metrics"] | {"step": call.kwargs["step"]} for call in memory.log_metrics.call_args_list]
     return [row for row in rows if "speed/data_wait" in row]
 
 
-def test_who_is_waited_for():
-    slow_data, slow_model = speeds(Sleeper(), loader(NAP)), speeds(Sleeper(NAP), loader())
-    assert [row["step"] for row in slow_data] == [1, 3, 5, 7]
-    for data, model in zip(slow_data[1:], slow_model[1:], strict=True):
-        assert 0 < model["speed/data_wait"] < data["speed/data_wait"] < 1
-        for row in (data, model):  # A batch has two scenes, and cannot take less than the nap.
-            assert 0 < row["speed/scenes_per_second"] < 2 / NAP
+def test_who_is_waited_for(clock):
+    """A batch is loaded in one second, and trained on in three."""
+    rows = speeds(Sleeper(clock, training=3), nap=1)
+    assert [row["step"] for row in rows] == [1, 3, 5, 7]
+    for row in rows[1:]:  # the first batch is loaded before there is a step
+        assert row["speed/data_wait"] == pytest.approx(1 / 4)
+        assert row["speed/scenes_per_second"] == pytest.approx(2 / 4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("interval", [1, 2])
-def test_validation_is_not_counted(interval):
+def test_validation_is_not_counted(clock, interval):
     """Five times as long as training, and in the midst of an interval as well as between two."""
-    validated = speeds(Sleeper(NAP, validation=5 * NAP), loader(), val_check_interval=interval)
-    for row in validated[1:]:
-        assert row["speed/scenes_per_second"] > 2 / (5 * NAP)
+    for row in speeds(Sleeper(clock, training=1, validation=5), val_check_interval=interval)[1:]:
+        assert row["speed/scenes_per_second"] == pytest.approx(2)
 
 
-def test_accumulated_batches_are_counted_and_logged_once():
-    rows = speeds(Sleeper(NAP), loader(), accumulate_grad_batches=2)
+def test_accumulated_batches_are_counted_and_logged_once(clock):
+    rows = speeds(Sleeper(clock, training=1), accumulate_grad_batches=2)
     assert [row["step"] for row in rows] == [1, 3]
-    for row in rows:  # Eight scenes take at least four naps.
-        assert row["speed/scenes_per_second"] < 2 / NAP
+    for row in rows:
+        assert row["speed/scenes_per_second"] == pytest.approx(2)
 
 
-def test_memory_is_that_of_a_process_with_torch():
-    before = speeds(Sleeper(), loader())[-1]
+def test_memory_is_that_of_a_process_with_torch(clock):
+    before = speeds(Sleeper(clock, training=1))[-1]
     assert 0.05 < before["memory/process_gb"] < 100
     assert "memory/gpu_gb" not in before
     ballast = torch.ones(2**27)  # half a GiB
-    after = speeds(Sleeper(), loader())[-1]["memory/process_gb"]
+    after = speeds(Sleeper(clock, training=1))[-1]["memory/process_gb"]
     assert after - before["memory/process_gb"] == pytest.approx(0.5, abs=0.2)
     del ballast
 

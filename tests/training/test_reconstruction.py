@@ -30,7 +30,7 @@ def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
     scenes = scene_batch()
     scenes.visible[..., 4:12, 2:9] = 0
     trained = module(f"model.masked={str(masked).lower()}")
-    monkeypatch.setattr(trained, "log_dict", lambda *_, **__: None)  # There is no trainer.
+    monkeypatch.setattr(trained, "log", lambda *_, **__: None)  # There is no trainer.
     monkeypatch.setattr(type(trained), "global_step", 0)
     seen, compared = [], []
     trained.model.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))

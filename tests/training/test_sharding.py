@@ -12,7 +12,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 from safetensors.torch import load_file, save_file
-from support import SMALL, compose_config, script, strict_json
+from support import LIMIT, SMALL, compose_config, script, strict_json
 
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.training.checkpoints import CheckpointFiles, newest_whole
@@ -43,7 +43,7 @@ def fit(launcher: list[str], root: Path, out: Path, *settings: object) -> Path:
     program = launcher or [str(script(out.parent))]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
-        [sys.executable, *program, "fit", *given], env=environment, capture_output=True, text=True, timeout=600
+        [sys.executable, *program, "fit", *given], env=environment, capture_output=True, text=True, timeout=LIMIT
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return out / LAST
@@ -104,7 +104,7 @@ def test_two_processes_whose_shards_do_not_fit_end_with_one_line(toy_root, tmp_p
     small_files = ["bash", "-c", 'ulimit -f 60; exec "$@"', "bash"]  # of 1024 bytes
     done = subprocess.run(
         [*small_files, sys.executable, str(script(tmp_path)), "fit", *given, "test=false"],
-        env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=600,
+        env=os.environ | {"OMP_NUM_THREADS": "1"}, capture_output=True, text=True, timeout=LIMIT,
     )  # fmt: skip
     said = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(said) == 1

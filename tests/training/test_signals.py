@@ -7,13 +7,13 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 from contextlib import suppress
 
 import pytest
 import torch
 from lightning.fabric.strategies.launchers import subprocess_script as launcher
 from small_runs import STEPS, Logging, fit, rows
+from support import LIMIT
 
 from completesplat import signals
 from completesplat.signals import ENDING, Interrupted, ended_by_signals, received
@@ -97,9 +97,11 @@ def test_slurm_queues_a_job_again_after_its_own_signal_only(tmp_path, monkeypatc
 
 
 def process(*lines: str) -> subprocess.Popen:
-    """One that is inside `ended_by_signals` when it has written a line."""
+    """A process that writes a line inside `ended_by_signals`, and another when it has received a signal."""
     program = ["import os, signal, time", "from completesplat.signals import *", *lines]
-    program += ["with ended_by_signals():", "    print(flush=True)", "    time.sleep(60)"]
+    program += ["with ended_by_signals():", "    print(flush=True)"]
+    program += ["    while received() is None:", "        time.sleep(0.01)"]
+    program += ["    print(flush=True)", f"    time.sleep({LIMIT})"]
     started = subprocess.Popen([sys.executable, "-c", "\n".join(program)], stdout=subprocess.PIPE)
     started.stdout.readline()
     return started
@@ -109,22 +111,20 @@ def process(*lines: str) -> subprocess.Popen:
 def test_outside_of_training_the_first_signal_ends_at_once_in_training_the_second(number):
     with process() as one:
         one.send_signal(number)
-        assert one.wait(10) == 128 + number
+        assert one.wait(LIMIT) == 128 + number
     with process("keep_signals(True)") as one:
         one.send_signal(number)
-        time.sleep(0.3)
-        assert one.poll() is None
+        assert one.stdout.readline() == b"\n"  # it has been received
         one.send_signal(signal.SIGTERM)
-        assert one.wait(10) == -signal.SIGTERM
+        assert one.wait(LIMIT) == -signal.SIGTERM
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_ignored():
+    """Of two signals that are not ignored, the one with the lower number would be handled first: SIGHUP."""
     with process("signal.signal(signal.SIGHUP, signal.SIG_IGN)") as one:
         one.send_signal(signal.SIGHUP)
-        time.sleep(0.3)
-        assert one.poll() is None
         one.send_signal(signal.SIGTERM)
-        assert one.wait(10) == 128 + signal.SIGTERM
+        assert one.wait(LIMIT) == 128 + signal.SIGTERM
 
 
 def test_a_signal_that_was_swallowed_does_not_end_with_success():
@@ -143,12 +143,11 @@ def test_what_fails_after_a_signal_because_another_process_has_gone_ends_as_the_
 
 def test_a_program_ends_whose_workers_nobody_has_ended():
     """Python's own way would be SIGTERM, which they ignore, and then to wait for them."""
-    lines = ("import multiprocessing, time", "from completesplat.signals import leave_to_parent")
-    lines += ("def work():", "    leave_to_parent()", "    print('ready', flush=True)", "    time.sleep(60)")
-    lines += ("multiprocessing.get_context('fork').Process(target=work, daemon=True).start()", "time.sleep(1)")
-    assert (
-        subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=40, capture_output=True).stdout == b"ready\n"
-    )
+    lines = ["import multiprocessing, time", "from completesplat.signals import leave_to_parent"]
+    lines += ["forked = multiprocessing.get_context('fork')", "ready = forked.Event()"]
+    lines += ["def work():", "    leave_to_parent()", "    ready.set()", f"    time.sleep({2 * LIMIT})"]
+    lines += ["forked.Process(target=work, daemon=True).start()", "ready.wait()"]
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], timeout=LIMIT, check=True)
 
 
 def test_numbers_of_signals_are_written_to_a_socket_that_is_open_and_to_nothing_else():

@@ -7,6 +7,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from unittest.mock import Mock
 
 import pytest
+from support import LIMIT
 from wandb_files import offline_runs
 
 from completesplat.errors import CompleteSplatError
@@ -34,7 +35,7 @@ def test_any_answer_counts_unless_a_proxy_gives_it(status, answered):
 
     with HTTPServer(("127.0.0.1", 0), Handler) as http:
         threading.Thread(target=http.handle_request, daemon=True).start()
-        assert answers(f"http://127.0.0.1:{http.server_port}", 5) == answered
+        assert answers(f"http://127.0.0.1:{http.server_port}", LIMIT) == answered
 
 
 def test_a_server_that_stays_silent_does_not_answer():

@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from types import SimpleNamespace
 
 import pytest
+from support import LIMIT, waited_for
 
 viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
@@ -22,7 +23,6 @@ from completesplat.errors import CompleteSplatError  # noqa: E402
 from completesplat.viewer import access  # noqa: E402
 from completesplat.viewer.access import MOST_FRAME, cookie_name, start_server, told  # noqa: E402
 
-SECONDS = 30
 MIB = 2**20
 EVIL = "evil.example"
 HANDSHAKE = {
@@ -48,7 +48,7 @@ def headers_of(server, host: str = "127.0.0.1:{port}", origin: str | None = None
 
 
 def status(server, path: str, headers: dict[str, str]) -> tuple[int, http.client.HTTPMessage]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=SECONDS)
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=LIMIT)
     connection.request("GET", path, headers=headers)
     with closing(connection), connection.getresponse() as response:
         return response.status, response.msg
@@ -65,10 +65,11 @@ def open_socket(server, path: str = "", cookie: str = ""):
     host = "{}:{}".format(*address)
     return connect(
         f"ws://{host}{path}",
-        sock=socket.create_connection(address, timeout=SECONDS),  # past a proxy that may be set
+        sock=socket.create_connection(address, timeout=LIMIT),  # past a proxy that may be set
         origin=f"http://{host}",
         additional_headers={"Cookie": cookie},
         subprotocols=[f"viser-v{viser.__version__}"],
+        open_timeout=LIMIT,
     )
 
 
@@ -91,7 +92,7 @@ def test_the_page_brings_the_token_as_a_cookie_for_itself_only(server):
     assert {"HttpOnly", "SameSite=Strict", "Path=/"} == set(attributes)
     assert headers["Referrer-Policy"] == "no-referrer"
     with open_socket(server, cookie=cookie) as opened:
-        assert opened.recv(timeout=SECONDS)
+        assert opened.recv(timeout=LIMIT)
 
 
 @pytest.mark.parametrize("cookie", ["", COOKIE])
@@ -125,7 +126,7 @@ def test_nobody_gets_anything_without_the_token(server, query, cookie):
 def test_a_handshake_says_where_its_page_comes_from_and_every_request_has_one_host(server):
     assert statuses(server, "?token={token}") == (200, 403)
     for hosts in ([], [f"127.0.0.1:{server.get_port()}"] * 2):
-        connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=SECONDS)
+        connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=LIMIT)
         connection.putrequest("GET", f"/?token={server.token}", skip_host=True)
         for host in hosts:
             connection.putheader("Host", host)
@@ -153,7 +154,7 @@ def closed_with(opened) -> int:
     """The code with which the server ends the connection."""
     with suppress(ConnectionClosed):
         while True:
-            opened.recv(timeout=SECONDS)
+            opened.recv(timeout=LIMIT)
     return opened.close_code
 
 
@@ -180,7 +181,7 @@ class Uploader:
         camera = {"fov": 1.0, "near": 0.1, "far": 9.0, "image_height": 8, "image_width": 8}
         three = (0.0, 0.0, 1.0)
         self.send(messages.ViewerCameraMessage((1.0, 0, 0, 0), three, **camera, look_at=three, up_direction=three))
-        until(server.get_clients)
+        assert waited_for(server.get_clients)
 
     def send(self, message) -> None:
         self.opened.send(_infra.msgspec.msgpack.encode(message.as_serializable_dict()))
@@ -196,7 +197,7 @@ class Uploader:
         self.arrived.clear()
         self.start(name, len(content), 1)
         self.part(name, 0, content)
-        assert self.arrived.wait(SECONDS)
+        assert self.arrived.wait(LIMIT)
 
     def uploads(self) -> dict[str, int]:
         """Bytes that are kept of the files that are being received."""
@@ -204,17 +205,12 @@ class Uploader:
         return {name: state["transferred_bytes"] for name, state in states.items()}
 
 
-def until(true) -> None:
-    waited = threading.Event()
-    assert any(true() or waited.wait(0.02) for _ in range(50 * SECONDS))
-
-
 @pytest.fixture
 def uploader(server, monkeypatch):
     monkeypatch.setattr(access, "MOST_BYTES", 2 * MIB)
     with own_socket(server) as opened:
         yield Uploader(server, opened)
-    until(lambda: not server.get_clients())
+    assert waited_for(lambda: not server.get_clients())
     assert server.gui._current_file_upload_states == {}  # a browser that leaves takes them with it
     server.gui.reset()
 
@@ -253,7 +249,7 @@ def test_files_that_are_received_at_once_share_the_room(uploader):
     assert uploader.uploads() == {"first": MIB // 2}
     uploader.arrived.clear()
     uploader.part("first", 1, bytes(MIB // 2))
-    assert uploader.arrived.wait(SECONDS)
+    assert uploader.arrived.wait(LIMIT)
     assert [len(content) for content in uploader.received] == [7, MIB]
 
 
@@ -264,8 +260,8 @@ def test_who_leaves_before_looking_takes_its_files_with_it(server):
     with own_socket(server) as opened:
         start = messages.FileTransferStartUpload(button._impl.uuid, "early", "a.png", "", 2, MIB)
         opened.send(_infra.msgspec.msgpack.encode(start.as_serializable_dict()))
-        until(lambda: uploads)
-    until(lambda: not uploads)
+        assert waited_for(lambda: uploads)
+    assert waited_for(lambda: not uploads)
     assert uploads == {}
     button.remove()
 
@@ -287,7 +283,7 @@ def test_a_viser_that_leaves_the_checks_out_is_not_served(monkeypatch):
     with pytest.raises(CompleteSplatError, match="cannot guard viser"):
         start_server(0)
     with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", ports[0]), timeout=SECONDS).close()
+        socket.create_connection(("127.0.0.1", ports[0]), timeout=LIMIT).close()
     assert websockets.asyncio.server.serve is serve
 
 

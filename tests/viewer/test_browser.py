@@ -6,14 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import tiny_generator
+from support import LIMIT, tiny_generator, waited_for
 from viewer_scenes import BALLS, balls_sample
 
 from completesplat.geometry.cameras import Cameras
@@ -35,7 +34,6 @@ pytestmark = [
 SWIFTSHADER = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 WINDOW = {"width": 700, "height": 360}
 START = {"samples": 1, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0, "remove_background": False}
-SECONDS = 90
 GREY = 128
 
 
@@ -66,7 +64,7 @@ def open_tab(chromium, address: str, window: dict[str, int] = WINDOW):
     tab.on("console", lambda message: message.type == "error" and tab.errors.append(message.text))
     tab.on("pageerror", lambda error: tab.errors.append(str(error)))
     tab.goto(address)
-    until(lambda: abs(settled(tab)[-5, 5] - GREY).max() < 3, "the page does not appear")
+    assert waited_for(lambda: abs(settled(tab)[-5, 5] - GREY).max() < 3), "the page does not appear"
     # The notices (that there is no graphics card, and others) would cover the scene.
     tab.add_style_tag(content=".mantine-Notification-root { visibility: hidden }")
     return tab
@@ -79,16 +77,9 @@ def tab(chromium, page):
 
 def pixels(tab) -> np.ndarray:
     """The scene's part of the window, [height width 3]."""
-    tab.locator("canvas").first.wait_for(timeout=1000 * SECONDS)
+    tab.locator("canvas").first.wait_for(timeout=1000 * LIMIT)
     canvas = max(tab.locator("canvas").all(), key=lambda c: c.bounding_box()["width"])
     return np.asarray(Image.open(io.BytesIO(canvas.screenshot())).convert("RGB")).astype(float)
-
-
-def until(true, what: str) -> None:
-    end = time.monotonic() + SECONDS
-    while not true():
-        assert time.monotonic() < end, what
-        time.sleep(0.1)
 
 
 def settled(tab) -> np.ndarray:
@@ -99,12 +90,12 @@ def settled(tab) -> np.ndarray:
         shots.append(pixels(tab))
         return shots[-1].mean() < 200 and abs(shots[-1] - shots[-2]).max() < 2
 
-    until(still, "the picture does not come to rest")
+    assert waited_for(still), "the picture does not come to rest"
     return shots[-1]
 
 
 def changed(tab, before: np.ndarray) -> np.ndarray:
-    until(lambda: abs(pixels(tab) - before).max() > 20, "the picture stays the same")
+    assert waited_for(lambda: abs(pixels(tab) - before).max() > 20), "the picture stays the same"
     return settled(tab)
 
 
@@ -175,7 +166,7 @@ def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium,
     for _, color in BALLS.values():
         assert place(shrunk(seen, 3), color) == pytest.approx(place(expected, color), abs=1.5)
     phone.get_by_text("completesplat", exact=True).click()
-    button.wait_for(timeout=1000 * SECONDS)
+    button.wait_for(timeout=1000 * LIMIT)
     assert phone.errors == []
     phone.close()
 
@@ -185,7 +176,7 @@ def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
     second.gaussians.colors[:] = torch.tensor(BALLS["yellow"][1])
     before = settled(tab)
     page.show([first, second])
-    tab.get_by_alt_text("sample 2", exact=True).click(timeout=1000 * SECONDS)
+    tab.get_by_alt_text("sample 2", exact=True).click(timeout=1000 * LIMIT)
     one = changed(tab, before)
     assert page.stage.chosen == 1
     assert not (abs(one - 255 * np.array(BALLS["red"][1])).max(-1) < 40).any()
@@ -205,7 +196,7 @@ def test_too_large_a_file_is_refused_and_the_page_says_so(tab, page, tmp_path):
         tab.get_by_role("button", name="Load a picture").click()
     chooser.value.set_files(file)
     told = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
-    told.wait_for(state="attached", timeout=1000 * SECONDS)
+    told.wait_for(state="attached", timeout=1000 * LIMIT)
     assert page.server.gui._current_file_upload_states == {}
 
 
@@ -220,7 +211,7 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     with tab.expect_file_chooser() as chooser:
         tab.get_by_role("button", name="Load a picture").click()
     chooser.value.set_files(file)
-    tab.get_by_text("1 drawn in").wait_for(timeout=1000 * SECONDS)
+    tab.get_by_text("1 drawn in").wait_for(timeout=1000 * LIMIT)
     first = changed(tab, turned)
     assert page.stage.samples[0].settings["image"] == "photo.png"
     assert client.camera.position == pytest.approx(np.zeros(3), abs=0.02)  # it comes back to the front
@@ -228,7 +219,7 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     seed = tab.locator(".mantine-NumberInput-input").nth(4)  # behind the fifth slider
     seed.fill("9")
     seed.press("Enter")
-    until(lambda: page.stage.samples[0].settings.get("seed") == 9, "no new sample")
+    assert waited_for(lambda: page.stage.samples[0].settings.get("seed") == 9), "no new sample"
     changed(tab, first)
 
 
@@ -239,7 +230,7 @@ def test_a_browser_needs_the_whole_address_once(chromium, page):
             tab = context.new_page()
             assert tab.goto(address).status == status
         # What the page shows comes through its websocket.
-        tab.get_by_role("button", name="Load a picture").wait_for(timeout=1000 * SECONDS)
+        tab.get_by_role("button", name="Load a picture").wait_for(timeout=1000 * LIMIT)
 
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):
@@ -271,7 +262,7 @@ def space(tiny_weights):
     else:
         pytest.fail("".join(said))
     process.terminate()
-    process.wait(timeout=SECONDS)
+    process.wait(timeout=LIMIT)
 
 
 @pytest.mark.skipif(find_spec("gradio") is None, reason='gradio is not installed (pip install "completesplat[space]")')
@@ -279,7 +270,7 @@ def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium,
     file = tmp_path / "photo.png"
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)).save(file)
     tab = chromium.new_page(viewport={"width": 500, "height": 600})
-    tab.set_default_timeout(1000 * SECONDS)
+    tab.set_default_timeout(1000 * LIMIT)
     tab.goto(space)
     tab.locator("input[type=file]").first.set_input_files(file)
     tab.get_by_role("button", name="Complete").click()
@@ -287,7 +278,7 @@ def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium,
     frame.wait_for()
     assert tab.locator("iframe").count() == 2
     frame.content_frame.locator("canvas").first.wait_for()
-    until(lambda: drawn(frame), "no scene in the frame")
+    assert waited_for(lambda: drawn(frame)), "no scene in the frame"
     links = tab.eval_on_selector_all("a", "links => links.map(link => link.href)")
     assert {"sample_00.ply", "sample_01.html", "scene.json"} <= {link.rpartition("/")[2] for link in links}
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import tiny_generator
+from support import LIMIT, tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
@@ -31,7 +31,6 @@ from completesplat.viewer.stage import Stage  # noqa: E402
 
 SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
 START = SETTINGS | {"remove_background": False}
-SECONDS = 30
 
 
 class Browser(viser.ClientHandle):
@@ -61,7 +60,8 @@ def server():
 
 
 @pytest.fixture
-def page(server, tmp_path):
+def page(server, tmp_path, monkeypatch):
+    monkeypatch.setattr(page_module, "THUMBNAIL", 8)  # of 96 pixels they take most of the time
     server.scene.reset()
     server.gui.reset()
     stage = Stage(server, (0.0, -1.0, 0.0))
@@ -83,7 +83,7 @@ def press(button, browser: Browser) -> None:
 
 def finish(completion: Completion) -> list:
     """What is shown when nothing is left to do."""
-    assert completion.page.worker.wait(SECONDS)
+    assert completion.page.worker.wait(LIMIT)
     return completion.page.stage.samples
 
 
@@ -120,7 +120,7 @@ def test_layers_of_samples_are_switched_and_samples_picked_and_put_where_they_we
 
 def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
     page.show([balls_sample()] * 3)
-    assert page.worker.wait(SECONDS)
+    assert page.worker.wait(LIMIT)
     thumbnails = page.looking.thumbnails
     assert thumbnails.content.count("<img") == 3
     assert "key:'3'" in thumbnails.content
@@ -132,7 +132,7 @@ def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
     assert len({tuple(node.position) for node in nodes(page).values()}) == 3
     assert thumbnails.content != first  # none is marked
     page.show([balls_sample()])
-    assert page.worker.wait(SECONDS)
+    assert page.worker.wait(LIMIT)
     assert thumbnails.content == ""
 
 
@@ -221,9 +221,9 @@ def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
     entered, release = threading.Event(), threading.Event()
     forward = model.denoiser.forward
     upload(completion)
-    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(SECONDS), forward(*a))[-1])
+    monkeypatch.setattr(model.denoiser, "forward", lambda *a: (entered.set(), release.wait(LIMIT), forward(*a))[-1])
     press(completion.controls.draw, Browser())
-    assert entered.wait(SECONDS)
+    assert entered.wait(LIMIT)
     completion.page.looking.layers[0].value = False
     assert not nodes(completion.page)["/sample_0/layer_0"].visible
     assert completion.controls.progress.visible
@@ -257,7 +257,7 @@ def test_files_are_written_and_sent_to_who_asked(page, kind, count, name, tmp_pa
     page.looking.chosen.value = SIDE_BY_SIDE
     page.saving.kind.value = kind
     press(page.saving.save, browser)
-    assert page.worker.wait(SECONDS)
+    assert page.worker.wait(LIMIT)
     assert sorted(browser.files) == [name.format(i) for i in range(count)]
     for file, content in browser.files.items():
         assert (page.saver.folder / file).read_bytes() == content
@@ -268,7 +268,7 @@ def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(pag
     page.looking.chosen.value = "sample 2"
     for _ in range(2):
         press(page.saving.save, Browser())
-        assert page.worker.wait(SECONDS)
+        assert page.worker.wait(LIMIT)
     assert sorted(path.name for path in page.saver.folder.iterdir()) == ["sample_00.ply", "sample_01.ply"]
 
 
@@ -308,7 +308,7 @@ def test_without_nodejs_the_formats_that_need_it_are_refused(page, monkeypatch, 
     browser = Browser()
     page.saving.kind.value = "spz"
     press(page.saving.save, browser)
-    assert page.worker.wait(SECONDS)
+    assert page.worker.wait(LIMIT)
     assert "need Node.js" in browser.messages[0]
 
 

@@ -1,6 +1,7 @@
 import threading
 
 import pytest
+from support import LIMIT
 
 from completesplat.viewer.page import Worker
 
@@ -17,8 +18,8 @@ def worker():
 def blocked(worker: Worker) -> threading.Event:
     """Keep the worker busy until the event is set."""
     started, release = threading.Event(), threading.Event()
-    worker.submit("block", lambda: (started.set(), release.wait(5)))
-    assert started.wait(5)
+    worker.submit("block", lambda: (started.set(), release.wait(LIMIT)))
+    assert started.wait(LIMIT)
     return release
 
 
@@ -28,7 +29,7 @@ def test_of_waiting_jobs_of_a_kind_the_newest_is_done_in_another_thread(worker):
     for kind, name in (("draw", "first"), ("draw", "second"), ("draw", "third"), ("save", "saved")):
         worker.submit(kind, lambda name=name: done.update({name: threading.current_thread()}))
     release.set()
-    assert worker.wait(5)
+    assert worker.wait(LIMIT)
     assert set(done) == {"saved", "third"}
     assert done["saved"] is done["third"] is not threading.current_thread()
 
@@ -37,7 +38,7 @@ def test_an_error_is_reported_and_the_next_job_done(worker):
     done = []
     worker.submit("fail", lambda: 1 / 0)
     worker.submit("draw", lambda: done.append(True))
-    assert worker.wait(5)
+    assert worker.wait(LIMIT)
     assert [type(error) for error in worker.failures] == [ZeroDivisionError]
     assert done == [True]
 
@@ -48,5 +49,5 @@ def test_what_waits_is_forgotten_when_it_closes(worker):
     worker.submit("draw", lambda: done.append(True))
     worker.close()
     release.set()
-    assert worker.wait(5)
+    assert worker.wait(LIMIT)
     assert done == []

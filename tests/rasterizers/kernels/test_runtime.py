@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import torch
 from degenerate_gaussians import camera, healthy
+from support import LIMIT
 
 from completesplat.rasterizers.kernels import compilation, drawing
 from completesplat.rasterizers.kernels.drawing import parallel
 from completesplat.rasterizers.tiled import TiledRasterizer
-
-TIMEOUT = 120
 
 
 def image() -> torch.Tensor:
@@ -55,7 +54,7 @@ def test_a_forked_child_renders() -> None:
     process = context.Process(target=child, args=(sender,))
     process.start()
     try:
-        assert receiver.poll(TIMEOUT), "the child hangs"
+        assert receiver.poll(LIMIT), "the child hangs"
         assert np.array_equal(receiver.recv(), expected.numpy())
     finally:
         process.kill()
@@ -74,7 +73,7 @@ def test_a_second_process_compiles_nothing() -> None:
         "print([(sum(k.stats.cache_hits.values()), sum(k.stats.cache_misses.values())) for k in kernels])"
     )
     command = [sys.executable, "-c", code, str(Path(__file__).parents[2])]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT)
     assert result.stdout.strip() == "[(1, 0), (1, 0), (1, 0)]", result.stderr
 
 
