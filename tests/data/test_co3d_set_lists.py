@@ -29,7 +29,7 @@ def test_few_views_of_sequences_never_seen_are_the_default_and_a_split_by_seed_m
     write_tree(tmp_path / "none", COUNTS, None)
     with pytest.raises(DataError, match=r"data\.subset=null"):
         module(tmp_path / "none").setup("fit")
-    by_seed = module(tmp_path / "none", subset=None)
+    by_seed = module(tmp_path / "none", subset=None, batch_size=2, targets=1)
     by_seed.setup("fit")
     assert by_seed.describe()["subset"] is None
     assert "seed 0" in by_seed.describe()["split"]

@@ -88,7 +88,7 @@ def test_an_evaluation_index_means_frames_also_where_some_were_left_out(tours, t
 
 
 def test_only_settings_that_change_nothing_of_what_was_prepared_are_free(packed_objects):
-    for name, value in (("image_size", 8), ("subset", None), ("split_seed", 1)):
+    for name, value in (("image_size", 99), ("subset", None), ("split_seed", 1)):
         with pytest.raises(DataError, match=name):
             objects(packed_objects, **{name: value}).setup("fit")
     data = objects(packed_objects, targets=1, seed=3, mask_threshold=0.5, evaluation_targets=1)

@@ -10,8 +10,7 @@ from lightning import Trainer
 from lightning.pytorch.demos.boring_classes import BoringModel
 from support import compose_config
 
-from completesplat.errors import CompleteSplatError
-from completesplat.training.checkpoints import CheckpointFiles, Checkpoints
+from completesplat.training.checkpoints import CheckpointFiles
 
 
 def test_a_file_is_written_whole_or_not_at_all_and_not_into_memory_first(tmp_path, monkeypatch):
@@ -114,9 +113,3 @@ def test_a_run_killed_between_any_two_changes_of_files_has_a_whole_last_checkpoi
     with pytest.raises(Killed):
         train(tmp_path, steps=9, every_n_train_steps=1, keep_every=2)
     assert step_of(tmp_path / "checkpoints/last.ckpt") in range(1, 9)
-
-
-def test_intervals_that_mean_nothing_are_refused(tmp_path):
-    for setting in ("every_n_train_steps", "keep_every"):
-        with pytest.raises(CompleteSplatError, match=f"callbacks.checkpoint.{setting}=0: must be at least 1"):
-            Checkpoints(str(tmp_path), **{setting: 0})
