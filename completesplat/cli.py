@@ -12,7 +12,7 @@ VERBS = {
     "view": "a page in the browser: look at scenes, draw new ones from a photograph (view PATH)",
     "report": "tables beside the paper's (report runs=DIR), a page with all (report html), samplers, ... (report NAME)",
     "new": "start a part of your own in this folder: loss, rasterizer, dataset, ablation or experiment (new loss NAME)",
-    "bench": "time what takes time (bench rasterizers, bench data, bench quality, bench startup, ...)",
+    "bench": "time what takes time (bench rasterizers, bench data, bench startup, ...)",
     "doctor": "what this machine has and lacks, and whether completing a photograph can work",
 }
 USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
