@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PLACES = {"CompleteSplat": "generation", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
+_PLACES |= {"compose": "commands", "instantiate": "commands.fit"}
+_PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
 
 
 def __getattr__(name: str) -> Any:

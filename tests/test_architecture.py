@@ -22,8 +22,8 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 LAYERS = """
     errors names options signals atomic schema ply_files weights tensors geometry gaussians splatter_image scene
     rasterizers
-    data autoreconstructor diffusion losses metrics baselines parts scene_model published generation export training
-    viewer results studies commands cli
+    opening data autoreconstructor diffusion losses metrics baselines parts scene_model published generation export
+    training viewer results studies commands cli
     benchmarks
 """
 FLOORS = LAYERS.split()

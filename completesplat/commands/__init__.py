@@ -91,6 +91,23 @@ def launch(verb: str, arguments: list[str]) -> None:
         raise failures[0]
 
 
+def compose(verb: str, *overrides: str) -> Any:
+    """Return the config of a verb, as `completesplat VERB OVERRIDES...` composes it: `compose("fit", "trainer=ddp")`.
+
+    Raises:
+        CompleteSplatError: an override cannot be read, or names no option.
+    """
+    arguments = for_hydra(verb, overrides)
+    try:
+        config = jobs.composed(verb, *arguments)
+    except (HydraException, ValueError) as error:
+        if (clearer := misspelt(error, verb, arguments, jobs.composed)) is None:
+            raise
+        raise clearer from error
+    OmegaConf.set_struct(config, False)
+    return config
+
+
 def best_precision() -> str:
     """Lightning's precision for networks: bfloat16 where the processor computes in it, else float32."""
     import torch

@@ -20,7 +20,7 @@ from completesplat.data.hidden_modes import hidden_modes
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_modes, log_scores, log_shown
+from completesplat.results.wandb import begin, log_modes, log_shown
 from completesplat.schema import Natural, Positive, Range
 from completesplat.training.loggers import finished
 from completesplat.training.stopping import stopped_together
@@ -99,7 +99,6 @@ def run(
         if not testing.is_global_zero:
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
-        log_scores(results, testing)
         write_json(out / METRICS, {"protocol": described} | results)
         log_shown(results, shown, testing, out)
     show(evaluation_table(results))

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import instantiate
+from hydra.utils import instantiate as build
 from lightning import seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import OmegaConf
@@ -17,12 +17,13 @@ from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
-from completesplat.commands.settings import check_image_size, check_optimizer
+from completesplat.commands.settings import check_image_size, check_optimizer, check_verb
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.generation import OneAnswer
+from completesplat.opening import without_training
 from completesplat.results.tables import Table, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_scores, log_shown
+from completesplat.results.wandb import begin, log_shown
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import finished
@@ -58,24 +59,40 @@ def parameter_table(module: nn.Module) -> Table:
     return table("Model", COLUMNS, rows)
 
 
+def instantiate(config: Any) -> tuple[Any, Any]:
+    """Return the LightningDataModule and the LightningModule of a config that `completesplat.compose` returned.
+
+    They are what `completesplat fit` trains. Checkpoints of the model hold its config, which `load_from_checkpoint`
+    reads.
+
+    Raises:
+        CompleteSplatError: a setting is missing, or does not fit.
+        WeightsError: weights to start from cannot be used.
+    """
+    refuse_missing(config)
+    check_verb("fit", config)
+    check_image_size(config)
+    check_optimizer(config.optimizer)
+    data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")
+    check_published_size(module, config)
+    if config.test:
+        set_scoring(module, config.evaluation)
+    model: Any = OmegaConf.create({"model": OmegaConf.to_container(config.model, resolve=True)})
+    module.config = OmegaConf.to_container(without_training(model))
+    return data, module
+
+
 @stopped_together()
 def run(config: Any, out: Path) -> None:
     """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
-    refuse_missing(config)
-    check_image_size(config)
-    check_optimizer(config.optimizer)
     seed_everything(config.seed, verbose=False)
-    data = instantiate(config.data, _convert_="all")
+    data, module = instantiate(config)
     # What cannot be scored is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
-    module = instantiate(config.model, _convert_="all")
-    check_published_size(module, config)
-    if tested is not None:
-        set_scoring(module, config.evaluation)
     callbacks, loggers = _parts(config.callbacks), _parts(config.logger)
-    trainer = instantiate(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
+    trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
         show(parameter_table(module))
@@ -99,7 +116,6 @@ def run(config: Any, out: Path) -> None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
-            log_scores(scores, trainer)
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
         if scores is not None:
             log_shown(scores, shown, trainer, out)
@@ -107,7 +123,7 @@ def run(config: Any, out: Path) -> None:
 
 def _parts(config: Any) -> list[Any]:
     """Callbacks or loggers: those that are not null."""
-    return [part for part in instantiate(config, _convert_="all").values() if part is not None]
+    return [part for part in build(config, _convert_="all").values() if part is not None]
 
 
 def checkpoint_to_continue(config: Any, out: Path) -> str | None:
@@ -184,9 +200,9 @@ def _epochs(trainer: Any) -> int:
 
 def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
     """Score as `completesplat test` does, in the protocol's precision; everything that was logged."""
-    progress = instantiate(config.callbacks.progress, _convert_="all")
+    progress = build(config.callbacks.progress, _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
-    trainer = instantiate(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
+    trainer = build(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 

@@ -73,7 +73,7 @@ def protocol(
         **({} if data.background is None else {"background": data.background}),
         "precision": evaluation["precision"],
         "scenes_listed": data.source("test").listed,
-        **{"scenes": model["scenes"], "skipped": scored.skipped, "views": model["views"]},
+        **{"scenes": model["scenes"], "skipped": len(scored.skipped), "views": model["views"]},
         **{"samples": scored.samples, "criterion": scored.criterion, "seed": scored.seed},
         **({"best": BEST_RULES} if scored.samples > 1 else {}),
         **drawing(module),

@@ -1,15 +1,11 @@
 """Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
 
-import os
-import re
-import sysconfig
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -17,28 +13,13 @@ from yaml import YAMLError
 from completesplat.commands.protocol import checkpoint_facts
 from completesplat.commands.settings import check_image_size, check_optimizer, check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.options import conf_folder
+from completesplat.opening import OF_A_RUN, read_run_config, without_training
 from completesplat.parts import read_architecture
-from completesplat.schema import check_value, shown
-from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
+from completesplat.schema import check_value
+from completesplat.weights import WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
 from completesplat.weights.splatter_image import find, is_published
 
-# What training needed of weights from elsewhere, before its first step and for its loss.
-ONLY_FOR_TRAINING = (
-    "model.autoreconstructor_checkpoint",
-    "model.checkpoint",
-    "model.model.pretrained",
-    "model.completesplat.autoreconstructor.pretrained",
-    "model.completesplat.conditioning.pretrained",
-    "model.loss.terms.lpips",
-)
-# What a run is read for, and the groups of `conf/` that these are composed of.
-OF_A_RUN = ["model", "data"]
-GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
-GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
-TARGET = re.compile(r"_target_: *([\w.]+)")
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
-OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 
 
 @dataclass(frozen=True)
@@ -201,9 +182,7 @@ def diffusion_of(module: Any) -> Any:
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
     """Return model and data of the configuration saved beside a checkpoint's folder, with changes that `fit` takes.
 
-    The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
-    run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
-    user's own, too, such as those in the working folder; the changes may name anything.
+    The file may come from anyone (`check_names` of `completesplat.opening`); the changes may name anything.
 
     Raises:
         WeightsError: one of both is missing or not readable, or the configuration names something else.
@@ -214,17 +193,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
         raise WeightsError(f"{checkpoint}: no such checkpoint")
     if not path.is_file():
         raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    config = _changed(_read_config(path, trust), overrides)
-    # The weights come from this checkpoint.
-    for key in ONLY_FOR_TRAINING:
-        parent, _, name = key.rpartition(".")
-        if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
-            OmegaConf.update(config, key, None)
-    # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
-    for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
-        if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
-            OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
-    return config
+    return without_training(_changed(read_run_config(path, trust), overrides))
 
 
 def _changed(config: Any, overrides: list[str]) -> Any:
@@ -243,74 +212,3 @@ def _changed(config: Any, overrides: list[str]) -> Any:
         check_image_size(changed)
         check_optimizer(changed.model.get("optimizer"))
     return changed
-
-
-def _read_config(path: Path, trust: bool) -> Any:
-    try:
-        written: Any = OmegaConf.create(read_small(path))
-        config = OmegaConf.masked_copy(written, OF_A_RUN)
-    except Exception as error:  # of YAML and of OmegaConf
-        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
-    if any(config.get(part) is None for part in OF_A_RUN):
-        raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(OF_A_RUN)}")
-    files = [file for group in GROUPS for file in (conf_folder() / group).glob("*.yaml")]
-    known = {name for file in files for name in TARGET.findall(file.read_text())}
-    for name, value in _strings(OmegaConf.to_container(config, resolve=False)):
-        # `fit` writes what it has resolved; a resolver can read the environment and more.
-        if "${" in value:
-            raise WeightsError(f"{path}: {shown(value)} refers to something else, which a run's configuration does not")
-        if name != "_target_" or value in known or OPTIMIZER.fullmatch(value):
-            continue
-        said = f"{path} names {shown(value)}, which is no part of models or data in this package"
-        if not trust and not _belongs_to_user(path):
-            raise WeightsError(f"{said}; if it is a module of your own, and you trust who made the run: trust=true")
-        if not _is_own(value):
-            raise WeightsError(f"{said}, and not defined in a module of your own (SECURITY.md)")
-    return config
-
-
-def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
-    """All keys and values, as text, with the name of the setting that they are of."""
-    if isinstance(config, Mapping):
-        for key, value in config.items():
-            yield name, str(key)
-            yield from _strings(value, key)
-    elif isinstance(config, list):
-        for value in config:
-            yield from _strings(value, name)
-    else:
-        yield name, str(config)
-
-
-def _belongs_to_user(config: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
-
-    In the run's own folder, modules that came with it would count as the user's.
-    """
-    run = config.resolve().parent
-    return Path.cwd() in run.parents and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
-
-
-def _is_own(target: str) -> bool:
-    """Whether something is defined in a module that is neither this package's nor of Python's installation."""
-    top = target.partition(".")[0]
-    try:
-        spec = find_spec(top)  # of a name without a dot: nothing is imported
-    except (ImportError, ValueError):
-        return False
-    if spec is None or top == "completesplat":
-        return False
-    places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
-    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
-        return False
-    try:
-        found = get_object(target)
-    except (ImportError, ValueError) as error:
-        raise WeightsError(f"{target}: cannot be imported ({error})") from error
-    # A module of the user's own leads to others, by the names that it imports.
-    return str(getattr(found, "__module__", None)).partition(".")[0] == top
-
-
-def _is_installed(path: Path) -> bool:
-    libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)

@@ -77,7 +77,7 @@ class Evaluation:
         self.scores: dict[str, dict[str, Scores]] = defaultdict(dict)
         self.views: dict[str, int] = {}
         self.drawn: dict[str, dict[str, Any]] = {}
-        self.skipped = 0  # scenes that could not be read
+        self.skipped: set[str] = set()  # names of scenes that could not be read
 
     def scene_seed(self, name: str) -> int:
         """What is drawn for a scene: the same whichever scenes come before it."""
@@ -164,7 +164,7 @@ class Evaluation:
             self.views |= views
             self.drawn |= drawn
             self.sets.merge(sets)
-            self.skipped += skipped
+            self.skipped |= skipped
 
     def results(self) -> dict[str, Any]:
         """{predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": novel views in all}}."""

@@ -109,14 +109,6 @@ def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> Scen
     return table
 
 
-def log_scores(results: dict[str, Any], trainer: Trainer) -> None:
-    """Log `test/PREDICTOR/REGION_VIEW_METRIC` of `SceneModule.test_results`."""
-    numbers = {f"test/{row}/{name}": x for row, scores in results.items() for name, x in by_name(scores).items()}
-    for logger in trainer.loggers:
-        logger.log_metrics(numbers, step=trainer.global_step)
-        logger.save()
-
-
 def log_shown(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
     """For W&B, tables, pictures and videos of a test.
 

@@ -76,7 +76,7 @@ class Preoptimized(PerScene):
     def __init__(self, parameterization: Parameterization, **fitting_and_rendering: Any) -> None:
         super().__init__(**fitting_and_rendering)
         self.parameterization = parameterization
-        self._empty, self._projected = 0.0, 0
+        self._empty: dict[str, float] = {}
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
         """Fit each scene, and keep what its reference view's Splatter Image has room for."""
@@ -86,8 +86,7 @@ class Preoptimized(PerScene):
         """Each scene's fitted Gaussians in the pixels of its reference view."""
         gaussians, cameras = self.fitted(scenes, seed), scenes.reference.cameras
         image, empty = project_to_splatter_image(gaussians, cameras, scenes.depth_range, self.parameterization)
-        self._empty += empty.float().mean(dim=(1, 2)).sum().item()
-        self._projected += len(empty)
+        self._empty |= dict(zip(scenes.names, empty.float().mean(dim=(1, 2)).tolist(), strict=True))
         return image
 
     def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
@@ -96,11 +95,11 @@ class Preoptimized(PerScene):
 
     def on_test_start(self) -> None:
         super().on_test_start()
-        self._empty, self._projected = 0.0, 0
+        self._empty = {}
 
     def test_results(self) -> dict[str, Any]:
-        """Those of `SceneModule`, and `empty_pixels`, of all processes, of which some may have had no scene."""
+        """Return those of `SceneModule`, and `empty_pixels`, the mean over the scenes of all processes."""
         results = super().test_results()
-        empty, projected = zip(*gathered((self._empty, self._projected)), strict=True)
-        results["model"]["empty_pixels"] = sum(empty) / max(sum(projected), 1)
+        empty = {name: share for shares in gathered(self._empty) for name, share in shares.items()}
+        results["model"]["empty_pixels"] = sum(empty.values()) / max(len(empty), 1)
         return results

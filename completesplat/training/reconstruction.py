@@ -70,7 +70,8 @@ class ReconstructionModule(SceneModule):
         self.camera = {name: torch.tensor(value).tolist() for name, value in measured.items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """With the training set's typical camera."""
+        """Add the training set's typical camera."""
+        super().on_save_checkpoint(checkpoint)
         checkpoint[CAMERA] = self.camera
 
     @property

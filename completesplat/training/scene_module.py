@@ -4,28 +4,35 @@ import statistics
 import time
 from abc import abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
+from hydra.utils import instantiate
 from jaxtyping import Float
 from lightning import LightningModule
 from lightning.pytorch.plugins import Precision
 from lightning.pytorch.utilities.enums import GradClipAlgorithmType
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from completesplat.data.loading.distributed import gathered, mean_of_processes
+from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import psnr
-from completesplat.metrics.scoring import Evaluation
+from completesplat.metrics.scoring import MODEL, REGIONS, Evaluation
+from completesplat.opening import check_names, without_training
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 from completesplat.schema import Share
+from completesplat.weights.checkpoint_reading import load_part, read_checkpoint
 
 Result = TypeVar("Result")
 Renders = Float[Tensor, "batch view 3 height width"]
@@ -130,6 +137,7 @@ class SceneModule(LightningModule):
         self.evaluation = Evaluation()
         self.timings = Timings()
         self.on_scene_scored: Callable[[ScoredScene], None] | None = None
+        self.config: Mapping[str, Any] | None = None
         # Lightning's name: of several processes that test, some may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
 
@@ -140,6 +148,39 @@ class SceneModule(LightningModule):
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
         """`samples` sets of Gaussians for each reference image and its seed, next to each other: [batch * samples]."""
         return self.reconstruct(scenes, seeds[0])
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, map_location: Any = None, trust: bool = False
+    ) -> Any:
+        """Build the model of a checkpoint from the config in it (`hyper_parameters`), with its weights.
+
+        Args:
+            trust: the checkpoint names modules of your own, and you trust who made it; not needed below the working
+                folder.
+
+        Raises:
+            WeightsError: the checkpoint is missing, damaged, without a config, names what `check_names` refuses, or is
+                of another class.
+        """
+        path = Path(checkpoint_path)
+        config = read_checkpoint(path).get("hyper_parameters")
+        if not isinstance(config, dict) or not isinstance(config.get("model"), dict):
+            raise WeightsError(
+                f"{path}: holds no config; train with `fit`, or with what completesplat.instantiate gives"
+            )
+        check_names(config, path, path.resolve().parent.parent, trust)
+        module = instantiate(without_training(OmegaConf.create(config)).model, _convert_="all")
+        if not isinstance(module, cls):
+            raise WeightsError(f"{path}: holds a {type(module).__name__}, which is no {cls.__name__}")
+        load_part(module, path, prefix="")
+        module.config = config
+        return module if map_location is None else module.to(map_location)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the config, which `load_from_checkpoint` reads."""
+        if self.config is not None:
+            checkpoint["hyper_parameters"] = dict(self.config)
 
     @property
     def method(self) -> str:
@@ -204,19 +245,32 @@ class SceneModule(LightningModule):
         if self.on_scene_scored is not None:
             self.on_scene_scored(scene)
 
-    def on_test_end(self) -> None:
+    def on_test_epoch_end(self) -> None:
+        """Log every score: the model's as `test/REGION/VIEW/METRIC`, a predictor's as `test/PREDICTOR/REGION/...`.
+
+        All processes know the scores of all, and log the same.
+        """
         loader: Any = self.trainer.test_dataloaders
-        self.evaluation.skipped = len(loader.refused)
+        self.evaluation.skipped = {str(error.sequence) for error in loader.refused}
         if loader.refused_depths:
             self.evaluation.missing["depth"] = f"missing: {loader.refused_depths[-1]}"
-
-    def test_results(self) -> dict[str, Any]:
-        """`Evaluation.results` of all processes, each of which must call it, with the model's seconds for a scene."""
         self.evaluation.gather()
         self.timings.gather()
+        for predictor, scores in self.test_results().items():
+            place = "test" if predictor == MODEL else f"test/{predictor}"
+            for region, view in product(REGIONS, ("novel", "reference")):
+                values = scores.get(region, {}).get(view, {})
+                self.log_dict({f"{place}/{region}/{view}/{name}": x for name, x in values.items() if x is not None})
+
+    def test_results(self) -> dict[str, Any]:
+        """Return `Evaluation.results` of the last test, with the model's seconds for a scene."""
         results = self.evaluation.results()
         results["model"] |= {"upper_bound": self.upper_bound, "seconds": self.timings.results()}
         return results
+
+    def predict_step(self, scenes: SceneBatch, index: int) -> Gaussians:
+        """Return one set of Gaussians for each reference image, in its camera's frame."""
+        return self.reconstruct(scenes, seed=index)
 
     def configure_gradient_clipping(
         self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None

@@ -18,8 +18,7 @@ from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
-from completesplat.viewer.access import GuardedServer, stop_server
-from completesplat.viewer.head import with_head
+from completesplat.viewer.access import GuardedServer, stop_server, with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Picture, add_looking, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample
 from completesplat.viewer.stage import Stage

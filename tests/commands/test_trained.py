@@ -11,8 +11,9 @@ from support import compose_config
 
 from completesplat.commands import conf_folder
 from completesplat.commands.jobs import use_working_folder
-from completesplat.commands.trained import GROUPS, config_of_run
+from completesplat.commands.trained import config_of_run
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.opening import GROUPS
 
 MINE = """
 import json

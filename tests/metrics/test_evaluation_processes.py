@@ -17,7 +17,7 @@ COUNTS = (1, 2, 5)
 BATCH = 2
 
 
-def scored(count: int, skipped: int) -> dict[str, Any]:
+def scored(count: int, skipped: set[str]) -> dict[str, Any]:
     """Results of so many scenes, of which this process scores its share."""
     store = SceneStore.__new__(SceneStore)  # of names alone: nothing is read
     store.names = [f"scene {index}" for index in range(count)]
@@ -30,19 +30,21 @@ def scored(count: int, skipped: int) -> dict[str, Any]:
         evaluation.update_samples(name, images, Views(true, cameras, masks))
     evaluation.skipped = skipped
     evaluation.gather()
-    return evaluation.results() | {"skipped": evaluation.skipped}
+    return evaluation.results() | {"skipped": sorted(evaluation.skipped)}
 
 
 def one_of_two(rank: int, folder: str) -> None:
     torch.set_num_threads(1)
     distributed.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
-    (Path(folder) / f"{rank}.json").write_text(json.dumps([scored(count, skipped=1) for count in COUNTS]))
+    (Path(folder) / f"{rank}.json").write_text(
+        json.dumps([scored(count, {"unreadable", f"unreadable {rank}"}) for count in COUNTS])
+    )
     distributed.destroy_process_group()
 
 
 def test_two_processes_tell_what_one_tells_for_any_number_of_scenes(tmp_path):
     multiprocessing.spawn(one_of_two, (str(tmp_path),), nprocs=2)
-    alone = json.loads(json.dumps([scored(count, skipped=2) for count in COUNTS]))
+    alone = json.loads(json.dumps([scored(count, {"unreadable", "unreadable 0", "unreadable 1"}) for count in COUNTS]))
     for rank in (0, 1):
         assert json.loads((tmp_path / f"{rank}.json").read_text()) == alone
     assert [results["model"]["scenes"] for results in alone] == list(COUNTS)

@@ -30,7 +30,7 @@ from completesplat.schema import Natural, OneOf, Positive, Range, Share, Side, c
 
 MOST_WORKERS = 4  # by default
 WORKERS_OF_A_CORE = 4  # at most
-SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",)}
+SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 logger = logging.getLogger(__name__)
 
@@ -246,6 +246,8 @@ class SceneDataModule(LightningDataModule):
     def test_dataloader(self) -> SceneLoader:
         """The same views of all test sequences each time."""
         return self._evaluation_loader("test")
+
+    predict_dataloader = test_dataloader
 
     def _evaluation_loader(self, split: str) -> SceneLoader:
         seen = None if self.at_model_size is None else self.at_model_size.store(split)

@@ -181,11 +181,14 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(self.names)
 
     def share(self, batch_size: int) -> "EvaluationScenes":
-        """What this process of several evaluates: whole batches, so that each is made up as in one process alone."""
+        """Return what this process evaluates: whole batches, made up as in one process alone.
+
+        A process for which none is left evaluates the first scene again, because all must take part in what follows.
+        """
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
         own = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, own, self.seen, self.depths)
+        return EvaluationScenes(self.store, self.choose, own or self.names[:1], self.seen, self.depths)
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]

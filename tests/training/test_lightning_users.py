@@ -1,0 +1,116 @@
+"""Lightning's own trainer, checkpoints, callbacks and loggers, without our commands."""
+
+import json
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from support import SMALL
+
+import completesplat
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.gaussians import Gaussians
+from completesplat.weights.checkpoint_reading import read_checkpoint
+
+README = Path(__file__).parents[2] / "README.md"
+QUIET = {"enable_progress_bar": False, "logger": False, "accelerator": "cpu"}
+CLASSES = {"var": completesplat.ReconstructionModule, "diffusion": completesplat.LatentDiffusion}
+
+
+def opened(toy_root: Path, *settings: str):
+    small = [setting for setting in SMALL if not setting.startswith(("trainer", "callbacks"))]
+    config = completesplat.compose("fit", "experiment=toy_var", f"data.root={toy_root}", *small, *settings)
+    return completesplat.instantiate(config)
+
+
+@pytest.mark.parametrize("stage", CLASSES)
+def test_a_checkpoint_of_fit_loads_and_scores_as_fit_scored_it(pipeline, stage):
+    run = getattr(pipeline, stage)
+    model = CLASSES[stage].load_from_checkpoint(run / "checkpoints/last.ckpt", trust=True)
+    weights = read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"]
+    assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
+    data, _ = opened(pipeline.toy)
+    (scores,) = lightning.Trainer(**QUIET).test(model, data, verbose=False)
+    of_fit = json.loads((run / "metrics.json").read_text())["test"]
+    for predictor, place in {"model": "test", "mean_image": "test/mean_image"}.items():
+        for region, view, metric in [("full", "novel", "psnr"), ("object", "reference", "ssim")]:
+            assert scores[f"{place}/{region}/{view}/{metric}"] == pytest.approx(of_fit[predictor][region][view][metric])
+
+
+def test_validation_and_prediction_are_lightnings_own(pipeline):
+    model = CLASSES["var"].load_from_checkpoint(pipeline.var / "checkpoints/last.ckpt")
+    data, _ = opened(pipeline.toy)
+    trainer = lightning.Trainer(**QUIET)
+    (scores,) = trainer.validate(model, data, verbose=False)
+    assert scores["val/psnr_novel"] > 0
+    scenes = trainer.predict(model, data)
+    assert all(isinstance(part, Gaussians) for part in scenes)
+    assert sum(len(part.means) for part in scenes) == len(data.store("test").names)
+
+
+def test_a_checkpoint_is_held_to_the_rules_of_a_run(pipeline, tmp_path):
+    path = pipeline.var / "checkpoints/last.ckpt"
+    with pytest.raises(WeightsError, match="holds a ReconstructionModule, which is no LatentDiffusion"):
+        completesplat.LatentDiffusion.load_from_checkpoint(path)
+    contents = torch.load(path, weights_only=True)
+    for target, match in [
+        ("os.system", "names os.system, which is no part"),
+        ("${oc.env:HOME}", "refers to something else"),
+    ]:
+        contents["hyper_parameters"]["model"]["loss"]["_target_"] = target
+        torch.save(contents, tmp_path / "other.ckpt")
+        with pytest.raises(WeightsError, match=match):
+            completesplat.ReconstructionModule.load_from_checkpoint(tmp_path / "other.ckpt")
+    del contents["hyper_parameters"]
+    torch.save(contents, tmp_path / "other.ckpt")
+    with pytest.raises(WeightsError, match="holds no config"):
+        completesplat.ReconstructionModule.load_from_checkpoint(tmp_path / "other.ckpt")
+
+
+def test_an_override_that_does_not_fit_is_refused_as_on_the_command_line(toy_root):
+    with pytest.raises(CompleteSplatError, match=r"no setting 'optimzer.lr' of completesplat fit"):
+        completesplat.compose("fit", "optimzer.lr=1")
+    with pytest.raises(CompleteSplatError, match=r"data\.image_size=50: must be"):
+        opened(toy_root, "data.image_size=50")
+    with pytest.raises(CompleteSplatError, match=r"model.checkpoint is needed"):
+        opened(toy_root, "experiment=toy_var_stage2")
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_run_as_they_stand(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    (lines,) = [block for block in blocks if "Trainer(" in block]
+    assert len([line for line in lines.splitlines() if line.strip()]) <= 10
+    assert command("data", "toy", "kind=objects", "scenes=20", "frames=8", "size=64", "out=DATA").status == 0
+    names: dict = {}
+    exec(lines, names)
+    assert names["scores"]["test/full/novel/psnr"] > 5
+    assert isinstance(names["model"], completesplat.ReconstructionModule)
+
+
+@pytest.mark.slow
+def test_callbacks_and_loggers_of_lightning_see_the_figures(toy_root, tmp_path):
+    from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+    data, model = opened(toy_root)
+    best = ModelCheckpoint(tmp_path / "best", "{step}", monitor="val/psnr_novel", mode="max", save_top_k=2)
+    # What must grow by 100 dB does not: it stops at the second validation after the first.
+    stop = EarlyStopping("val/psnr_novel", min_delta=100.0, patience=1, mode="max")
+    loggers = [CSVLogger(tmp_path, "csv")]
+    if find_spec("tensorboard") or find_spec("tensorboardX"):
+        loggers.append(TensorBoardLogger(tmp_path, "board"))
+    settings = {"max_steps": 50, "val_check_interval": 1, "limit_val_batches": 1, "enable_progress_bar": False}
+    trainer = lightning.Trainer(callbacks=[best, stop], logger=loggers, accelerator="cpu", **settings)
+    trainer.fit(model, data)
+    assert stop.stopped_epoch >= 0
+    assert trainer.global_step < 50
+    assert len(best.best_k_models) == 2
+    assert float(best.best_model_score) == pytest.approx(max(map(float, best.best_k_models.values())))
+    loaded = completesplat.ReconstructionModule.load_from_checkpoint(best.best_model_path)
+    assert trainer.test(loaded, data, verbose=False)[0]["test/full/novel/psnr"] > 0
+    assert "val/psnr_novel" in (tmp_path / "csv/version_0/metrics.csv").read_text()
