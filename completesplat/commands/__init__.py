@@ -41,7 +41,7 @@ UNHELPFUL_WARNINGS = (
 
 
 def launch(verb: str, arguments: list[str]) -> None:
-    """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
+    """Compose the verb's config (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
     `data toy` is short for `data data_task=toy`, `predict A B` for `predict image=[A,B]`, `view PATH` for
     `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
@@ -68,7 +68,6 @@ def launch(verb: str, arguments: list[str]) -> None:
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
     sys.argv = [f"completesplat {verb}", *arguments]
-
     failures: list[Exception] = []
 
     def job(config: Any) -> float | None:

@@ -33,10 +33,7 @@ def behind_dashes(arguments: Sequence[str]) -> list[str]:
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate Hydra's flags and their values from the other arguments.
-
-    Hydra takes flags before or behind the settings, not between them.
-    """
+    """Separate Hydra's flags and their values from the other arguments, because Hydra takes no flags between them."""
     flags, others, remaining = [], [], iter(arguments)
     for argument in remaining:
         name, equals, value = argument.partition("=")
@@ -107,9 +104,8 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     A value that is the name of an existing file or folder is taken literally, whatever it contains: `a,b.jpg`.
 
     Raises:
-        CompleteSplatError: a flag or `--export` lacks its value; there are more words than the verb takes, or file
-            names besides `image=`; a word is no setting, a value cannot be read, several values come without `-m`, or
-            `out=` is empty.
+        CompleteSplatError: a flag lacks its value, there are too many words, images are given by name and by `image=`,
+            a word is no setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
     """
     flags, others = split_flags(arguments)
     settings = [_with_file(argument) for argument in SHORT_FORMS.get(verb, list)(others)]

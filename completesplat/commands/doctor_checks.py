@@ -37,7 +37,7 @@ def check_rasterizers() -> Iterator[Finding]:
 
 @torch.no_grad()
 def wrong(rasterizer: Rasterizer) -> str | None:
-    """Render two round Gaussians, one behind the other on the optical axis; return the error in words, None if small.
+    """Render two round Gaussians, one behind the other on the optical axis; return what is wrong, None if nothing is.
 
     With focal length f, a Gaussian of scale s at depth z is a disc of variance (f s / z)^2 plus the blur, in px^2. Its
     alpha is its opacity at the center, and exp(-1 / (2 variance)) times that one pixel aside. The front one is

@@ -1,4 +1,4 @@
-"""Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
+"""Trained models: a run's checkpoint with its config, or a folder of weights; with data for evaluation."""
 
 import os
 import re
@@ -23,7 +23,7 @@ from completesplat.schema import check_value, shown
 from completesplat.weights import WEIGHTS_FILE, in_the_box, read_small, sha256_of, weights_folder
 from completesplat.weights.splatter_image import find, is_published
 
-# What training needed of weights from elsewhere, before its first step and for its loss.
+# Settings that name weights from elsewhere, which only training needs: before its first step and for its loss.
 ONLY_FOR_TRAINING = (
     "model.autoreconstructor_checkpoint",
     "model.checkpoint",
@@ -32,7 +32,7 @@ ONLY_FOR_TRAINING = (
     "model.completesplat.conditioning.pretrained",
     "model.loss.terms.lpips",
 )
-# What a run is read for, and the groups of `conf/` that these are composed of.
+# The parts of a run's config that are read, and the groups of `conf/` from which they are composed.
 OF_A_RUN = ["model", "data"]
 GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
 GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
@@ -45,8 +45,8 @@ OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
 class Trained:
     """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`. What the run
-    may name, and when it has to be trusted: `config_of_run`.
+    `conf/test.yaml` explains the arguments; the configs `data` and `rasterizer` are used with `weights` only.
+    `config_of_run` explains what a run's config may name, and when it needs `trust`.
     """
 
     ckpt: str | None
@@ -59,10 +59,10 @@ class Trained:
     seed: int = 0
 
     def configuration(self) -> Any:
-        """The configuration of model and data.
+        """Return the config of model and data.
 
         Raises:
-            WeightsError: the checkpoint, its run's configuration or the weights are missing or not trusted.
+            WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
             CompleteSplatError: neither is given, or both, or weights without data.
         """
         if (self.ckpt is None) == (self.weights is None):
@@ -76,16 +76,16 @@ class Trained:
         return self._config_of_weights(str(self.weights))
 
     def open(self) -> tuple[Any, Any]:
-        """The model and the data module, as `open_module` and with the errors of `configuration`."""
+        """Return the model and the data module; raise the errors of `configuration` and `open_module`."""
         configuration = self.configuration()
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
     def open_module(self, configuration: Any) -> Any:
-        """The model of the configuration, with its weights and the sampler that is to draw.
+        """Return the model of the config, with its weights and, if given, another sampler.
 
         Raises:
             WeightsError: the weights do not fit.
-            CompleteSplatError: a sampler for a model that draws nothing.
+            CompleteSplatError: a sampler is given for a model that draws no samples.
         """
         from completesplat.weights.checkpoint_reading import load_part
 
@@ -97,7 +97,7 @@ class Trained:
         return module
 
     def facts(self) -> dict[str, Any]:
-        """As `checkpoint_facts`; a folder of weights does not say how training ended."""
+        """Return `checkpoint_facts`; for a folder of weights, path and checksum but not how training ended."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
         weights = str(self.weights)
@@ -105,7 +105,7 @@ class Trained:
         return {"checkpoint": {"path": weights, "sha256": sha256_of(file), "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
-        """A stage's module around a model that is loaded; what it would be trained with does not matter."""
+        """Return the config of a stage's module around a loaded model; its loss and optimizer are never used."""
         published = is_published(weights)
         folder = weights if published else str(weights_folder(weights))
         architecture = {} if published else read_architecture(Path(folder))
@@ -118,27 +118,25 @@ class Trained:
             }
         else:
             loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": folder}
-            stage = {
-                "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
-                "completesplat": loaded,
-            }
+            stage = {"_target_": "completesplat.training.latent_diffusion.LatentDiffusion", "completesplat": loaded}
         model = {
             **stage,
             "rasterizer": self.rasterizer,
             "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
             "schedule": {"_target_": "completesplat.training.optimization.constant", "_partial_": True},
         }
-        found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
+        config = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
         if published:
-            return _as_published(found, weights)
-        found.data.image_size = architecture["image_size"]
-        return found
+            return _as_published(config, weights)
+        config.data.image_size = architecture["image_size"]
+        return config
 
 
 def _as_published(config: Any, weights: str) -> Any:
-    """Data as published weights know them, objects only on their background, and renders of such Gaussians.
+    """Adapt data and rasterizer to published weights, which know only objects on one background.
 
-    `CompleteSplatError`: weights that have to be told where objects are, and data that do not.
+    Raises:
+        CompleteSplatError: the weights need the distance of the object, and the data do not contain it.
     """
     known = find(weights).data
     config.model.rasterizer = {
@@ -155,20 +153,20 @@ def _as_published(config: Any, weights: str) -> Any:
 
 
 def network_of(weights: str) -> Any:
-    """The network of weights that give one answer."""
+    """Return the network of weights that give one scene for an image and draw no samples."""
     from completesplat.generation import CompleteSplat
 
     return CompleteSplat.from_pretrained(weights).reconstructing
 
 
 def open_generator(config: Any) -> Any:
-    """The model of `config.weights`, with `config.sampler` if given; what it cannot do is printed.
+    """Return the model of `config.weights`, with `config.sampler` if given, and print its limits.
 
-    Of one that draws nothing, `config.samples` becomes 1.
+    If the model draws no samples, `config.samples` is set to 1.
 
     Raises:
         WeightsError: as `from_pretrained`.
-        CompleteSplatError: a sampler for a model that draws nothing.
+        CompleteSplatError: a sampler is given for a model that draws no samples.
     """
     from completesplat.generation import CompleteSplat
     from completesplat.published import PublishedGenerator
@@ -190,7 +188,11 @@ def open_generator(config: Any) -> Any:
 
 
 def diffusion_of(module: Any) -> Any:
-    """The generator of a latent diffusion model; `CompleteSplatError` for another model."""
+    """Return the generator of a latent diffusion model.
+
+    Raises:
+        CompleteSplatError: the module is another model.
+    """
     from completesplat.training.latent_diffusion import LatentDiffusion
 
     if not isinstance(module, LatentDiffusion):
@@ -199,15 +201,15 @@ def diffusion_of(module: Any) -> Any:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
-    """Return model and data of the configuration saved beside a checkpoint's folder, with changes that `fit` takes.
+    """Return model and data of the config saved beside a checkpoint's folder, with changes that `fit` accepts.
 
-    The file may come from anyone. It names what `conf/` names for models and data, or an optimizer of torch. Where the
-    run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may name modules of the
-    user's own, too, such as those in the working folder; the changes may name anything.
+    The file may come from anyone, so it may name only what `conf/` names for models and data, or an optimizer of torch.
+    If the run is the user's (`trust`, or it lies below the working folder and belongs to the user), it may also name
+    the user's modules, such as those in the working folder. The changes may name anything.
 
     Raises:
-        WeightsError: one of both is missing or not readable, or the configuration names something else.
-        CompleteSplatError: the changes cannot be read, or `fit` refuses them, too.
+        WeightsError: the checkpoint or its config is missing or not readable, or the config names something else.
+        CompleteSplatError: the changes cannot be read, or `fit` would refuse them, too.
     """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():
@@ -220,7 +222,7 @@ def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -
         parent, _, name = key.rpartition(".")
         if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
             OmegaConf.update(config, key, None)
-    # The machine that trained it had to have a GPU; this one need not. Where it has one, both are the same.
+    # Training with `cuda` needed a GPU, and this machine may lack one. With a GPU, `auto` is the same as `cuda`.
     for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
         if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
             OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
@@ -249,28 +251,28 @@ def _read_config(path: Path, trust: bool) -> Any:
     try:
         written: Any = OmegaConf.create(read_small(path))
         config = OmegaConf.masked_copy(written, OF_A_RUN)
-    except Exception as error:  # of YAML and of OmegaConf
+    except Exception as error:  # raised by YAML or OmegaConf
         raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
     if any(config.get(part) is None for part in OF_A_RUN):
         raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(OF_A_RUN)}")
     files = [file for group in GROUPS for file in (conf_folder() / group).glob("*.yaml")]
     known = {name for file in files for name in TARGET.findall(file.read_text())}
     for name, value in _strings(OmegaConf.to_container(config, resolve=False)):
-        # `fit` writes what it has resolved; a resolver can read the environment and more.
+        # `fit` writes resolved values. A reference is refused, because a resolver can read the environment and more.
         if "${" in value:
             raise WeightsError(f"{path}: {shown(value)} refers to something else, which a run's configuration does not")
         if name != "_target_" or value in known or OPTIMIZER.fullmatch(value):
             continue
-        said = f"{path} names {shown(value)}, which is no part of models or data in this package"
+        message = f"{path} names {shown(value)}, which is no part of models or data in this package"
         if not trust and not _belongs_to_user(path):
-            raise WeightsError(f"{said}; if it is a module of your own, and you trust who made the run: trust=true")
+            raise WeightsError(f"{message}; if it is a module of your own, and you trust who made the run: trust=true")
         if not _is_own(value):
-            raise WeightsError(f"{said}, and not defined in a module of your own (SECURITY.md)")
+            raise WeightsError(f"{message}, and not defined in a module of your own (SECURITY.md)")
     return config
 
 
 def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
-    """All keys and values, as text, with the name of the setting that they are of."""
+    """Yield all keys and values as text, each after the name of the setting to which it belongs."""
     if isinstance(config, Mapping):
         for key, value in config.items():
             yield name, str(key)
@@ -283,19 +285,19 @@ def _strings(config: Any, name: Any = "") -> Iterator[tuple[Any, str]]:
 
 
 def _belongs_to_user(config: Path) -> bool:
-    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+    """Return whether a run belongs to the user and lies below the working folder, where the user then put it.
 
-    In the run's own folder, modules that came with it would count as the user's.
+    The working folder must not be the run's own, because modules that came with the run would count as the user's.
     """
     run = config.resolve().parent
     return Path.cwd() in run.parents and {run.stat().st_uid, config.stat().st_uid} == {os.getuid()}
 
 
 def _is_own(target: str) -> bool:
-    """Whether something is defined in a module that is neither this package's nor of Python's installation."""
+    """Return whether a target is defined in a module outside of this package and Python's installation."""
     top = target.partition(".")[0]
     try:
-        spec = find_spec(top)  # of a name without a dot: nothing is imported
+        spec = find_spec(top)  # imports nothing, because the name has no dot
     except (ImportError, ValueError):
         return False
     if spec is None or top == "completesplat":
@@ -304,11 +306,11 @@ def _is_own(target: str) -> bool:
     if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
         return False
     try:
-        found = get_object(target)
+        definition = get_object(target)
     except (ImportError, ValueError) as error:
         raise WeightsError(f"{target}: cannot be imported ({error})") from error
-    # A module of the user's own leads to others, by the names that it imports.
-    return str(getattr(found, "__module__", None)).partition(".")[0] == top
+    # A module of the user's may also hold names that it imports from elsewhere.
+    return str(getattr(definition, "__module__", None)).partition(".")[0] == top
 
 
 def _is_installed(path: Path) -> bool:
