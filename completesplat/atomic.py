@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, and what is said where the disk is full or a folder is gone."""
+"""Files and folders that are written whole or not at all, and the errors for a full disk or a missing folder."""
 
 import errno
 import os
@@ -15,21 +15,22 @@ NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
 BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
 PROBE_BYTES = 2**16
-BLOCK_BYTES = 512  # of `st_blocks`
+BLOCK_BYTES = 512  # unit of `st_blocks`
 
 
 @contextmanager
 def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an exception.
+    """Yield a temporary path beside `path` that replaces it when the block ends without an exception.
 
-    The folder is not made: one that was removed while a program runs does not come back without what was in it. After
-    an exception the old file is as it was and nothing is left beside it. A link at `path` is replaced, not followed.
+    The folder must exist, because a folder that is removed during a run must not come back without its other files.
+    After an exception the old file is unchanged and the temporary one removed. A link at `path` is not followed.
 
     Args:
-        name: of the temporary file; by default one of its own each time, with the suffix of `path`.
-        size: bytes that the file needs at least, where that is known beforehand.
+        name: name of the temporary file; by default a unique one with the suffix of `path`.
+        size: bytes that the file needs at least, if known beforehand.
 
-    `DiskError`: it cannot be written. Whatever the library says that wrote it, the disk itself is asked.
+    Raises:
+        DiskError: the file cannot be written. A test write finds the reason if the writing library hides it.
     """
     path = Path(path)
     temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
@@ -46,9 +47,12 @@ def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Ite
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder beside `folder`, which is not there, that becomes it when the block ends without an exception.
+    """Yield an empty folder that becomes the missing `folder` when the block ends without an exception.
 
-    After one nothing is left; nor is what a process left that was killed. `DiskError`: as `atomic_path`.
+    The unfinished folder is removed after an exception, and so is one that a killed process left behind.
+
+    Raises:
+        DiskError: as `atomic_path`.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = folder.with_name(f".{folder.name}.unfinished")
@@ -64,7 +68,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def writing(path: Path, size: int = 0) -> Iterator[None]:
-    """`DiskError` where the operating system refuses what the block writes to `path`: `size` bytes at least."""
+    """Raise DiskError if the operating system refuses what the block writes to `path`, `size` bytes at least."""
     try:
         yield
     except OSError as error:
@@ -74,18 +78,18 @@ def writing(path: Path, size: int = 0) -> Iterator[None]:
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole or not at all; `DiskError` as `atomic_path`."""
+    """Write a file whole or not at all, with the errors of `atomic_path`."""
     with atomic_path(path, size=len(content)) as temporary:
         temporary.write_bytes(content)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a file of text, in UTF-8, as `write_bytes` does."""
+    """Write a text file in UTF-8, as `write_bytes` does."""
     write_bytes(path, text.encode())
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, if it is missing, in one that is there.
+    """Make a folder, if it is missing, in an existing one.
 
     Raises:
         CompleteSplatError: the folder is a link, through which results would be written elsewhere.
@@ -98,10 +102,7 @@ def make_folder(folder: Path) -> None:
 
 
 def file_refusal(error: BaseException) -> CompleteSplatError | None:
-    """Return one line for an error of the operating system with a named file: no space, or a name that cannot be used.
-
-    None for any other error.
-    """
+    """Return the error to show for an OSError about a named file: no space, or an unusable name; None for others."""
     name = (error.filename2 or error.filename) if isinstance(error, OSError) else None
     if not isinstance(error, OSError) or not isinstance(name, str):
         return None
@@ -112,7 +113,7 @@ def file_refusal(error: BaseException) -> CompleteSplatError | None:
 
 @contextmanager
 def _asking_the_disk(path: Path, temporary: Path, size: int = 0) -> Iterator[None]:
-    """`DiskError` where `temporary`, a file or folder that is to become `path`, cannot be written."""
+    """Raise DiskError if `temporary`, a file or folder that is to become `path`, cannot be written."""
     try:
         yield
     except CompleteSplatError:
@@ -125,7 +126,7 @@ def _asking_the_disk(path: Path, temporary: Path, size: int = 0) -> Iterator[Non
 
 
 def _asked(path: Path) -> OSError | None:
-    """What the operating system says if more is written to a file or folder, which is no longer needed."""
+    """Write more to a file or folder, which is no longer needed, and return the operating system's error, if any."""
     try:
         with (path / "more" if path.is_dir() else path).open("ab") as file:
             file.write(bytes(PROBE_BYTES))
@@ -137,7 +138,7 @@ def _asked(path: Path) -> OSError | None:
 
 
 def _disk_error(error: OSError, path: Path, size: int = 0, temporary: Path | None = None) -> DiskError | None:
-    """The refusal to show; None for an error that is not of the disk. What `temporary` takes is going to be free."""
+    """Return the error to show, None if it is not the disk's; `temporary` will be removed, so its space is free."""
     from rich.filesize import decimal
 
     if not path.parent.is_dir():

@@ -1,4 +1,4 @@
-"""The `completesplat` command: picks the verb, reports refusals in one line."""
+"""The `completesplat` command, which starts a verb and reports refusals in one line."""
 
 import io
 import os
@@ -22,8 +22,8 @@ USAGE += "\n\ncompletesplat completion bash|zsh|fish prints what makes that shel
 
 
 def main() -> None:
-    """Entry point. Exit status 0 only when all of it worked, 2 for a refused input, 1 for other failures."""
-    # Paths may hold bytes that are no UTF-8. Standard error escapes them by itself.
+    """Run the command; exit with status 0 only if everything worked, 2 for a refused input, 1 for other failures."""
+    # Paths may hold bytes that are not UTF-8. Standard error escapes them by default.
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     arguments = sys.argv[1:]
@@ -46,8 +46,8 @@ def main() -> None:
 
         sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{meant(arguments[0], VERBS)}"))
 
-    # To be set before torch is loaded. By default its threads (GNU OpenMP's) wait for more work at full speed, for
-    # milliseconds, in which they keep the rasterizer's threads and other processes off the cores.
+    # This must be set before torch is loaded. By default its idle threads (GNU OpenMP's) spin for milliseconds and
+    # so keep the rasterizer's threads and other processes off the cores.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     from completesplat.commands import exit_status, launch, refusal
 
@@ -66,7 +66,7 @@ def main() -> None:
 
 
 def _complete(words: list[str], script: bool) -> None:
-    """Print what may complete the last word, or the script by which a shell asks for that."""
+    """Print completions of the last word, or the script with which a shell asks for them."""
     from completesplat.options import SCRIPTS, candidates
 
     if not script:

@@ -1,18 +1,18 @@
-"""The refusals that a person sees as one line, `error: ...`, with exit status 2, or 1 after work that failed."""
+"""Errors that the user sees as one line, `error: ...`, with exit status 2, or 1 after work that failed."""
 
 
 class CompleteSplatError(Exception):
-    """Something that the caller can put right: a bad input, a missing file, a wrong setting."""
+    """An error that the caller can put right: a bad input, a missing file, a wrong setting."""
 
     exit_status = 2
 
 
 class DataError(CompleteSplatError):
-    """Something of a data set that is missing, broken or not in the expected layout; its kinds: `data/validation.py`.
+    """A part of a data set that is missing, broken or not in the expected layout; subclasses: `data/validation.py`.
 
     Args:
         reason: what is wrong, without the place.
-        file, sequence, frame: the place: file or folder, name of the sequence, number of the frame in its data set.
+        file, sequence, frame: the place: file or folder, name of the sequence, number of the frame in the data set.
     """
 
     kind = "not as expected"
@@ -41,7 +41,7 @@ class PlyError(CompleteSplatError):
 
 
 class TensorFileError(CompleteSplatError):
-    """A file of `torch.save` that is damaged, or made to take more memory than it has bytes; the path is not named."""
+    """A `torch.save` file that is damaged or would take more memory than it has bytes; the message omits the path."""
 
 
 class WeightsError(CompleteSplatError):
@@ -49,12 +49,12 @@ class WeightsError(CompleteSplatError):
 
 
 class DivergenceError(CompleteSplatError):
-    """A training whose losses, gradients or weights are not finite any more."""
+    """A training run whose losses, gradients or weights are no longer finite."""
 
     exit_status = 1
 
 
 class DiskError(CompleteSplatError):
-    """A file that cannot be written: the disk is full, or the folder is not there any more."""
+    """A file that cannot be written, because the disk is full or the folder no longer exists."""
 
     exit_status = 1

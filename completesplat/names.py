@@ -1,4 +1,4 @@
-"""Names of files that anybody may have given: shown in one line, and made into names of our own."""
+"""File names from strangers: forms to print in one line, and safe names for files that the program writes."""
 
 import re
 import unicodedata
@@ -7,27 +7,22 @@ from collections.abc import Iterable
 LONGEST = 100  # bytes of UTF-8
 MOST_SHOWN = 500  # characters
 UNNAMED = "unnamed"
-# Control characters, breaks of lines, and the surrogates that stand for bytes that are no UTF-8.
+# Control characters, line breaks, and the surrogates that stand for bytes that are not UTF-8.
 UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 SEPARATORS = re.compile(r"[/\\]")
 
 
 def printable(text: str) -> str:
-    """The text in one line that can be printed and encoded: what cannot is written as Python writes it (`\\n`).
-
-    Of more than 500 characters the middle is left out.
-    """
-    shown = UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
-    return shown if len(shown) <= MOST_SHOWN else f"{shown[: MOST_SHOWN // 2 - 5]} ... {shown[-MOST_SHOWN // 2 :]}"
+    """Return one line to print: escape unprintable characters as in Python (`\\n`), omit the middle of a long text."""
+    line = UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+    return line if len(line) <= MOST_SHOWN else f"{line[: MOST_SHOWN // 2 - 5]} ... {line[-MOST_SHOWN // 2 :]}"
 
 
 def safe_name(text: str, ending: str = "") -> str:
-    """The name of a file or folder that is like this text and cannot lead anywhere.
+    """Return a name for a file or folder that resembles the text and cannot lead to another folder.
 
-    Never empty, without separators, leading dots and unprintable characters, of at most 100 bytes of UTF-8.
-
-    Args:
-        ending: comes behind it, and does not count as text: a number, say.
+    It is never empty, has no separators, leading dots or unprintable characters, and at most 100 bytes of UTF-8.
+    `ending`, such as a number, is added to a name that is not empty without it.
     """
     plain = SEPARATORS.sub("_", UNPRINTABLE.sub("_", text)).lstrip(".")
     shortened = plain.encode()[: LONGEST - len(ending)].decode(errors="ignore")
@@ -35,9 +30,9 @@ def safe_name(text: str, ending: str = "") -> str:
 
 
 def folder_names(stems: Iterable[str]) -> list[str]:
-    """A safe name for each stem, and for one whose name is taken, that with `_2`, `_3` and so on behind it.
+    """Return a safe name for each stem, with `_2`, `_3` and so on behind names that are taken.
 
-    Capitals and the forms of Unicode do not tell names apart, because they do not on every file system.
+    Names that differ only in case or Unicode form count as equal, because they are equal on some file systems.
     """
     names: list[str] = []
     taken: set[str] = set()

@@ -1,7 +1,7 @@
-"""What can be chosen and set, as the files of `conf/` say: read line by line, comments too, without importing anything.
+"""Options and settings in `conf/`: a reader of its files and their comments that imports neither Hydra nor OmegaConf.
 
-A comment above a key or behind its value explains it; the first comment of a file is about the file. Shells that
-complete the command line call `completesplat --complete WORDS`, which is answered from here: it has to be quick.
+A comment above a key or behind its value explains the key; the first comment of a file explains the file. This module
+answers `completesplat --complete WORDS`, which shells call to complete the command line, so it has to be quick.
 """
 
 import re
@@ -19,7 +19,6 @@ PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
 """Verbs with several tasks: `data toy` is short for `data data_task=toy`."""
 LEAST_LIKE = 0.7
-
 
 BASH = r"""# eval "$(completesplat completion bash)"   in ~/.bashrc
 _completesplat() {
@@ -66,7 +65,7 @@ SWITCHES = ("true", "false")
 
 
 class Setting(NamedTuple):
-    """A key of a file with its value as it is written there."""
+    """A key in a file of `conf/`, with its value as written there and its comment."""
 
     key: str
     value: str
@@ -74,7 +73,7 @@ class Setting(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A group in a file's list of defaults, the place of its settings, and the option that is chosen."""
+    """An entry of a file's defaults list: a config group, the place of its settings, and the default option."""
 
     group: str
     place: str
@@ -83,46 +82,50 @@ class Choice(NamedTuple):
 
 
 class ConfFile(NamedTuple):
-    """What a file of `conf/` says. `package`: the place of its settings, if it names one."""
+    """Contents of a file of `conf/`; `package` is the place of its settings, if the file names one."""
 
     about: str
     package: str | None
     settings: list[Setting]
     choices: list[Choice]
     bases: list[str]
-    """Files whose settings it takes over."""
+    """Files from which it inherits settings."""
 
 
 def conf_folder() -> Path:
-    """The configuration tree: inside an installed package, or beside it in the repository."""
+    """Return the folder of configs, inside an installed package or beside the package in the repository."""
     package = Path(__file__).parent
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
 def folders() -> list[Path]:
-    """Where settings are looked for: the package's, and those of the working folder."""
+    """Return the folders of configs: the package's, and `conf` in the working folder if it exists."""
     return [conf_folder(), *(folder for folder in [Path.cwd() / "conf"] if folder.is_dir())]
 
 
 def groups() -> list[str]:
-    """Names of all groups."""
+    """Return the names of all config groups."""
     return sorted({path.name for folder in folders() for path in folder.iterdir() if path.is_dir()})
 
 
 def options(group: str) -> list[str]:
-    """What can be chosen in a group; empty where there is no such group."""
+    """Return the options of a group; an empty list if there is no such group."""
     files = [file for folder in folders() for file in (folder / group).glob("[!_]*.yaml")]
     return sorted({file.stem for file in files})
 
 
 def about_groups() -> dict[str, str]:
-    """What each group chooses, from the table in `conf/README.md`."""
+    """Return a description of each group, from the table in `conf/README.md`."""
     text = (conf_folder() / "README.md").read_text(encoding="utf-8")
     return {name: about for names, about in NAMED.findall(text) for name in re.findall(r"`(\w+)`", names)}
 
 
 def read(name: str) -> ConfFile:
-    """A file of `conf/`, by its name without ending: `fit`, `data/toy_objects`. `FileNotFoundError`: there is none."""
+    """Read a file of `conf/` by its name without suffix: `fit`, `data/toy_objects`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
     for folder in folders():
         if (folder / f"{name}.yaml").is_file():
             return parse((folder / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -130,11 +133,11 @@ def read(name: str) -> ConfFile:
 
 
 def parse(text: str) -> ConfFile:
-    """What a file's lines say."""
+    """Parse the text of a file."""
     head: list[str] = []
     comments: list[str] = []
     package, above = None, [""]
-    found = ConfFile("", None, [], [], [])
+    parsed = ConfFile("", None, [], [], [])
     lines = text.splitlines()
     while lines and (lines[0].startswith("#") or not lines[0]):
         line = lines.pop(0)
@@ -145,25 +148,25 @@ def parse(text: str) -> ConfFile:
         else:
             head.append(line[1:])
     for line in lines:
-        said, _, remark = line.partition(" #") if not line.strip().startswith("#") else ("", "", line.strip()[1:])
-        if not said.strip():
+        content, _, remark = line.partition(" #") if not line.strip().startswith("#") else ("", "", line.strip()[1:])
+        if not content.strip():
             comments = [*comments, remark.strip()] if remark else []
             continue
         comment, comments = " ".join([*comments, remark.strip()]).strip(), []
-        if above[0] == "defaults" and said.startswith(" "):
-            if chosen := CHOICE.fullmatch(said.rstrip()):
-                found.choices.append(Choice(chosen[2], chosen[3] or chosen[2], chosen[4], comment))
-            elif (base := said.strip()[2:]) != "_self_":
-                found.bases.append(base)
-        elif key := KEY.fullmatch(said.rstrip()):
+        if above[0] == "defaults" and content.startswith(" "):
+            if chosen := CHOICE.fullmatch(content.rstrip()):
+                parsed.choices.append(Choice(chosen[2], chosen[3] or chosen[2], chosen[4], comment))
+            elif (base := content.strip()[2:]) != "_self_":
+                parsed.bases.append(base)
+        elif key := KEY.fullmatch(content.rstrip()):
             above = [*above[: len(key[1]) // 2], key[2]]
-            found.settings.append(Setting(".".join(above), key[3] or "", comment))
+            parsed.settings.append(Setting(".".join(above), key[3] or "", comment))
     about = "\n".join(line[1:] if line.startswith(" ") else line for line in head)
-    return found._replace(about=about, package=package)
+    return parsed._replace(about=about, package=package)
 
 
 def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[Setting]:
-    """A file's settings that have values, in its order; not those below the keys in `without`."""
+    """Yield a file's settings that have values, in its order, except those below the keys in `without`."""
     keys = {setting.key for setting in written.settings}
     for setting in written.settings:
         inner = any(key.startswith(f"{setting.key}.") for key in keys)
@@ -173,7 +176,7 @@ def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[S
 
 
 def settings_of_option(group: str, option: str, place: str | None = None) -> list[Setting]:
-    """All settings of an option, with those that its file takes over from others; `place`: where they belong."""
+    """Return all settings of an option, also inherited ones, with keys below `place` (by default, its package)."""
     written = with_bases(group, option)
     where = place if place is not None else written.package or group.replace("/", ".")
     prefix = "" if where in ("", "_global_") else f"{where}."
@@ -181,47 +184,47 @@ def settings_of_option(group: str, option: str, place: str | None = None) -> lis
 
 
 def settings_of_verb(verb: str, task: str | None = None) -> list[Setting]:
-    """A verb's own settings: where it writes, those in its file, and those of its task."""
+    """Return a verb's own settings: its output folder, those in its file, and those of its task."""
     without = ("hydra", "verb", "description", "task")
-    found = [*own_settings(read("base"), without), *own_settings(read(verb), without)]
-    found += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
-    return list({setting.key: setting for setting in found}.values())
+    settings = [*own_settings(read("base"), without), *own_settings(read(verb), without)]
+    settings += [] if task is None else own_settings(with_bases(f"{verb}_task", task), without)
+    return list({setting.key: setting for setting in settings}.values())
 
 
 def with_bases(group: str, option: str) -> ConfFile:
-    """An option's file with the settings and choices of those that it takes over."""
+    """Return an option's file with the settings and choices that it inherits."""
     written = read(f"{group}/{option}")
     inherited = [with_bases(group, base) for base in written.bases]
-    choices = [choice for one in inherited for choice in one.choices] + written.choices
+    choices = [choice for entry in inherited for choice in entry.choices] + written.choices
     settings: dict[str, Setting] = {}
-    for one in (one for base in [*inherited, written] for one in base.settings):
-        settings[one.key] = one._replace(comment=one.comment or settings.get(one.key, one).comment)
+    for entry in (entry for base in [*inherited, written] for entry in base.settings):
+        settings[entry.key] = entry._replace(comment=entry.comment or settings.get(entry.key, entry).comment)
     return written._replace(settings=list(settings.values()), choices=choices)
 
 
 def choices_of_verb(verb: str, task: str | None = None) -> list[Choice]:
-    """The groups that a verb is made of, with what is chosen by itself, its task left out."""
-    found = [choice for choice in read(verb).choices if choice.group != f"{verb}_task"]
-    return found + ([] if task is None else with_bases(f"{verb}_task", task).choices)
+    """Return the config groups of a verb and its task with their default options, without the group of tasks."""
+    choices = [choice for choice in read(verb).choices if choice.group != f"{verb}_task"]
+    return choices + ([] if task is None else with_bases(f"{verb}_task", task).choices)
 
 
 def meant(name: str, names: Any, most: int = 3) -> str:
-    """What to add to a message on a name that is not there: the nearest of those that are, if any is near."""
-    found = get_close_matches(name, list(names), n=most, cutoff=LEAST_LIKE)
-    return f"; did you mean {' or '.join(found)}?" if found else ""
+    """Return an ending for a message about an unknown name: the nearest of `names`, or nothing if none is near."""
+    nearest = get_close_matches(name, list(names), n=most, cutoff=LEAST_LIKE)
+    return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
 
 
 def candidates(words: Sequence[str], verbs: Collection[str]) -> list[str]:
-    """What the last of the words behind `completesplat` may become; an empty list where that may be anything."""
+    """Return completions of the last word behind `completesplat`; an empty list if it may be anything."""
     if len(words) < 2:
-        found = [*verbs, "completion"]
+        completions = [*verbs, "completion"]
     elif words[0] == "completion":
-        found = list(SCRIPTS)
+        completions = list(SCRIPTS)
     elif words[0] in verbs:
-        found = _behind_verb(words[0], words[1:])
+        completions = _behind_verb(words[0], words[1:])
     else:
-        found = []
-    return [one for one in found if one.startswith(words[-1] if words else "")]
+        completions = []
+    return [completion for completion in completions if completion.startswith(words[-1] if words else "")]
 
 
 def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
@@ -238,23 +241,23 @@ def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
     settings = {setting.key: setting.value for setting in settings_of_verb(verb, task)}
     for place, (group, option) in chosen.items():
         if option in options(group) and group not in ("experiment", "ablation"):
-            own = settings_of_option(group, option, None if place == group else place)
-            settings |= {one.key: one.value for one in own if not one.key.rpartition(".")[2].startswith("_")}
+            inner = settings_of_option(group, option, None if place == group else place)
+            settings |= {entry.key: entry.value for entry in inner if not entry.key.rpartition(".")[2].startswith("_")}
     key, equals, _ = words[-1].partition("=")
     if equals:
         values = options(chosen[key][0]) if key in chosen else SWITCHES if settings.get(key) in SWITCHES else ()
         return [f"{key}={value}" for value in values]
-    found = [f"{name}=" for name in [*settings, *chosen]]
-    # Keys below the first point are shown when it is typed.
-    near = [name for name in found if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
+    keys = [f"{name}=" for name in [*settings, *chosen]]
+    # Nested keys are offered once their dots, or three characters, are typed.
+    near = [name for name in keys if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
     return [*(tasks if len(words) == 1 else []), *near, "--help"]
 
 
 def gsplat_constants() -> dict[str, float]:
     """Return the constants compiled into the kernels of the installed gsplat, without importing it.
 
-    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. 1.5.3 has them in its kernels only
-    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); they are the default where there is no gsplat.
+    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. Release 1.5.3 has them in its kernels only
+    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); its values are the defaults, also where gsplat is not installed.
     """
     spec = find_spec("gsplat")
     files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]

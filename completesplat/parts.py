@@ -1,8 +1,7 @@
-"""What a model is made of: its configuration (`config.json` of weights), held against a list, and only then built.
+"""Models built from configs (`config.json` of weights), which are first checked against a list of allowed classes.
 
-Anyone can publish weights, and runs. Their configuration names classes of this list with settings of these classes, by
-value, and nothing else: nothing is imported or called that it names, and no memory is asked for that the weights' file
-does not have.
+Anyone can publish weights and runs. Their configs may name only classes of this list, with plain values as settings:
+nothing else that they name is imported or called, and a model takes no more memory than its weights file holds.
 """
 
 import inspect
@@ -36,7 +35,7 @@ from completesplat.schema import Entries, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, RUN_CONFIG_FILE, SCENES, read_small
 
-# What each setting that is a part may be.
+# The classes that each setting may name, for settings that are parts of a model.
 PARTS: dict[str, tuple[type, ...]] = {
     "autoreconstructor": (VariationalAutoReconstructor,),
     "encoder": (Encoder,),
@@ -47,15 +46,10 @@ PARTS: dict[str, tuple[type, ...]] = {
     "denoiser": (Denoiser, TextlessStableDiffusion),
     "network": (VariationalAutoReconstructor, SplatterImageUNet),
     "sampler": (Sampler,),
-    "scheduler": (
-        DDIMScheduler,
-        DPMSolverMultistepScheduler,
-        FlowMatchEulerDiscreteScheduler,
-        UniPCMultistepScheduler,
-    ),
+    "scheduler": (DDIMScheduler, DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler),
 }
 NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")
-# Of a run's model: where its configuration has a model's settings, and its checkpoints the tensors.
+# For each Lightning module of a run: the key of the model in its config and of the tensors in its checkpoints.
 STAGES = {
     "completesplat.training.latent_diffusion.LatentDiffusion": "completesplat",
     "completesplat.training.reconstruction.ReconstructionModule": "model",
@@ -64,10 +58,10 @@ Part = Mapping[str, Any]
 
 
 class TrainingPictures(TypedDict, total=False):
-    """What weights say about the pictures that they were trained on; older ones say nothing.
+    """Facts about the training images that are stored with weights; older weights have none.
 
-    `box_masks`: how often parts of a picture were hidden. The others: mean and deviation of the training pictures'
-    features, see `completesplat.data.pictures.photograph.picture_features`.
+    `box_masks`: how often parts of an image were hidden. The others: mean and standard deviation of the training
+    images' features, see `completesplat.data.pictures.photograph.picture_features`.
     """
 
     box_masks: Share
@@ -76,7 +70,7 @@ class TrainingPictures(TypedDict, total=False):
 
 
 class Needed(TypedDict):
-    """The settings of `CompleteSplat` that all weights have."""
+    """Settings of `CompleteSplat` that all weights have."""
 
     autoreconstructor: Part
     conditioning: Part
@@ -86,26 +80,26 @@ class Needed(TypedDict):
 
 
 class Architecture(Needed, total=False):
-    """The settings of `CompleteSplat`."""
+    """All settings of `CompleteSplat`."""
 
     training: TrainingPictures
 
 
 class NeededOfOneAnswer(TypedDict):
-    """What every configuration of `OneAnswer` has."""
+    """Settings of `OneAnswer` that all weights have."""
 
     network: Part
     image_size: Annotated[int, Range(8, 1024)]
 
 
 class OneAnswerArchitecture(NeededOfOneAnswer, total=False):
-    """The settings of `OneAnswer`."""
+    """All settings of `OneAnswer`."""
 
     training: TrainingPictures
 
 
 class SchedulerSettings(TypedDict, total=False):
-    """Settings of diffusers' schedulers, of each those that it has."""
+    """Settings of diffusers' schedulers; each scheduler has some of them."""
 
     num_train_timesteps: Annotated[int, Range(1, 10_000)]
     beta_start: Share
@@ -122,7 +116,7 @@ class SchedulerSettings(TypedDict, total=False):
     thresholding: bool
     dynamic_thresholding_ratio: Share
     sample_max_value: Annotated[float, Range(0, 1e6)]
-    algorithm_type: Literal["dpmsolver", "dpmsolver++"]  # the others draw noise of their own
+    algorithm_type: Literal["dpmsolver", "dpmsolver++"]  # the other types draw their own noise
     solver_order: Annotated[int, Range(1, 3)]
     solver_type: Literal["midpoint", "heun", "bh1", "bh2"]
     lower_order_final: bool
@@ -138,7 +132,7 @@ class SchedulerSettings(TypedDict, total=False):
 
 
 def name_of(kind: type) -> str:
-    """The name by which configurations know a class; diffusers gives all of its own at its top."""
+    """Return the name of a class in configs; diffusers exports all of its classes from its top level."""
     module = "diffusers" if kind.__module__.startswith("diffusers.") else kind.__module__
     return f"{module}.{kind.__name__}"
 
@@ -147,20 +141,20 @@ CLASSES = {name_of(kind): kind for kinds in PARTS.values() for kind in kinds}
 
 
 def settings_of(kind: Any) -> dict[str, Any]:
-    """The settings that a configuration may give to a class, with their annotations."""
+    """Return the settings that a config may give to a class, with their annotations."""
     if kind in PARTS["scheduler"]:
-        own = inspect.signature(kind).parameters
-        return {name: hint for name, hint in hints_of(SchedulerSettings).items() if name in own}
+        parameters = inspect.signature(kind).parameters
+        return {name: hint for name, hint in hints_of(SchedulerSettings).items() if name in parameters}
     hints = {name: hint for name, hint in hints_of(kind.__init__).items() if name not in ("return", "sizes")}
-    # What training started from is not needed again, and could name any file or address.
+    # The weights that training started from are not needed again, and could name any file or address.
     return hints | dict.fromkeys(hints.keys() & {"pretrained"}, NoneType)
 
 
 def read_architecture(folder: Path) -> dict[str, Any]:
-    """The configuration in a folder of weights.
+    """Read the config in a folder of weights.
 
     Raises:
-        WeightsError: it cannot be read, or is refused by `check_architecture`.
+        WeightsError: the config cannot be read, or `check_architecture` refuses it.
     """
     path = folder / CONFIG_FILE
     try:
@@ -175,12 +169,10 @@ def read_architecture(folder: Path) -> dict[str, Any]:
 
 
 def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
-    """The configuration of the model that a run trained, and the prefix of its tensors in the run's checkpoints.
-
-    It is read from the `config.yaml` beside the checkpoint's folder.
+    """Return a run's model config, from `config.yaml` beside the checkpoint's folder, and its tensors' prefix.
 
     Raises:
-        WeightsError: it cannot be read, is of a model that makes no scene of a picture, or as `check_architecture`.
+        WeightsError: the config cannot be read, its model makes no scene from an image, or as `check_architecture`.
     """
     run = checkpoint.absolute().parent.parent
     path = run / RUN_CONFIG_FILE
@@ -192,12 +184,12 @@ def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
         target = str(model["_target_"])
     except WeightsError:
         raise
-    except Exception as error:  # of YAML and of OmegaConf, and where it is no mapping
+    except Exception as error:  # raised by YAML or OmegaConf, or because it is no mapping
         raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
     if target not in STAGES:
-        said = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
+        reason = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
         fitted = f"; those that it fitted are in {run / SCENES}" if (run / SCENES).is_dir() else ""
-        raise WeightsError(f"{path} names {shown(target)}: {said}{fitted}")
+        raise WeightsError(f"{path} names {shown(target)}: {reason}{fitted}")
     part = model.get(STAGES[target])
     if STAGES[target] == "model":
         architecture: dict[str, Any] = {"network": untrained(part), "image_size": image_size}
@@ -212,17 +204,17 @@ def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
 
 
 def untrained(part: Any) -> Any:
-    """A part's configuration without the weights that its training started from: all are saved together."""
+    """Return a part's config without the weights that training started from, because a checkpoint holds all weights."""
     if not isinstance(part, Mapping):
         return part
     return {key: None if key == "pretrained" else value for key, value in part.items()}
 
 
 def check_architecture(architecture: Any) -> None:
-    """Hold a configuration against `PARTS`, the signatures of these classes, and the bounds in their annotations.
+    """Check a config against `PARTS`, the signatures of these classes, and the bounds in their annotations.
 
     Raises:
-        WeightsError: names the first setting that does not fit.
+        WeightsError: a setting does not fit; the message names the first one.
     """
     one_answer = isinstance(architecture, Mapping) and "network" in architecture
     hints = hints_of(OneAnswerArchitecture if one_answer else Architecture)
@@ -241,8 +233,8 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
             _check_part(key, value, PARTS[name])
         elif is_typeddict(hints[name]) and isinstance(value, Mapping):
             _check_settings(key, hints_of(hints[name]), value)
-        elif name not in PARTS and (found := refused(hints[name], value)):
-            raise WeightsError(f"{key}={shown(value)}: {found[0].reason}")
+        elif name not in PARTS and (refusals := refused(hints[name], value)):
+            raise WeightsError(f"{key}={shown(value)}: {refusals[0].reason}")
 
 
 def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
@@ -256,30 +248,27 @@ def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
 
 
 def build(part: Part) -> Any:
-    """A part of a configuration that `check_architecture` has let through, with the parts in it."""
+    """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
     settings = {name: build(value) if isinstance(value, Mapping) else value for name, value in part.items()}
     return CLASSES[settings.pop("_target_")](**settings)
 
 
 def check_sizes(architecture: Mapping[str, Any], held: Mapping[str, Sequence[int]], files: tuple[str, str]) -> None:
-    """Compare the networks' tensors with the sizes of those that are held.
-
-    Args:
-        files: names of the one that holds them, and of the one that the configuration is from.
+    """Compare the networks' tensors with the sizes `held`; `files` names the tensors' file and the config's.
 
     Raises:
-        WeightsError: one is not there, or has another size.
+        WeightsError: a tensor is missing, or has another size.
     """
-    with torch.device("meta"):  # which gives tensors sizes and no memory
+    with torch.device("meta"):  # tensors with sizes but without memory
         networks = nn.ModuleDict({name: build(architecture[name]) for name in NETWORKS if name in architecture})
     for name, value in networks.state_dict().items():
-        there = held.get(name)
-        if there is None or list(there) != list(value.shape):
-            found = "missing" if there is None else list(there)
-            raise WeightsError(f"{name} is {found} in {files[0]} and {list(value.shape)} by {files[1]}")
+        stored = held.get(name)
+        if stored is None or list(stored) != list(value.shape):
+            actual = "missing" if stored is None else list(stored)
+            raise WeightsError(f"{name} is {actual} in {files[0]} and {list(value.shape)} by {files[1]}")
 
 
 def sizes_in(file: Path) -> dict[str, list[int]]:
-    """Of the tensors in a `safetensors` file, of which only the header is read."""
+    """Return the sizes of the tensors in a `safetensors` file, of which only the header is read."""
     with safe_open(file, "pt") as tensors:
         return {name: tensors.get_slice(name).get_shape() for name in tensors.keys()}  # noqa: SIM118

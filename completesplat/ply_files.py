@@ -1,6 +1,6 @@
-"""The vertices of PLY files: the header, and one array with a field for each property.
+"""Vertices of PLY files: the header, and one array with a field for each property.
 
-Format: Greg Turk, "The PLY Polygon File Format" (1994); the names of types are those of both of its generations.
+Format: Greg Turk, "The PLY Polygon File Format" (1994); both the old and the new names of types are read.
 """
 
 import os
@@ -24,7 +24,7 @@ TYPES = {
 
 
 class Element(NamedTuple):
-    """An element that a header declares, with its properties and their types; of a list, that of its length."""
+    """An element that a header declares, with its properties and their types; a list has the type of its length."""
 
     name: str
     records: int
@@ -32,32 +32,32 @@ class Element(NamedTuple):
     lists: bool
 
     def dtype(self, order: str) -> np.dtype[np.void]:
-        """Of a record, or of the least that is there of one with lists."""
+        """Return the dtype of a record, or, if it has lists, of the shortest possible record."""
         return np.dtype([(name, order + kind) for name, kind in self.fields.items()])
 
 
 def header(count: int, properties: Sequence[tuple[str, str]], comments: Sequence[str] = ()) -> bytes:
-    """The header of a binary little-endian file that has vertices only.
+    """Return the header of a binary little-endian file that has vertices only.
 
     Args:
         properties: names and types (`TYPES`), in the order of a record.
-        comments: a line each; characters outside ASCII are escaped.
+        comments: one line each; characters outside ASCII are escaped.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
-    # A line break inside a comment would start a header line of its own.
+    # A line break inside a comment would start another header line.
     lines += [f"comment {' '.join(comment.split())}" for comment in comments]
     lines += [f"element vertex {count}", *(f"property {kind} {name}" for name, kind in properties), "end_header", ""]
     return "\n".join(lines).encode("ascii", "backslashreplace")
 
 
 def read_vertices(path: str | Path, needed: Sequence[str]) -> np.ndarray:
-    """The vertices of a file, ASCII or binary, as an array [n] with a field for each property.
+    """Read the vertices of a file, ASCII or binary, as an array [n] with a field for each property.
 
     Other elements are left out. Lists (of faces) may only follow the vertices.
 
     Raises:
-        PlyError: no such file, a damaged one, another size than the header declares, or one of the `needed` properties
-            is missing. It does not name the file.
+        PlyError: the file is missing, damaged or of another size than its header declares, or one of the `needed`
+            properties is missing. The message does not name the file.
     """
     try:
         if not Path(path).is_file():
@@ -72,10 +72,10 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
     start = file.read(LONGEST_HEADER)
     if not start.startswith(b"ply"):
         raise PlyError("not a .ply file")
-    found = HEADER.match(start)
-    if found is None:
+    header_match = HEADER.match(start)
+    if header_match is None:
         raise PlyError("no end of the header found")
-    form, *lines = found[1].decode("ascii", "replace").splitlines() or [""]
+    form, *lines = header_match[1].decode("ascii", "replace").splitlines() or [""]
     elements = _elements(lines)
     names = [element.name for element in elements]
     if names.count("vertex") != 1:
@@ -85,7 +85,7 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
         raise PlyError("a list in the vertices, or before them")
     if missing := [name for name in needed if name not in elements[index].fields]:
         raise PlyError(f"no property {', '.join(missing)}")
-    file.seek(found.end())
+    file.seek(header_match.end())
     match form.split():
         case ["format", "ascii", "1.0"]:
             return _from_text(file, elements, index)
@@ -95,7 +95,7 @@ def _vertices(file: BinaryIO, needed: Sequence[str]) -> np.ndarray:
 
 
 def _elements(lines: Sequence[str]) -> list[Element]:
-    """In the order of the file."""
+    """Parse the header's elements, in the order of the file."""
     declared: list[Element] = []
     for line in lines:
         match line.split():
@@ -137,6 +137,6 @@ def _from_text(file: BinaryIO, elements: Sequence[Element], index: int) -> np.nd
             raise PlyError(f"the header declares {declared} lines of data, the file has {len(lines)}")
         before = sum(element.records for element in elements[:index])
         rows = lines[before : before + count]
-        return np.loadtxt(rows, dtype, comments=None, ndmin=1) if rows else np.empty(0, dtype)  # of none it warns
-    except ValueError as error:  # characters that are not ASCII among them
+        return np.loadtxt(rows, dtype, comments=None, ndmin=1) if rows else np.empty(0, dtype)  # it warns of none
+    except ValueError as error:  # raised for characters that are not ASCII, too
         raise PlyError(" ".join(str(error).split())) from None

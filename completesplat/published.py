@@ -1,7 +1,7 @@
-"""Scenes from photographs by weights that others published: one answer for each.
+"""Published weights of another method, which reconstruct one scene from a photo.
 
-Splatter Image (Szymanowicz et al., CVPR 2024) sees an object on a plain background and gives one Gaussian a pixel. It
-draws nothing: there are no samples, and what is hidden stays an average.
+Splatter Image (Szymanowicz et al., CVPR 2024) sees an object on a plain background and predicts one Gaussian per pixel.
+It draws no samples, so hidden parts are reconstructed as an average.
 """
 
 from dataclasses import replace
@@ -20,20 +20,18 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.scene_model import SceneModel, require_one
 
 OBJECT_SHARE = 0.65
-"""Of the picture that a cut-out object fills (`gradio_app.py`, `resize_foreground`)."""
+"""Share of the image that a cut-out object fills (`gradio_app.py`, `resize_foreground`)."""
 PHONE_FOV = 50.0
 
 
 class PublishedGenerator(SceneModel):
     """Published weights of Splatter Image, as `CompleteSplat.from_pretrained` and `predict` take them.
 
-    Its field of view is that of the training's pictures, or where each had its own, that of a phone's main camera; up
-    is upwards in the photograph.
+    Its field of view is that of the training images, or if these have different ones, that of a phone's main camera.
+    Its up direction points upwards in the photo. Arguments and errors are those of `PublishedSplatterImage`.
 
     Attributes:
-        said: what it is, and which pictures it wants.
-
-    Args, Raises: those of `PublishedSplatterImage`.
+        said: the method, and the images that it needs.
     """
 
     def __init__(self, weights: str) -> None:
@@ -49,14 +47,14 @@ class PublishedGenerator(SceneModel):
 
     @property
     def reconstructing(self) -> PublishedSplatterImage:
-        """The network."""
+        """Return the network."""
         return self.network
 
     def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
-        """A picture at the model's size, on the background that the weights know (`read_photograph`).
+        """Read an image at the model's size, on the background that the weights know (`read_photograph`).
 
-        Where the weights know one camera, each picture counts as that one's, and a cut-out object is put into its
-        middle, as large as in training.
+        If the weights know only one camera, the image counts as that camera's, and a cut-out object is put into the
+        middle of the image, as large as in training.
 
         Raises:
             CompleteSplatError: as `read_photograph`, or a field of view for weights that know one camera.
@@ -76,7 +74,7 @@ class PublishedGenerator(SceneModel):
         return photograph if known is None else replace(photograph, fov_degrees=known, fov_source="default")
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
-        """Near and far; of captures around the distance at which the object has the size of training's."""
+        """Return near and far; for weights of captures, around the distance that gives the object its trained size."""
         focal_length = self.camera(photograph).intrinsics[0, 0].item()
         distance = self.network.object_distance(photograph.image, focal_length)
         known = torch.tensor([0.0, distance + self.network.depths.far], device=self.up.device)
@@ -92,7 +90,7 @@ class PublishedGenerator(SceneModel):
         visible: Float[Tensor, "batch 1 height width"] | None = None,
         **settings: Any,
     ) -> Gaussians:
-        """As `OneAnswer.generate`, in the colours that the cameras see; what is hidden counts as background."""
+        """Return scenes as `OneAnswer.generate`, in the colours that the cameras see; hidden pixels are background."""
         require_one(samples)
         if visible is not None:
             images = images * visible + self.network.background * (1 - visible)
@@ -101,5 +99,5 @@ class PublishedGenerator(SceneModel):
         return seen
 
     def save_pretrained(self, path: Path | str) -> None:
-        """`WeightsError`: what others published stays in their files."""
+        """Raise WeightsError, because published weights stay in their authors' files."""
         raise WeightsError("published weights are kept as their authors' files: copy these")

@@ -1,4 +1,4 @@
-"""Settings are checked against the signature of the function that they start, before anything is done."""
+"""Checks of settings against the annotations of the function that takes them, made before any work begins."""
 
 import inspect
 import math
@@ -10,19 +10,19 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args,
 
 from completesplat.errors import CompleteSplatError
 
-MOST_SHOWN = 1e6  # bounds above it are no help
+MOST_SHOWN = 1e6  # help texts leave out larger bounds
 KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
 
 
 @dataclass(frozen=True)
 class Range:
-    """A rule for `Annotated`: a number is finite and lies between two others, both included."""
+    """Rule for `Annotated`: a finite number between two bounds, both included."""
 
     least: float
     most: float = math.inf
 
     def refusal(self, value: Any) -> str | None:
-        """Why the value is refused; None if it is not."""
+        """Return why the value is refused, None if it is accepted."""
         if value == math.inf:
             return "must be finite"
         if self.least <= value <= self.most:
@@ -31,30 +31,30 @@ class Range:
         return f"must be at least {self.least:g}" if math.isinf(self.most) else f"must {limited}"
 
     def words(self) -> str:
-        """The range in a few words."""
+        """Describe the range in a few words."""
         return f"at least {self.least:g}" if self.most > MOST_SHOWN else f"{self.least:g} to {self.most:g}"
 
 
 @dataclass(frozen=True)
 class OneOf:
-    """A rule for `Annotated`: a value is one of several."""
+    """Rule for `Annotated`: one of several values."""
 
     choices: tuple[Any, ...]
 
     def refusal(self, value: Any) -> str | None:
-        """Why the value is refused; None if it is not."""
+        """Return why the value is refused, None if it is accepted."""
         return None if value in self.choices else f"choose one of {', '.join(map(str, self.choices))}"
 
 
 @dataclass(frozen=True)
 class Entries:
-    """A rule for `Annotated`: a list has at least and at most so many entries."""
+    """Rule for `Annotated`: a list with a minimum and a maximum number of entries."""
 
     least: int = 0
     most: float = math.inf
 
     def refusal(self, value: Any) -> str | None:
-        """Why the value is refused; None if it is not."""
+        """Return why the value is refused, None if it is accepted."""
         if self.least <= len(value) <= self.most:
             return None
         if math.isinf(self.most):
@@ -66,9 +66,9 @@ Positive = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 Share = Annotated[float, Range(0, 1)]
-Side = Annotated[int, Range(8, 4096)]  # of a picture, in pixels
+Side = Annotated[int, Range(8, 4096)]  # of an image, in pixels
 
-# Sizes of networks. Their bounds lie beyond what anyone trains; they hold off configurations that strangers wrote.
+# Sizes of networks. Their bounds lie beyond what anyone trains, and protect from configs that strangers wrote.
 Width = Annotated[int, Range(1, 8192)]
 Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
 Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
@@ -76,7 +76,7 @@ Few = Annotated[int, Range(1, 16)]
 
 
 class Refused(NamedTuple):
-    """A value below a setting: `.key` of its place (empty for the setting itself), and why it is refused."""
+    """A refused value: its place inside the setting (`.key`, empty for the setting itself) and the reason."""
 
     place: str
     value: Any
@@ -84,13 +84,13 @@ class Refused(NamedTuple):
 
 
 def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
-    """Hold settings against the annotations of the same names: of a function's arguments, or in a `TypedDict`.
+    """Check settings against the annotations of the same names, of a function's arguments or in a `TypedDict`.
 
     Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Entries`; any
     other annotation accepts everything.
 
     Raises:
-        CompleteSplatError: names the first setting that does not fit, and what it may be.
+        CompleteSplatError: a setting does not fit. The message names the first one, and the values that it may have.
     """
     hints = hints_of(function)
     for name in [name for name in settings if name in hints]:
@@ -98,14 +98,14 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
 
 
 def check_value(key: str, annotation: Any, value: Any) -> None:
-    """Hold one setting against an annotation; `CompleteSplatError`: it does not fit, with what it may be."""
+    """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
     for place, part, reason in refused(annotation, value):
         example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
         raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
 
 
 def hints_of(function: Any) -> dict[str, Any]:
-    """Annotations by name, of a function's arguments or in a `TypedDict`; those of `**name: Unpack[...]` one by one."""
+    """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
     hints = get_type_hints(function, include_extras=True)
     for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
         hints |= get_type_hints(shared, include_extras=True)
@@ -113,57 +113,57 @@ def hints_of(function: Any) -> dict[str, Any]:
 
 
 def arguments_of(target: Any) -> tuple[dict[str, Any], bool]:
-    """Annotations of what a class or function is called with, by name, and whether there are no others.
+    """Return annotations of a class's or function's arguments, by name, and whether these are all the arguments.
 
-    What a class hands on to the one above it (`**settings: Any`) is the other's.
+    If a class passes `**settings: Any` on to its base class, the arguments of the base class are included.
     """
     kinds = target.__mro__ if isinstance(target, type) else ()
     functions = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [target]
-    found: dict[str, Any] = {}
+    annotations: dict[str, Any] = {}
     for function in functions:
         try:
             hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
-        except (NameError, TypeError, ValueError):  # of others: they may name what is there for type checkers alone
-            return found, False
-        named = {one.name for one in parameters if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY)}
-        more = [one for one in parameters if one.kind is one.VAR_KEYWORD]
-        named |= {name for name in hints if name != "return"} - {one.name for one in parameters}
-        found = {name: hints.get(name, Any) for name in named - {"self"}} | found
+        except (NameError, TypeError, ValueError):  # other packages: names only under TYPE_CHECKING
+            return annotations, False
+        named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
+        more = [param for param in parameters if param.kind is param.VAR_KEYWORD]
+        named |= {name for name in hints if name != "return"} - {param.name for param in parameters}
+        annotations = {name: hints.get(name, Any) for name in named - {"self"}} | annotations
         if not more or get_origin(get_type_hints(function).get(more[0].name)) is Unpack:
-            return found, True
-    return found, False
+            return annotations, True
+    return annotations, False
 
 
 def refused(annotation: Any, value: Any) -> list[Refused]:
-    """The parts of a value that do not fit an annotation, with the reasons."""
+    """Return the parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         unfit = refused(kind, value)
         return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
     if origin in (Union, UnionType):
-        literals = [one for member in arguments for one in get_args(member) if get_origin(member) is Literal]
+        literals = [literal for member in arguments for literal in get_args(member) if get_origin(member) is Literal]
         if literals and all(get_origin(member) is Literal or member is NoneType for member in arguments):
             choices = (*literals, None) if NoneType in arguments else tuple(literals)
             return refused(Annotated[Any, OneOf(choices)], value)
-        # What is written in settings is no object of another class (`float | Tensor`); alone, that may be anything.
+        # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
         plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
         numbers = {int, float} & set(arguments) and isinstance(value, str | int | float | Sequence)
-        found = [refused(member, value) for member in (plain if numbers else arguments)]
-        return [] if [] in found else found[0]
+        attempts = [refused(member, value) for member in (plain if numbers else arguments)]
+        return [] if [] in attempts else attempts[0]
     if origin is Literal:
         return refused(Annotated[Any, OneOf(arguments)], value)
-    if origin is Sequence:  # the whole list, where one of its entries does not fit
+    if origin is Sequence:  # if an entry does not fit, the whole list is reported
         if isinstance(value, str) or not isinstance(value, Sequence):
             return [Refused("", value, "must be a list")]
-        return [Refused("", value, one.reason) for entry in value for one in refused(arguments[0], entry)]
+        return [Refused("", value, bad.reason) for entry in value for bad in refused(arguments[0], entry)]
     if origin is Mapping or typing.is_typeddict(annotation):
         if not isinstance(value, Mapping):
             return [Refused("", value, "must be a mapping")]
         typed = get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else {}
         kinds = {key: typed.get(key, Any) if typed else arguments[1] for key in value}
         return [
-            one._replace(place=f".{key}{one.place}") for key, kind in kinds.items() for one in refused(kind, value[key])
+            bad._replace(place=f".{key}{bad.place}") for key, kind in kinds.items() for bad in refused(kind, value[key])
         ]
     if annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
@@ -171,7 +171,7 @@ def refused(annotation: Any, value: Any) -> list[Refused]:
 
 
 def described(annotation: Any) -> str:
-    """What a setting with this annotation may be, in a few words; empty where that is not known."""
+    """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
@@ -196,5 +196,5 @@ def _is_a(kind: type, value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """A stranger's value for a message: not for pages, and without what would move a terminal's cursor."""
+    """Shorten a stranger's value for a message, and escape characters that would move a terminal's cursor."""
     return str(value).encode("unicode_escape").decode()[:80]

@@ -1,7 +1,7 @@
-"""Signals that ask a program to end: it ends in good order, with exit status 128 + the signal's number.
+"""Orderly end of the program after a signal, with exit status 128 + the signal's number.
 
-The first signal raises `Interrupted` where the program stands, or is kept until work says that it can end there
-(training: at the end of a step). From then on signals have the system's effect: a second one ends the process at once.
+The first signal raises `Interrupted` where the program stands, or waits until the program asks for it (training does
+so at the end of a step). After that signals have their default effect: a second one ends the process at once.
 """
 
 import os
@@ -14,14 +14,14 @@ from multiprocessing import active_children, parent_process
 from multiprocessing.util import Finalize
 
 ENDING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
-"""Sent by `kill`, systems and clusters, Ctrl-C, a terminal that closes, and SLURM before a job's time is up."""
+"""Signals from `kill`, systems and clusters, Ctrl-C, a terminal that closes, and SLURM before a job's time is up."""
 
 _received: int | None = None
 _kept = False
 
 
 class Interrupted(SystemExit):
-    """The end of the program because of a signal."""
+    """Exit of the program because of a signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
@@ -30,9 +30,9 @@ class Interrupted(SystemExit):
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """What is done inside ends with `Interrupted` after a signal, also where that was swallowed on its way.
+    """End the block with `Interrupted` after a signal, even if code inside the block swallowed the exception.
 
-    Signals that are ignored (`nohup`) or that another program has a handler for stay as they are.
+    Signals that are ignored (`nohup`), or for which another program has a handler, stay as they are.
     """
     global _received, _kept
     plain = (signal.SIG_DFL, signal.default_int_handler)
@@ -52,23 +52,23 @@ def ended_by_signals() -> Iterator[None]:
 
 
 def received() -> int | None:
-    """The signal that came, if any did."""
+    """Return the number of the signal that came, None if none did."""
     return _received
 
 
 def keep_signals(kept: bool) -> None:
-    """From now on a signal waits for whoever asks by `received`; or, with `kept=False`, it raises again."""
+    """Make signals wait for code that calls `received`, or, with `kept=False`, raise Interrupted at once again."""
     global _kept
     _kept = kept
 
 
 def are_kept() -> bool:
-    """Whether signals wait."""
+    """Return whether signals wait."""
     return _kept
 
 
 def end(number: int) -> None:
-    """`Interrupted`, as after this signal, which another process may have got."""
+    """Raise Interrupted as after this signal, which another process may have received."""
     global _received
     _received = number
     raise Interrupted(number)
@@ -77,9 +77,9 @@ def end(number: int) -> None:
 def _first(number: int, frame: object) -> None:
     global _received
     _received = number
-    for one in ENDING:
-        if signal.getsignal(one) is _first:
-            signal.signal(one, signal.SIG_DFL)
+    for ending_signal in ENDING:
+        if signal.getsignal(ending_signal) is _first:
+            signal.signal(ending_signal, signal.SIG_DFL)
     if not _kept:
         raise Interrupted(number)
 
@@ -90,25 +90,25 @@ def _end_workers() -> None:
             process.kill()
 
 
-# When Python ends, before it waits for them: they ignore the signal by which it would end them (`leave_to_parent`).
+# This runs when Python ends, before it waits for its workers, because they ignore its SIGTERM (`leave_to_parent`).
 Finalize(None, _end_workers, exitpriority=0)
 
 
 def leave_to_parent(_: int = 0) -> None:
-    """In a worker process: signals to all processes of the program are its parent's, which ends its workers."""
+    """Ignore signals in a worker process, because the parent process receives them, too, and ends its workers."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
 
 def end_with_parent() -> None:
-    """In a worker process: what it does ends with `Interrupted` if the parent ends it, and it does not outlive that."""
+    """Make a worker process raise Interrupted on its parent's SIGTERM, and end when the parent has ended."""
     leave_to_parent()
     signal.signal(signal.SIGTERM, _raise)
     threading.Thread(target=_outlive_nobody, daemon=True).start()
 
 
 def end_with(starter: int) -> None:
-    """In a process that another started: it does not outlive that, however that ends, wherever it stands itself."""
+    """End this process when the process that started it has ended, for whatever reason."""
     threading.Thread(target=_outlive, args=(starter,), daemon=True).start()
 
 

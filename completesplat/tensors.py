@@ -1,4 +1,4 @@
-"""Frozen dataclasses of tensors that travel as one thing: between devices, into batches, through indexing."""
+"""Frozen dataclasses of tensors, which are moved between devices, batched and indexed together."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -20,7 +20,7 @@ class TensorDataclass:
     """
 
     def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
-        """The same dataclass with `function` applied to every tensor, nested ones included."""
+        """Return the same dataclass with `function` applied to every tensor, including nested ones."""
 
         def apply(value: Any) -> Any:
             if isinstance(value, Tensor):
@@ -30,7 +30,7 @@ class TensorDataclass:
         return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Like `torch.Tensor.to`, for every tensor; integer and boolean tensors keep their dtype."""
+        """Apply `torch.Tensor.to` to every tensor; integer and boolean tensors keep their dtype."""
         dtype_only_for_floats = {k: v for k, v in kwargs.items() if k != "dtype"}
         places: list[Any] = [a.device if isinstance(a, Tensor) else a for a in args if not isinstance(a, torch.dtype)]
 
@@ -57,7 +57,10 @@ class TensorDataclass:
 def stack(items: Sequence[T]) -> T:
     """Stack equal-shaped dataclasses along a new leading axis (the collate function of the data loaders).
 
-    Strings are collected into a tuple; another static value must be the same in all items (`ValueError` otherwise).
+    Strings are collected into a tuple; other static values must be the same in all items.
+
+    Raises:
+        ValueError: there are no items, or a static value differs between them.
     """
     if not items:
         raise ValueError("cannot stack an empty sequence")
@@ -66,7 +69,7 @@ def stack(items: Sequence[T]) -> T:
 
 
 def concatenate(items: Sequence[T], axis: int = 0) -> T:
-    """One dataclass of all items' tensors, joined along an axis that they have; static values are the first's."""
+    """Concatenate the items' tensors along an existing axis; static values are those of the first item."""
 
     def join(values: list[Any]) -> Any:
         if isinstance(values[0], Tensor):
@@ -80,7 +83,7 @@ def concatenate(items: Sequence[T], axis: int = 0) -> T:
 def _merge(values: list[Any]) -> Any:
     first = values[0]
     if isinstance(first, Tensor):
-        # Like `torch.stack`, but in a loading process straight into the memory that it shares with training.
+        # Like `torch.stack`, but a loader's worker process writes directly into memory that it shares with training.
         return default_collate(values)
     if isinstance(first, TensorDataclass):
         return stack(values)

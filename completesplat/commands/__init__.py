@@ -1,4 +1,4 @@
-"""The verbs of the command line, one thin file each, and how hydra starts them."""
+"""The verbs of the command line, one module each, and the code that starts them through Hydra."""
 
 import logging
 import os
@@ -41,26 +41,26 @@ UNHELPFUL_WARNINGS = (
 
 
 def launch(verb: str, arguments: list[str]) -> None:
-    """Compose the verb's configuration (`conf/<verb>.yaml`) and run it, once or as a sweep.
+    """Compose the verb's config (`conf/<verb>.yaml`) and run it, once or as a sweep.
 
     `data toy` is short for `data data_task=toy`, `predict A B` for `predict image=[A,B]`, `view PATH` for
     `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
     """
     jobs.use_working_folder()
-    # A further process of a job: Lightning starts one for each device.
+    # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
         starter, _, out_name = arguments[0].partition("=")[2].partition(":")
         out = Path(out_name)
         end_with(int(starter))
         with ended_by_signals():
             return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
-    program, given = sys.argv[0], arguments
+    program, original = sys.argv[0], arguments
     arguments = behind_dashes(arguments)
     if any(flag in arguments for flag in help.FLAGS):
         return print(help.page(verb, arguments))
     # Hydra would print its own report and exit; errors are reported in one place, `cli.main`.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    # What a full disk keeps from the log is no error of its own: whatever is written next says it in one line.
+    # Logging stays silent on a full disk, because the next file that is written reports it in one line.
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
     if any(flag in arguments for flag in SWEEP):
@@ -68,16 +68,15 @@ def launch(verb: str, arguments: list[str]) -> None:
     elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
     sys.argv = [f"completesplat {verb}", *arguments]
-
     failures: list[Exception] = []
 
     def job(config: Any) -> float | None:
         try:
             with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
-                return jobs.run_job(verb, config, program, given)
+                return jobs.run_job(verb, config, program, original)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.MULTIRUN:
-                raise  # hydra says which job it was, goes on with the others, and raises in the end
+                raise  # Hydra names the job, runs the others, and raises at the end
             failures.append(error)
             return None
 
@@ -109,7 +108,7 @@ def compose(verb: str, *overrides: str) -> Any:
 
 
 def best_precision() -> str:
-    """Lightning's precision for networks: bfloat16 where the processor computes in it, else float32."""
+    """Return Lightning's precision for networks: bfloat16 where the GPU, or else the CPU, supports it, or float32."""
     import torch
 
     on_gpu = torch.cuda.is_available()
@@ -120,7 +119,7 @@ def best_precision() -> str:
 def quieten() -> None:
     """Keep Lightning's hints about its products and settings out of the output; its errors and progress stay.
 
-    To be called after Lightning is imported, which sets these levels itself.
+    Call this after importing Lightning, because the import sets these levels itself.
     """
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -129,15 +128,15 @@ def quieten() -> None:
 
 
 def refusal(error: BaseException) -> str | None:
-    """One line for an error that the user can put right; None for a fault of the program."""
-    if (own := _own_error(error)) is not None:
-        return " ".join(str(own).split())
+    """Return one line for an error that the user can put right, None for a fault of the program."""
+    if (own_error := _own_error(error)) is not None:
+        return " ".join(str(own_error).split())
     if isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
-        named = str(error).partition("Missing mandatory value: ")[2].split()  # omegaconf keeps it nowhere else
+        named = str(error).partition("Missing mandatory value: ")[2].split()  # OmegaConf has it nowhere else
         key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
         return f"{key} is needed: give {key}=VALUE"
     if isinstance(error, InstantiationException):
-        # A module or name that is not there may be misspelt; what else is raised while parts are made is a fault.
+        # A missing module or name may be misspelt; any other error while parts are built is a fault of the program.
         if error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError):
             return " ".join(str(error.__cause__).split())
         return _of_a_library(error)
@@ -147,7 +146,7 @@ def refusal(error: BaseException) -> str | None:
 
 
 def _of_a_library(error: InstantiationException) -> str | None:
-    """One line for a setting that a library's class refuses; None for what the package itself raises."""
+    """Return one line for an option that a library's class refuses, None for an error of the package itself."""
     called, cause = CALLED.match(str(error)), error.__cause__
     if called is None or not (isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS):
         return None
@@ -156,13 +155,13 @@ def _of_a_library(error: InstantiationException) -> str | None:
 
 
 def exit_status(error: BaseException) -> int:
-    """Of an error that `refusal` has a line for."""
-    own = _own_error(error)
-    return 2 if own is None else own.exit_status
+    """Return the exit status for an error that `refusal` can explain."""
+    own_error = _own_error(error)
+    return 2 if own_error is None else own_error.exit_status
 
 
 def _own_error(error: BaseException) -> CompleteSplatError | None:
-    """The package's own error in a chain of causes, or one for a full disk or a bad file name."""
+    """Return the package's own error in a chain of causes, or a new one for a full disk or a bad file name."""
     chain: BaseException | None = error
     while chain is not None:
         if isinstance(chain, CompleteSplatError):
@@ -173,7 +172,7 @@ def _own_error(error: BaseException) -> CompleteSplatError | None:
     return None
 
 
-# What `conf/` interpolates besides hydra's own; here, because jobs that a cluster starts elsewhere import this alone.
+# Resolvers used in `conf/`. They are registered here because jobs that a cluster starts import only this module.
 OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
 OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
 OmegaConf.register_new_resolver("gsplat", lambda name: gsplat_constants()[name], replace=True)

@@ -1,4 +1,4 @@
-"""What people type behind a verb, made into what hydra reads: words, files of any name, and settings."""
+"""The arguments behind a verb, rewritten for Hydra: words, file names with any characters, and settings."""
 
 import os
 import re
@@ -14,37 +14,34 @@ from completesplat.options import TASKS, groups, meant, options
 
 EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
-"""Hydra's flags behind which another argument belongs to them."""
+"""Hydra's flags that take the next argument as their value."""
 SWEEP = ("-m", "--multirun")
 MOST_SHOWN = 120  # characters of a value
 
 
 def quoted(text: str) -> str:
-    """A text as hydra takes it, every character as it is: neither lists nor references to other settings in it."""
+    """Quote a text so that Hydra takes every character literally, without lists or references to other settings."""
     unreferring = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
     return QuotedString(text=unreferring, quote=Quote.single).with_quotes()
 
 
 def behind_dashes(arguments: Sequence[str]) -> list[str]:
-    """Remove `--`, behind which no argument is a flag: `-name.png` becomes `./-name.png`."""
+    """Remove `--`. No argument behind it is a flag, so `-name.png` becomes `./-name.png` there."""
     before = list(arguments).index("--") if "--" in arguments else len(arguments)
-    behind = [f"./{one}" if one.startswith("-") else one for one in arguments[before + 1 :]]
+    behind = [f"./{argument}" if argument.startswith("-") else argument for argument in arguments[before + 1 :]]
     return [*arguments[:before], *behind]
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate Hydra's flags, with the values that belong to them, from the other arguments.
-
-    Hydra takes flags before or behind the settings, not between them. `CompleteSplatError`: a flag lacks its value.
-    """
-    flags, others, given = [], [], iter(arguments)
-    for argument in given:
+    """Separate Hydra's flags and their values from the other arguments, because Hydra takes no flags between them."""
+    flags, others, remaining = [], [], iter(arguments)
+    for argument in remaining:
         name, equals, value = argument.partition("=")
         if name == EXPORT or not name.startswith("-"):
             others.append(argument)
         elif name not in WITH_VALUE:
             flags.append(argument)
-        elif value := value if equals else next(given, ""):
+        elif value := value if equals else next(remaining, ""):
             flags.append(f"{name}={value}")
         else:
             raise CompleteSplatError(f"{name}: lacks its value; give {name} VALUE")
@@ -52,7 +49,7 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def of_predict(arguments: Sequence[str]) -> list[str]:
-    """`a.jpg b.jpg` as `image=['a.jpg','b.jpg']`; `CompleteSplatError` if `image=` is given besides."""
+    """Rewrite `a.jpg b.jpg` as `image=['a.jpg','b.jpg']`."""
     words, others = _split(arguments)
     if not words:
         return others
@@ -63,13 +60,13 @@ def of_predict(arguments: Sequence[str]) -> list[str]:
 
 
 def of_view(arguments: Sequence[str]) -> list[str]:
-    """`PATH` as `path='PATH'`, and `--export FILE` as `export='FILE'`; `CompleteSplatError` for two paths."""
-    plain, exported, given = [], [], iter(arguments)
-    for argument in given:
+    """Rewrite `PATH` as `path='PATH'`, and `--export FILE` as `export='FILE'`."""
+    plain, exported, remaining = [], [], iter(arguments)
+    for argument in remaining:
         if argument.partition("=")[0] != EXPORT:
             plain.append(argument)
             continue
-        file = argument.partition("=")[2] or next(given, "")
+        file = argument.partition("=")[2] or next(remaining, "")
         if not file:
             raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
         exported.append(f"export={quoted(file)}")
@@ -80,7 +77,7 @@ def of_view(arguments: Sequence[str]) -> list[str]:
 
 
 def of_new(arguments: Sequence[str]) -> list[str]:
-    """`KIND NAME` as `kind='KIND' name='NAME'`; `CompleteSplatError` for more words."""
+    """Rewrite `KIND NAME` as `kind='KIND' name='NAME'`."""
     words, others = _split(arguments)
     if len(words) > 2:
         raise CompleteSplatError(f"give one kind and one name, not {' '.join(map(_shown, words))}")
@@ -88,7 +85,7 @@ def of_new(arguments: Sequence[str]) -> list[str]:
 
 
 def of_task(verb: str) -> Callable[[Sequence[str]], list[str]]:
-    """For a verb with tasks: `TASK` as `VERB_task=TASK`, if it is the first argument."""
+    """Return the function that rewrites a first argument `TASK` as `VERB_task=TASK`, for a verb with tasks."""
 
     def overrides(arguments: Sequence[str]) -> list[str]:
         if not arguments or "=" in arguments[0]:
@@ -104,10 +101,11 @@ SHORT_FORMS = {"predict": of_predict, "view": of_view, "new": of_new, **{verb: o
 def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
-    The value of a setting that is the name of a file or folder as it stands is that name, whatever is in it: `a,b.jpg`.
+    A value that is the name of an existing file or folder is taken literally, whatever it contains: `a,b.jpg`.
 
     Raises:
-        CompleteSplatError: a word that is no setting, a value that cannot be read, several values without `-m`.
+        CompleteSplatError: a flag lacks its value, there are too many words, images are given by name and by `image=`,
+            a word is no setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
     """
     flags, others = split_flags(arguments)
     settings = [_with_file(argument) for argument in SHORT_FORMS.get(verb, list)(others)]
@@ -117,9 +115,9 @@ def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate words, which have no = or name a file, from the other arguments."""
-    words = [one for one in arguments if ("=" not in one and not one.startswith("~")) or os.path.isfile(one)]
-    return words, [one for one in arguments if one not in words]
+    """Separate words, which contain no `=` or name a file, from the other arguments."""
+    words = [word for word in arguments if ("=" not in word and not word.startswith("~")) or os.path.isfile(word)]
+    return words, [argument for argument in arguments if argument not in words]
 
 
 def _with_file(argument: str) -> str:
@@ -127,8 +125,8 @@ def _with_file(argument: str) -> str:
     if not equals or not os.path.exists(value):
         return argument
     try:
-        read = OverridesParser.create().parse_override(argument)
-        if not read.is_sweep_override() and not isinstance(read.value(), list | dict):
+        override = OverridesParser.create().parse_override(argument)
+        if not override.is_sweep_override() and not isinstance(override.value(), list | dict):
             return argument
     except HydraException:
         pass
@@ -142,26 +140,26 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
         nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else meant(argument, groups())
         raise CompleteSplatError(f"{_shown(argument)}: no setting, which are given as key=value{nearest}")
     try:
-        read = OverridesParser.create().parse_override(argument)
+        override = OverridesParser.create().parse_override(argument)
     except HydraException:
         example = f'"{key}={_readable(value)}"'
-        said = "cannot be read; a text with such characters wants quotes"
-        raise CompleteSplatError(f"{_shown(argument)}: {said}: {_shown(example)}") from None
-    if read.is_sweep_override() and not sweep:
-        said = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
-        raise CompleteSplatError(f"{_shown(argument)}: {_shown(said)}")
-    if read.key_or_group == "out" and not read.is_sweep_override() and read.value() in ("", None):
+        message = "cannot be read; a text with such characters wants quotes"
+        raise CompleteSplatError(f"{_shown(argument)}: {message}: {_shown(example)}") from None
+    if override.is_sweep_override() and not sweep:
+        message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
+        raise CompleteSplatError(f"{_shown(argument)}: {_shown(message)}")
+    if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
 
 
 def _readable(value: str) -> str:
-    """The value in quotes; of a list, its entries."""
+    """Quote a value, or each entry of a list."""
     if not (value.startswith("[") and value.endswith("]")):
         return quoted(value)
-    entries = re.split(r",(?![^\[\]]*\])", value[1:-1])  # a list inside stays whole
+    entries = re.split(r",(?![^\[\]]*\])", value[1:-1])  # an inner list is not split
     return f"[{','.join(quoted(entry.strip()) for entry in entries)}]"
 
 
 def _shown(text: str) -> str:
-    shown = printable(text)
-    return shown if len(shown) <= MOST_SHOWN else f"{shown[:MOST_SHOWN]}..."
+    preview = printable(text)
+    return preview if len(preview) <= MOST_SHOWN else f"{preview[:MOST_SHOWN]}..."

@@ -18,13 +18,13 @@ Splits = Annotated[Sequence[Split], Entries(1)]
 
 
 def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
-    """Read everything once and write `check.json`; exit status 1 when nothing is usable."""
+    """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
     from completesplat.data.audit import Findings, show
     from completesplat.data.audit import check as check_sources
 
     try:
         findings = check_sources(_sources(data, splits), workers)
-    except DataError as error:  # the data set as a whole
+    except DataError as error:  # concerns the data set as a whole
         findings = Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
     show(findings)
@@ -40,15 +40,15 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     from completesplat.studies.statistics import plot_statistics, show_statistics, statistics
 
     sources = _sources(data, splits)
-    shown = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
-    results = statistics({split: _readable(sources[split], names) for split, names in shown.items()})
+    tracked_names = {split: track(source.names, f"reading cameras of {split}") for split, source in sources.items()}
+    results = statistics({split: _readable(sources[split], names) for split, names in tracked_names.items()})
     write_text(out / "stats.json", json.dumps(results, indent=2, allow_nan=False) + "\n")
     plot_statistics(results, out / "stats.png", str(data.root))
     show_statistics(results)
 
 
 def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
-    """Write `show.png`: pictures and cameras of some sequences, evenly spread over a split."""
+    """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
     source = _sources(data, [split])[split]
@@ -93,7 +93,7 @@ def latents(
     devices: Positive,
     num_nodes: Positive,
 ) -> None:
-    """Encode the training set of stage 1's run into `out`; see `completesplat.training.encoding`."""
+    """Encode the training set of a stage-1 run into `out`; see `completesplat.training.encoding`."""
     from hydra.utils import instantiate
     from lightning import Fabric
 
@@ -120,7 +120,7 @@ def latents(
 
 
 def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
-    """The splits that are there; what is broken in them is collected by them, not raised."""
+    """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()
     sources, missing = {}, []

@@ -1,4 +1,4 @@
-"""`completesplat doctor`: what this machine has, what it lacks, and whether completing a photograph can work."""
+"""`completesplat doctor`: a report of what this machine has and lacks, and whether `predict` can work on it."""
 
 import os
 import platform
@@ -33,14 +33,14 @@ EXTRAS = {
 OWN_PARTS = "completesplat.commands.doctor_checks"
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100e6
-"""Bytes: the files of a few predictions."""
+"""Bytes that the files of a few predictions take."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found, is missing, which is no error, or is broken: completing a photograph needs it.
+    """Result of one check: present ("yes"), absent but not necessary ("no"), or "broken", which stops predictions.
 
-    It says a version, a place, or the reason and what to do.
+    `said` is a version, a place, or the reason and what to do.
     """
 
     name: str
@@ -49,30 +49,30 @@ class Finding:
 
 
 def one_line(error: BaseException) -> str:
-    """An exception's kind and message, without line breaks and not too long."""
+    """Return an exception's type and message, without line breaks and of limited length."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".removesuffix(": ")
 
 
 def size(count: float) -> str:
-    """Bytes as `3.2 GB`, `14.1 MB`, `0.3 MB`."""
+    """Format bytes as `3.2 GB`, `14.1 MB`, `0.3 MB`."""
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
 
 
 def check_packages() -> Iterator[Finding]:
-    """Versions of what is needed."""
+    """Yield the versions of Python, this package and the packages that it requires."""
     yield Finding("completesplat", "yes", __version__)
     yield Finding("python", "yes", f"{platform.python_version()} on {platform.system()}")
     try:
         needed = [Requirement(line) for line in requires("completesplat") or ()]
     except PackageNotFoundError:
-        said = "runs from its source without being installed; `pip install -e .` there also fetches what it needs"
-        yield Finding("installation", "no", said)
+        message = "runs from its source without being installed; `pip install -e .` there also fetches what it needs"
+        yield Finding("installation", "no", message)
         return
-    yield from needed_packages(one for one in needed if applies(one, ""))
+    yield from needed_packages(requirement for requirement in needed if applies(requirement, ""))
 
 
 def check_extras() -> Iterator[Finding]:
-    """What each extra would give; nothing where this package is not installed."""
+    """Yield the packages of each extra; nothing where this package is not installed."""
     with suppress(PackageNotFoundError):
         lines = [Requirement(line) for line in requires("completesplat") or ()]
         for name, gives in EXTRAS.items():
@@ -80,30 +80,30 @@ def check_extras() -> Iterator[Finding]:
 
 
 def check_imports() -> Iterator[Finding]:
-    """Whether what draws and writes a prediction can be imported; raises whatever stands in the way."""
+    """Import the modules that compute and write a prediction; their exceptions are not caught here."""
     for module in ("completesplat.generation", "completesplat.export.prediction"):
         import_module(module)
     yield Finding("networks, files", "yes", "all that completing a photograph imports")
 
 
 def applies(requirement: Requirement, extra: str) -> bool:
-    """Whether a package is needed here for an extra, "" for none."""
+    """Return whether this machine needs a package for an extra, or without any (`""`)."""
     return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
 
 
 def needed_packages(needed: Iterable[Requirement]) -> Iterator[Finding]:
-    """A line for each of the best known and for each that is missing or of another version; one for all others."""
+    """Yield one finding for each well-known, missing or mismatched package, and one that counts all others."""
     lines, others = [], 0
     for requirement in needed:
-        found = _version(requirement)
-        if found is None:
-            said = f'missing; `pip install "{requirement.name}{requirement.specifier}"`'
-            lines.append(Finding(requirement.name, "broken", said))
-        elif not requirement.specifier.contains(found, prereleases=True):
-            said = f"{found}, which is not {requirement.specifier}: it may or may not work"
-            lines.append(Finding(requirement.name, "no", said))
+        installed = _version(requirement)
+        if installed is None:
+            message = f'missing; `pip install "{requirement.name}{requirement.specifier}"`'
+            lines.append(Finding(requirement.name, "broken", message))
+        elif not requirement.specifier.contains(installed, prereleases=True):
+            message = f"{installed}, which is not {requirement.specifier}: it may or may not work"
+            lines.append(Finding(requirement.name, "no", message))
         elif requirement.name in ALWAYS_SHOWN:
-            lines.append(Finding(requirement.name, "yes", found))
+            lines.append(Finding(requirement.name, "yes", installed))
         else:
             others += 1
     yield from sorted(lines, key=lambda line: line.name not in ALWAYS_SHOWN)
@@ -111,12 +111,12 @@ def needed_packages(needed: Iterable[Requirement]) -> Iterator[Finding]:
 
 
 def extra_packages(name: str, gives: str, requirements: Iterable[Requirement]) -> Iterator[Finding]:
-    """A line for each package of an extra; one that is not installed is no error."""
+    """Yield one finding for each package of an extra; a package that is not installed is no error."""
     for requirement in requirements:
         if applies(requirement, name) and not applies(requirement, ""):
-            found = _version(requirement)
-            said = f"{found}: {gives}" if found else f'{gives}: pip install "completesplat[{name}]"'
-            yield Finding(requirement.name, "yes" if found else "no", said)
+            installed = _version(requirement)
+            message = f"{installed}: {gives}" if installed else f'{gives}: pip install "completesplat[{name}]"'
+            yield Finding(requirement.name, "yes" if installed else "no", message)
 
 
 def _version(requirement: Requirement) -> str | None:
@@ -127,7 +127,7 @@ def _version(requirement: Requirement) -> str | None:
 
 
 def check_device() -> Iterator[Finding]:
-    """A GPU that is not there is no error: small models draw in seconds without."""
+    """Yield CPU, memory and GPUs. A missing GPU is no error: small models draw samples in seconds without one."""
     import torch
 
     from completesplat.results.machine import machine
@@ -145,7 +145,7 @@ def check_device() -> Iterator[Finding]:
 
 
 def no_gpu() -> str:
-    """Why torch sees none."""
+    """Return the reason why torch sees no GPU."""
     import torch
 
     if torch.version.cuda is None:
@@ -156,10 +156,10 @@ def no_gpu() -> str:
 
 
 def check_data(conf: Path, place: Path) -> Iterator[Finding]:
-    """The data sets of the configurations in `conf`, with roots from `place`: needed to train, not to predict."""
+    """Yield the data sets in `conf`, with roots relative to `place`; they are needed to train, not to predict."""
     for path in sorted(conf.glob("*.yaml")):
         config = OmegaConf.to_container(OmegaConf.load(path))
-        # One without a root of its own has another one's, or cannot be chosen.
+        # A config without a root inherits one, or cannot be chosen.
         if not isinstance(config, dict) or "root" not in config:
             continue
         name, root = path.stem, str(config["root"])
@@ -173,15 +173,15 @@ def check_data(conf: Path, place: Path) -> Iterator[Finding]:
 
 
 def check_tools(place: Path) -> Iterator[Finding]:
-    """Videos need ffmpeg, which comes as a package; node is for exports only. Space is that of `place`'s disk."""
+    """Yield ffmpeg (for videos; a package brings it), Node.js (for exports only) and free space on `place`'s disk."""
     from completesplat.export.splat_transform import PACKAGE, PROGRAM
 
     yield _ffmpeg()
     yield _node(PROGRAM)
     path = shutil.which(PROGRAM)
     how = "npx fetches it when they are asked for" if shutil.which("npx") else "first Node.js with npm"
-    said = f"for formats spz, sog and html: `npm install -g {PACKAGE}`, or {how}"
-    yield Finding(PROGRAM, "yes" if path else "no", path or said)
+    message = f"for formats spz, sog and html: `npm install -g {PACKAGE}`, or {how}"
+    yield Finding(PROGRAM, "yes" if path else "no", path or message)
     free = shutil.disk_usage(place).free
     short = ": too little for a prediction's files" if free < LEAST_SPACE else ""
     yield Finding("free disk", "broken" if short else "yes", f"{size(free)} in {place}{short}")
@@ -191,11 +191,11 @@ def _ffmpeg() -> Finding:
     try:
         import imageio_ffmpeg
 
-        said = f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}"
-    except Exception as error:  # a program that is missing, cannot be run, or says nothing
-        said = f"{one_line(error)}; for videos, `pip install --force-reinstall imageio-ffmpeg`"
-        return Finding("ffmpeg", "broken", said)
-    return Finding("ffmpeg", "yes", said)
+        message = f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}"
+    except Exception as error:  # the program is missing, cannot be run, or prints nothing
+        message = f"{one_line(error)}; for videos, `pip install --force-reinstall imageio-ffmpeg`"
+        return Finding("ffmpeg", "broken", message)
+    return Finding("ffmpeg", "yes", message)
 
 
 def _node(program: str) -> Finding:
@@ -203,20 +203,20 @@ def _node(program: str) -> Finding:
     if path is None:
         return Finding("node", "no", f"version 20 or newer runs {program}: https://nodejs.org")
     try:
-        found = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True).stdout
+        printed = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=10, check=True).stdout
     except (OSError, subprocess.SubprocessError) as error:
         return Finding("node", "no", f"{path} does not run: {one_line(error)}")
-    return Finding("node", "yes", f"{found.strip()}, {path}")
+    return Finding("node", "yes", f"{printed.strip()}, {path}")
 
 
 def run(config: Any, out: Path) -> None:
-    """Print the table and write `doctor.json`; exit status 1 if something is broken that a prediction needs."""
+    """Print the table and write `doctor.json`; exit with status 1 if something that a prediction needs is broken."""
     findings: dict[str, Sequence[Finding]] = {}
     with Console(stderr=True).status("looking") as status:
         for part, check in checks(Path.cwd()).items():
             status.update(f"looking at: {part}")
             findings[part] = findings_of(check)
-    rows = [{"part": part, **vars(finding)} for part, found in findings.items() for finding in found]
+    rows = [{"part": part, **vars(finding)} for part, part_findings in findings.items() for finding in part_findings]
     broken = [f"{row['part']}, {row['name']}: {row['said']}" for row in rows if row["state"] == "broken"]
     write_json(out / "doctor.json", {"works": not broken, "findings": rows})
     show(findings)
@@ -228,13 +228,13 @@ def run(config: Any, out: Path) -> None:
 
 
 def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
-    """The parts of the machine with their checks, in the order of the table."""
+    """Return the checks by the part of the machine that they examine, in the order of the table."""
     return {
         "packages": check_packages,
         "extras": check_extras,
         "imports": check_imports,
         "device": check_device,
-        # These need the package's own parts, which are imported only now.
+        # These need other modules of the package, which are imported only when the check runs.
         "rasterizers": lambda: import_module(OWN_PARTS).check_rasterizers(),
         "weights": lambda: import_module(OWN_PARTS).check_weights(),
         "data": lambda: check_data(conf_folder() / "data", place),
@@ -243,20 +243,20 @@ def checks(place: Path) -> dict[str, Callable[[], Iterable[Finding]]]:
 
 
 def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
-    """The findings of a check; an exception, such as a failing import, becomes a finding."""
+    """Run a check; an exception, such as that of a failing import, becomes a finding."""
     try:
         return list(check())
-    except Exception as error:  # of any library: the other parts are looked at all the same
+    except Exception as error:  # of any library: the other checks still run
         return [Finding("check", "broken", one_line(error))]
 
 
 def show(findings: Mapping[str, Sequence[Finding]]) -> None:
-    """The table, with a rule between the parts."""
+    """Print the table, with a rule between the parts."""
     table = Table(title="completesplat doctor", title_justify="left")
     for heading in ("part", "what", "here", "which, or why not"):
         table.add_column(heading, overflow="fold")
-    for part, found in findings.items():
-        for index, finding in enumerate(found):
+    for part, part_findings in findings.items():
+        for index, finding in enumerate(part_findings):
             state = Text(finding.state, style=STYLES[finding.state])
             table.add_row("" if index else part, Text(finding.name), state, Text(finding.said))
         table.add_section()

@@ -1,4 +1,4 @@
-"""The checks of `completesplat doctor` that need the package's own parts: rasterizers and weights."""
+"""The checks of `completesplat doctor` that need other modules of the package: rasterizers and weights."""
 
 import math
 from collections.abc import Iterator
@@ -26,22 +26,22 @@ VAE = "CompVis/stable-diffusion-v1-4"
 
 
 def check_rasterizers() -> Iterator[Finding]:
-    """The backends, fastest first. The last one, which needs torch alone, must work; the others need not."""
+    """Yield the rasterizers, fastest first. Only the last one, which needs nothing but torch, must work."""
     faster = {name: failure(name, None) or wrong(make(None)) for name, make in FASTER.items()}
     for name, reason in faster.items():
         yield Finding(name, "no" if reason else "yes", reason or GOOD)
     reason = wrong(ReferenceRasterizer())
-    said = f"{GOOD}; with nothing else, predictions are very slow" if all(faster.values()) else GOOD
-    yield Finding("reference", "broken" if reason else "yes", reason or said)
+    message = f"{GOOD}; with nothing else, predictions are very slow" if all(faster.values()) else GOOD
+    yield Finding("reference", "broken" if reason else "yes", reason or message)
 
 
 @torch.no_grad()
 def wrong(rasterizer: Rasterizer) -> str | None:
-    """How the picture of two round Gaussians, one behind the other on the optical axis, is wrong; None if it is right.
+    """Render two round Gaussians, one behind the other on the optical axis; return what is wrong, None if nothing is.
 
-    With focal length f, a Gaussian of size s at depth z is a disc of variance (f s / z)^2 and the blur's, in px^2: its
-    alpha is its opacity in the middle, and exp(-1 / (2 variance)) of that one pixel aside. The front one covers the
-    other (gsplat's conventions, see `completesplat.rasterizers`).
+    With focal length f, a Gaussian of scale s at depth z is a disc of variance (f s / z)^2 plus the blur, in px^2. Its
+    alpha is its opacity at the center, and exp(-1 / (2 variance)) times that one pixel aside. The front one is
+    composited over the other (gsplat's conventions, see `completesplat.rasterizers`).
     """
     focal, depths, sizes, opacities = 40.0, (2.0, 4.0), (0.1, 0.4), (0.8, 0.5)
     colors = torch.tensor([[0.9, 0.5, 0.1], [0.2, 0.4, 1.0]])
@@ -55,18 +55,18 @@ def wrong(rasterizer: Rasterizer) -> str | None:
         front, back = (o * math.exp(-(aside**2) / (2 * v)) for o, v in zip(opacities, variances, strict=True))
         true = front * colors[0] + (1 - front) * back * colors[1]
         difference = (drawn[:, 2, 2 + aside] - true).abs().max().item()
-        if not difference <= TOLERANCE:  # not-a-number is wrong too
+        if not difference <= TOLERANCE:  # NaN is wrong too
             return f"its test rendering is wrong by {difference:.2g}"
     return None
 
 
 def check_weights(box: Path = BOX) -> Iterator[Finding]:
-    """The package's own, in folders of `box`, and published ones, which are no error if missing: they are fetched."""
-    own = sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
-    yield from map(_own, own)
-    if not own:
-        said = "none come with this version: give predict weights=FOLDER, the `weights` that a run of stage 2 leaves"
-        yield Finding("in the package", "no", said)
+    """Yield the package's weights, in folders of `box`, and published ones, which are downloaded if missing."""
+    folders = sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
+    yield from map(_own, folders)
+    if not folders:
+        message = "none come with this version: give predict weights=FOLDER, the `weights` that a run of stage 2 leaves"
+        yield Finding("in the package", "no", message)
     for name, url in PUBLISHED:
         path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
         yield _published(name, path if path.is_file() else None, f"from {url} when it is asked for")

@@ -1,4 +1,4 @@
-"""`completesplat VERB --help`: what can be set, with comments from `conf/`, what it may be, and examples."""
+"""`completesplat VERB --help`: the settings with their comments in `conf/`, allowed values, and examples."""
 
 import inspect
 import re
@@ -32,13 +32,14 @@ REMARK = "the paper"
 FLAGS = ("--help", "-h")
 NEEDED = "???"
 ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {6,}\S.*)*)", re.MULTILINE)
-"""In the docstring of a class: what is said of one argument or of several."""
+"""An entry of a docstring's `Args:`, for one argument or several."""
 
 
 def page(verb: str, arguments: Sequence[str]) -> str:
-    """The text for a verb; with its task (`data toy --help`) for that, with a group (`fit --help data`) for a part.
+    """Return the help text of a verb, of one of its tasks (`data toy --help`) or groups (`fit --help data`).
 
-    `CompleteSplatError`: there is no such task or group.
+    Raises:
+        CompleteSplatError: there is no such task or group.
     """
     words = [argument for argument in arguments if argument not in FLAGS and not argument.startswith("-")]
     task = None
@@ -65,15 +66,15 @@ def _body(verb: str, task: str | None) -> list[str]:
         parts.append(f"Tasks (completesplat {verb} TASK --help shows one):\n\n" + "\n".join(_row(*row) for row in rows))
     of_task = f" of {verb} {task}" if task is not None else ""
     hints = _hints(verb, task)
-    shown = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
-    parts.append(f"Settings{of_task} (key=value):\n\n" + "\n".join(shown))
+    lines = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
+    parts.append(f"Settings{of_task} (key=value):\n\n" + "\n".join(lines))
     groups, about = choices_of_verb(verb, task), about_groups()
     if groups:
         rows = [(_chosen(group), _about(group, about)) for group in groups]
-        said = (
+        heading = (
             f"Parts (group=option chooses; completesplat {f'{verb} {task}' if task else verb} --help GROUP shows one):"
         )
-        parts.append(f"{said}\n\n" + "\n".join(_row(*row) for row in rows))
+        parts.append(f"{heading}\n\n" + "\n".join(_row(*row) for row in rows))
     return [
         *parts,
         "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'.",
@@ -81,17 +82,21 @@ def _body(verb: str, task: str | None) -> list[str]:
 
 
 def part_page(verb: str, choice: Choice, option: str) -> str:
-    """The settings of one option of a group; `CompleteSplatError`: there is none of this name."""
+    """Return the help text of one option of a group.
+
+    Raises:
+        CompleteSplatError: the group has no option of this name.
+    """
     named = options(choice.group)
     if option == "null":
-        said = f"{choice.place}: {_about(choice, about_groups())}"
-        return f"{_wrapped(said)}\nTo see one: completesplat {verb} --help {choice.place}=OPTION"
+        message = f"{choice.place}: {_about(choice, about_groups())}"
+        return f"{_wrapped(message)}\nTo see one: completesplat {verb} --help {choice.place}=OPTION"
     if option not in named:
         raise CompleteSplatError(f"no {choice.group} {option!r}: there are {', '.join(named)}{meant(option, named)}")
     place = None if choice.place == choice.group else choice.place
     settings = settings_of_option(choice.group, option, place)
     targets = {key.removesuffix("._target_"): value for key, value, _ in settings if key.endswith("._target_")}
-    settings = [one for one in settings if not one.key.rpartition(".")[2].startswith("_")]
+    settings = [setting for setting in settings if not setting.key.rpartition(".")[2].startswith("_")]
     known = {key: _of_target(target) for key, target in targets.items()}
     lines = []
     for setting in settings:
@@ -108,7 +113,7 @@ def part_page(verb: str, choice: Choice, option: str) -> str:
 
 
 def _wrapped(text: str) -> str:
-    """Lines of at most 120 columns, but commands (indented) as they are."""
+    """Wrap lines at 120 columns, except commands, which are indented."""
     lines = [[line] if line.startswith(" ") else textwrap.wrap(line, WIDTH) for line in text.splitlines()]
     return "\n".join(line for some in lines for line in some)
 
@@ -118,7 +123,7 @@ def _first_sentence(text: str) -> str:
 
 
 def _hints(verb: str, task: str | None) -> Mapping[str, Any]:
-    """Annotations of a verb's own settings, as far as what they start is known and can be imported."""
+    """Return the annotations of a verb's own settings, where the function that takes them can be imported."""
     if verb in OF_VERBS:
         return hints_of(OF_VERBS[verb])
     named = {setting.key: setting.value for setting in with_bases(f"{verb}_task", task).settings} if task else {}
@@ -126,18 +131,18 @@ def _hints(verb: str, task: str | None) -> Mapping[str, Any]:
 
 
 def _of_target(target: str) -> tuple[Mapping[str, Any], Mapping[str, str]]:
-    """Annotations of what a class or function is called with, and what docstrings say of it, by name."""
+    """Return annotations and descriptions (from docstrings) of a class's or function's arguments, by name."""
     module, _, name = target.rpartition(".")
     try:
-        found = getattr(import_module(module), name)
-        hints, _ = arguments_of(found)
-    except Exception:  # a part that this machine lacks is no reason to show nothing
+        function = getattr(import_module(module), name)
+        hints, _ = arguments_of(function)
+    except Exception:  # help also works where this machine lacks a package
         return {}, {}
-    said: dict[str, str] = {}
-    for kind in found.__mro__ if isinstance(found, type) else (found,):
+    descriptions: dict[str, str] = {}
+    for kind in function.__mro__ if isinstance(function, type) else (function,):
         for names, text in ENTRY.findall(inspect.cleandoc(kind.__doc__ or "")):
-            said = {one: " ".join(text.split()) for one in names.split(", ")} | said
-    return hints, said
+            descriptions = {argument: " ".join(text.split()) for argument in names.split(", ")} | descriptions
+    return hints, descriptions
 
 
 def _line(setting: Setting, hint: Any, documented: Mapping[str, str], verb: str = "") -> str:
@@ -145,14 +150,14 @@ def _line(setting: Setting, hint: Any, documented: Mapping[str, str], verb: str 
     key = setting.key if value in ("", NEEDED) or "${" in value else f"{setting.key}={value}"
     kind = described(hint) or _kind_of(value)
     documentation = documented.get(setting.key.rpartition(".")[2], "")
-    # What is remarked on the paper stands beside what the setting is.
-    said = f"{documentation} {setting.comment}" if REMARK in setting.comment[:20] else setting.comment or documentation
-    parts = ["needed;" if value == NEEDED else "", said.strip(), f"[{kind}]" if kind else ""]
+    # A remark on the paper follows the description; any other comment replaces it.
+    text = f"{documentation} {setting.comment}" if REMARK in setting.comment[:20] else setting.comment or documentation
+    parts = ["needed;" if value == NEEDED else "", text.strip(), f"[{kind}]" if kind else ""]
     return _row(key, " ".join(filter(None, parts)))
 
 
 def _kind_of(value: str) -> str:
-    """What a setting may be, by the value that it has, where nothing else says it."""
+    """Return the kind of a setting, judged by its value, for settings without an annotation."""
     kinds = {r"true|false": "true or false", r"-?\d+": "whole number", r"-?\d*\.\d*(e[+-]?\d+)?": "number"}
     kinds |= {r"\[.*": "list", r"\{.*": "mapping"}
     return next((kind for pattern, kind in kinds.items() if re.fullmatch(pattern, value)), "")
@@ -163,12 +168,12 @@ def _chosen(choice: Choice) -> str:
 
 
 def _about(choice: Choice, about: Mapping[str, str]) -> str:
-    said = (choice.comment or about.get(choice.group, "")).replace("`", "").rstrip(".")
-    return f"{said} [{', '.join(options(choice.group))}]".strip()
+    text = (choice.comment or about.get(choice.group, "")).replace("`", "").rstrip(".")
+    return f"{text} [{', '.join(options(choice.group))}]".strip()
 
 
 def _row(key: str, text: str) -> str:
-    """A key, and beside it a text in lines of at most 120 columns."""
+    """Format a key with a text beside it, in lines of at most 120 columns."""
     indent = " " * COLUMN
     lines = textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_long_words=False) or [""]
     if len(key) + 3 <= COLUMN:

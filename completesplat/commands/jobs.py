@@ -1,4 +1,4 @@
-"""The jobs of a sweep and single runs: their folders, what is recorded of them, what continues."""
+"""The jobs of a sweep and single runs: their folders, locks and records, and how they continue."""
 
 import gc
 import hashlib
@@ -47,22 +47,22 @@ MAY_CHANGE = (
     *("ckpt_path", "data.allow_changed", "optimized_metric"),
     *("trainer.devices", "trainer.num_nodes", "trainer.strategy"),
 )
-"""Settings that a run may go on without; the last one with all below it."""
+"""Settings that may differ when a run continues; of the last one, also all settings below it."""
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
 
 
 class SettingsOfWorkingFolder(SearchPathPlugin):
-    """`./conf`, where it is, holds further options of the groups; the package's own come first."""
+    """Hydra plugin that finds further options of the config groups in `./conf`; the package's own come first."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add it (hydra's name for what a plugin does)."""
+        """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
         folder = Path.cwd() / "conf"
         if folder.is_dir() and not folder.samefile(conf_folder()):
             search_path.append("working-folder", f"file://{folder}")
 
 
 def use_working_folder() -> None:
-    """Have modules found in the working folder, behind all others, and settings in its `conf`; in each process."""
+    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path; each process must call this."""
     folder = str(Path.cwd())
     if not {"", folder} & set(sys.path):
         sys.path.append(folder)
@@ -70,24 +70,24 @@ def use_working_folder() -> None:
 
 
 def composed(verb: str, *overrides: str) -> Any:
-    """A verb's configuration, as the command line would compose it in this folder, without starting anything."""
+    """Return a verb's config, as the command line would compose it in this folder, without starting anything."""
     use_working_folder()
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
         return compose(verb, overrides=list(overrides))
 
 
 def one_of_several() -> bool:
-    """Whether a launcher started several of this process: torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`)."""
+    """Return whether torchrun (`LOCAL_RANK`) or srun (`SLURM_STEP_NUM_TASKS`) started several of this process."""
     return "LOCAL_RANK" in os.environ or int(os.environ.get("SLURM_STEP_NUM_TASKS", 1)) > 1
 
 
 def is_first() -> bool:
-    """Whether this is the first of the processes that torchrun (`RANK`) or srun (`SLURM_PROCID`) started, or alone."""
+    """Return whether this process is alone, or the first that torchrun (`RANK`) or srun (`SLURM_PROCID`) started."""
     return int(os.environ.get("RANK", os.environ.get("SLURM_PROCID", 0))) == 0
 
 
 class LogFile(logging.FileHandler):
-    """Hydra's log of a job; a link in the place of its file is removed, not followed."""
+    """Hydra's log file of a job. A link at its path is removed, not followed."""
 
     def __init__(self, filename: str, mode: str = "a") -> None:
         if os.path.islink(filename):
@@ -97,9 +97,12 @@ class LogFile(logging.FileHandler):
 
 @contextmanager
 def alone_in(out: Path) -> Iterator[None]:
-    """Hold the lock of a job's directory, in its first process; the lock's file names the process and the computer.
+    """Hold the lock of a job's directory in the job's first process; the lock file names process and computer.
 
-    The system gives it up when the process ends, however that is. `CompleteSplatError`: another process holds it.
+    The operating system releases the lock when the process ends, for whatever reason.
+
+    Raises:
+        CompleteSplatError: another process holds the lock, or its path is a link or a folder.
     """
     path = out / LOCK
     if not is_first():
@@ -113,8 +116,8 @@ def alone_in(out: Path) -> Iterator[None]:
     except Timeout:
         holder = path.read_text().split()
         named = f"process {holder[0]} on {holder[1]}" if len(holder) > 1 else "another process"
-        said = f"{out}: {named} is at work in it: wait for it or end it, or choose another out=DIR"
-        raise CompleteSplatError(said) from None
+        message = f"{out}: {named} is at work in it: wait for it or end it, or choose another out=DIR"
+        raise CompleteSplatError(message) from None
     with lock:
         with writing(path):
             path.write_text(f"{os.getpid()}\n{platform.node()}\n")
@@ -122,7 +125,7 @@ def alone_in(out: Path) -> Iterator[None]:
 
 
 def at_work(out: Path) -> bool:
-    """Whether a process of this computer holds the lock of a job's directory."""
+    """Return whether a process of this computer holds the lock of a job's directory."""
     path = out / LOCK
     if not path.is_file():
         return False
@@ -134,13 +137,14 @@ def at_work(out: Path) -> bool:
 
 
 def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
-    """Arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
+    """Return arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
 
-    `CompleteSplatError`: this is one of several processes that a launcher started, each of which would sweep.
+    Raises:
+        CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
     """
     if one_of_several():
-        said = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
-        raise CompleteSplatError(said)
+        message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
+        raise CompleteSplatError(message)
     keys = [override.split("=")[0] for override in arguments]
     added = [] if "out" in keys else [f"out=outputs/{verb}/{run_name}"]
     if verb == "fit" and "ckpt_path" not in keys:
@@ -152,16 +156,16 @@ def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]
 
 
 def swept_keys(arguments: list[str]) -> list[str]:
-    """Keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
+    """Return the keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
     overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(overrides)
     return [override.key_or_group for override in parsed if override.is_sweep_override()]
 
 
 def job_name(*keys: str, _root_: Any) -> str:
-    """A directory's name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
+    """Return the directory name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
 
-    Without equals signs and commas, so that paths into it need no quotes in Hydra's overrides.
+    It has no equals signs and commas, so that paths into the directory need no quotes in Hydra's overrides.
     """
     values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
     full = "+".join(f"{key}-{values[key]}" for key in keys if key in values)
@@ -172,10 +176,10 @@ def job_name(*keys: str, _root_: Any) -> str:
 
 
 def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | None:
-    """Run one job in its own directory, leaving there what is needed to know what was run.
+    """Run one job in its own directory, record its command and config there, and return the value of `optimized`.
 
-    A job with `ckpt_path=last` whose directory holds its results is not repeated; see `is_finished`. `program` was
-    started with the arguments `given` behind the verb. The result is that of `optimized`, for sweepers that want it.
+    A job with `ckpt_path=last` is not repeated if its directory holds its results; see `is_finished`. The user started
+    `program` with the arguments `given` behind the verb.
     """
     use_working_folder()  # a cluster may have started this process
     hydra_config = HydraConfig.get()
@@ -194,7 +198,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | N
                     OmegaConf.save(resolved, temporary)
                 _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
-                # It may name the job's choices (`hydra:runtime.choices`), of which nothing is known below.
+                # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
                 if OmegaConf.select(config, f"model.{key}") is not None:
                     config.model[key] = resolved["model"][key]
             with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
@@ -208,23 +212,24 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | N
 
 
 def optimized(metric: str | None, out: Path) -> float | None:
-    """A figure of a finished job, NaN if it was not finite; None if no metric is asked for.
+    """Return a finished job's metric for a sweeper such as Optuna: NaN if not finite, None if no metric is asked for.
 
-    `CompleteSplatError`: the job has no figure of this name; it names those that it has.
+    Raises:
+        CompleteSplatError: the job has no metric of this name; the message lists those that it has.
     """
     if metric is None:
         return None
     figures = json.loads((out / METRICS).read_text())
-    lost = {one.partition(": ")[0] for one in figures.get("not_finite", [])}
+    lost = {entry.partition(": ")[0] for entry in figures.get("not_finite", [])}
     known = [name for name, x in figures.items() if name in lost or isinstance(x, float)]
     if metric not in known:
-        there = f"there are {', '.join(known)}{meant(metric, known)}"
-        raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {there}")
+        available = f"there are {', '.join(known)}{meant(metric, known)}"
+        raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {available}")
     return math.nan if metric in lost else float(figures[metric])
 
 
 def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
-    """One line: what ended a job, its checkpoint, and the command that goes on with it (in a sweep, with all jobs)."""
+    """Return one line: the signal that ended a job, its checkpoint, and the command to continue the job or sweep."""
     hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
     of_a_sweep = hydra_config.mode == RunMode.MULTIRUN
     dropped = ("out=", "ckpt_path=") if begun and not of_a_sweep else ("out=",)
@@ -236,10 +241,7 @@ def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
 
 
 def start(verb: str, config: Any, out: Path) -> None:
-    """Call the function that the configuration names as its task (settings are checked by `check_settings`).
-
-    A verb that has a single task calls its own.
-    """
+    """Check the settings and call the function that the config names as its task, or else the verb's `run`."""
     with importing():
         check_verb(verb, config)
         if config.get("task") is None:
@@ -253,9 +255,9 @@ def start(verb: str, config: Any, out: Path) -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Import much, and leave the garbage collector out of it, which would go through all of it again and again.
+    """Pause the garbage collector during imports, because it took a fifth of a prediction's time.
 
-    It took a fifth of a prediction's time. What is there when torch has come stays out of its sight for good.
+    The objects that exist after the first import of torch are frozen: the collector does not examine them again.
     """
     before = "torch" in sys.modules
     gc.disable()
@@ -268,9 +270,10 @@ def importing() -> Iterator[None]:
 
 
 def is_finished(out: Path, config: Any) -> bool:
-    """Whether a job's directory holds its results, for jobs that have something to continue (`ckpt_path`).
+    """Return whether a job's directory holds its results, for jobs that can continue a run (`ckpt_path`).
 
-    `CompleteSplatError`: there is training in it that would be lost, or that had other settings.
+    Raises:
+        CompleteSplatError: the directory holds a run that would be lost, or that had other settings.
     """
     begun = (out / LAST).is_file() or (out / METRICS).is_file()
     if "ckpt_path" not in config or not begun or not (out / CONFIG).is_file():
@@ -280,13 +283,13 @@ def is_finished(out: Path, config: Any) -> bool:
     different = _differences(OmegaConf.to_container(OmegaConf.load(out / CONFIG)), config)
     different = {key for key in different if key not in MAY_CHANGE and not key.startswith(f"{MAY_CHANGE[-1]}.")}
     if different:
-        first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats what stands outside it
+        first = min(different, key=lambda key: (key.count("."), key))  # `model` repeats settings from outside it
         raise CompleteSplatError(f"{out} holds a run with another {first}: choose another out=DIR")
     return (out / METRICS).is_file()
 
 
 def _differences(one: Any, other: Any, key: str = "") -> set[str]:
-    """Keys of the settings that are not the same in both."""
+    """Return the keys of the settings that differ."""
     if isinstance(one, dict) and isinstance(other, dict):
         return {
             name
@@ -297,7 +300,7 @@ def _differences(one: Any, other: Any, key: str = "") -> set[str]:
 
 
 def _record(path: Path, command: list[str], overrides: list[str]) -> None:
-    """Write `run.json`: what was started and when, and when it was continued."""
+    """Write `run.json`: version, command and overrides, and the times of the start and of continuations."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
     record: dict[str, Any] = {"version": __version__, "commit": git_commit()}
     record |= {"command": command, "overrides": overrides, "started": now}
@@ -311,17 +314,17 @@ def _record(path: Path, command: list[str], overrides: list[str]) -> None:
 def _for_other_processes(arguments: list[str]) -> Iterator[None]:
     """Make the processes that Lightning starts for further devices work on this job.
 
-    It repeats the program's arguments, which in a sweep would be a second sweep; where it finds Hydra at work, it adds
-    settings of Hydra's. The next job of a sweep is to start its own processes: what Lightning leaves behind would make
-    it wait for those of this one.
+    Lightning repeats the program's arguments, which in a sweep would start a second sweep, and adds Hydra's settings if
+    Hydra is active; so both are replaced. At the end Lightning's variables and process group are removed: with them,
+    the next job of a sweep would wait for this job's processes instead of starting its own.
     """
-    given, hydra_config = sys.argv, HydraConfig.instance().cfg
+    program_arguments, hydra_config = sys.argv, HydraConfig.instance().cfg
     variables = {name: os.environ.get(name) for name in VARIABLES_OF_PROCESSES}
     sys.argv, HydraConfig.instance().cfg = arguments, None
     try:
         yield
     finally:
-        sys.argv, HydraConfig.instance().cfg = given, hydra_config
+        sys.argv, HydraConfig.instance().cfg = program_arguments, hydra_config
         torch = sys.modules.get("torch")
         if torch is not None and torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()

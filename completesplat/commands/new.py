@@ -1,4 +1,4 @@
-"""`completesplat new`: a part of the user's own, begun in the working folder with settings and a test that run."""
+"""`completesplat new`: a first version of a user's own part in the working folder, with settings and a passing test."""
 
 import keyword
 import re
@@ -13,11 +13,11 @@ from completesplat.options import conf_folder
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")
 FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
-"""A line of a template that names the file which follows."""
+"""Line of a template that names the file which follows."""
 
 
 def run(config: Any, out: Path) -> None:
-    """Write the part's files into the working folder and print their names, and what to do next."""
+    """Write the part's files into the working folder; print their names and the next command."""
     kind, name = str(config.kind), str(config.name)
     files = begun(kind, name)
     for path, text in files.items():
@@ -28,10 +28,10 @@ def run(config: Any, out: Path) -> None:
 
 
 def begun(kind: str, name: str) -> dict[Path, str]:
-    """The files of a part of this kind and their texts, by paths in the working folder.
+    """Return the texts of a new part's files, by their paths in the working folder.
 
     Raises:
-        CompleteSplatError: no such kind; a name that is none of Python's, or taken; a file that is there already.
+        CompleteSplatError: there is no such kind, the name is not a Python name or is taken, or a file exists.
     """
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
@@ -46,7 +46,7 @@ def begun(kind: str, name: str) -> dict[Path, str]:
             raise CompleteSplatError(f"{path}: is there already; choose another name")
         if path.parts[0] == "conf" and (conf_folder().parent / path).is_file():
             raise CompleteSplatError(f"name={name}: the package has {path}; choose another name")
-    # The working folder comes behind all others in which Python looks for modules.
+    # Python searches the working folder last, so it would import the other module of this name.
     if Path(f"{name}.py") in files and find_spec(name) is not None:
         raise CompleteSplatError(f"name={name}: there is a module of this name; choose another name")
     return files

@@ -1,4 +1,4 @@
-"""`completesplat predict`: complete scenes from photographs, each from one, or one from several."""
+"""`completesplat predict`: complete scenes, each from one photo, or one scene from several photos."""
 
 import logging
 import math
@@ -33,19 +33,19 @@ from completesplat.scene_model import SceneModel
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
-"""Ratio of the tangents of half the fields of view, photograph to training, from which a warning is given."""
+"""Ratio of tan(fov / 2), photo to training, from which a warning is given."""
 UNLIKE = 2.0
-"""Distance from the training pictures (`SceneModel.distance`) from which a warning is given."""
+"""Distance from the training images (`SceneModel.distance`) from which a warning is given."""
 
 log = logging.getLogger(__name__)
 
 
 def run(config: Any, out: Path) -> None:
-    """Write each photograph's files into `out/<its name>/`."""
+    """Write each photo's files into `out/<its name>/`."""
     pictures = find_pictures(config.image)
     if config.mask is not None and len(pictures) > 1:
         raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
-    wanted = wanted_files(config)  # before the model runs: is the converter there?
+    wanted = wanted_files(config)  # before the model runs, because the converter may be missing
     if config.cameras is not None:
         predict_from_views(config, pictures, wanted, out)
     else:
@@ -53,34 +53,34 @@ def run(config: Any, out: Path) -> None:
 
 
 def find_pictures(image: Any) -> list[Path]:
-    """The files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its pictures, by suffix, sorted.
+    """Return the files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its images, by suffix, sorted.
 
-    Files that are named themselves are taken as they are, missing ones too: reading them says what is wrong.
+    Files that are named one by one are not checked here, even missing ones, because reading them reports the fault.
 
     Raises:
-        CompleteSplatError: a folder without a picture or one that cannot be read, an empty list, or no name.
+        CompleteSplatError: a folder has no image or cannot be read, the list is empty, or an entry is no name.
     """
-    given = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
-    if not given:
+    entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
+    if not entries:
         raise CompleteSplatError("image=[]: name at least one picture")
-    found: list[Path] = []
-    for one in given:
-        if one == "" or isinstance(one, bool) or not isinstance(one, str | int):
+    paths: list[Path] = []
+    for entry in entries:
+        if entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int):
             raise CompleteSplatError(f"image={image}: give a picture, a folder, or a list of them")
-        found += _pictures_of(Path(str(one)))
-    return found
+        paths += _pictures_of(Path(str(entry)))
+    return paths
 
 
 def _pictures_of(path: Path) -> list[Path]:
-    # The methods of `Path` raise where a name is too long.
+    # `os.path`, because the methods of `Path` raise an error if a name is too long.
     if not os.path.isdir(path):
         return [path]
     try:
-        images = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES)
+        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
-    pictures = [one for one in images if os.path.isfile(one)]
-    if left_out := [printable(one.name) for one in images if not os.path.isfile(one)]:
+    pictures = [file for file in images if os.path.isfile(file)]
+    if left_out := [printable(file.name) for file in images if not os.path.isfile(file)]:
         log.warning("%s: left out, because they are no files: %s", printable(str(path)), ", ".join(left_out))
     if not pictures:
         raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
@@ -88,9 +88,10 @@ def _pictures_of(path: Path) -> list[Path]:
 
 
 def wanted_files(config: Any) -> Wanted:
-    """What to write of each picture.
+    """Return the outputs to write for each image.
 
-    `CompleteSplatError`: no such format or camera path, no format at all, or no converter for one that needs it.
+    Raises:
+        CompleteSplatError: no such format or camera path, no format at all, or no converter for one that needs it.
     """
     formats = _chosen("formats", config.formats, FORMATS)
     if not formats:
@@ -107,20 +108,21 @@ def wanted_files(config: Any) -> Wanted:
 
 
 def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
-    """One name or a list of them, each once."""
+    """Return one name, or the names of a list without duplicates; refuse those that are not in `choice`."""
     several = not value or (isinstance(value, Sequence) and not isinstance(value, str))
     names = list(value or []) if several else [value]
-    for one in names:
-        if one not in choice:
-            raise CompleteSplatError(f"{name}={one}: choose from {', '.join(choice)}")
+    for entry in names:
+        if entry not in choice:
+            raise CompleteSplatError(f"{name}={entry}: choose from {', '.join(choice)}")
     return tuple(dict.fromkeys(names))
 
 
 def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
-    """Write each picture's files into a folder below `out`, with a bar, or a line for each where there is no terminal.
+    """Write each image's files into a folder below `out`, with a progress bar, or a line per image without a terminal.
 
-    `CompleteSplatError`: the only picture failed, or some of several, which it names. None of several stops the others;
-    a full disk does (`DiskError`).
+    Raises:
+        CompleteSplatError: the only image failed, or some of several, which the message names; the others are written.
+        DiskError: the disk is full; the remaining images are not predicted.
     """
     console, failed = Console(), []
     if (config.mask is not None or config.box is not None) and not model.knows_hidden:
@@ -139,7 +141,7 @@ def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], w
             start = time.perf_counter()
             try:
                 _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
-            except DiskError:  # it would be the same with the others
+            except DiskError:  # the other images would fail, too
                 raise
             except Exception as error:
                 message, expected = _told(error, picture), isinstance(error, CompleteSplatError | OSError)
@@ -161,16 +163,16 @@ def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], w
 
 
 def _told(error: Exception, picture: Path) -> str:
-    """What went wrong with a picture, in one line that names it."""
+    """Return the error of an image in one line that names the image."""
     message = " ".join(str(error).split()) or type(error).__name__
     return printable(message if picture.name in message else f"{picture}: {message}")
 
 
 def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
-    """Write the files of one scene that all pictures show, into the folder of the first's name.
+    """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
-        CompleteSplatError: one picture alone, something hidden, or a field of view beside that of the cameras.
+        CompleteSplatError: one image alone, or a mask, box, field of view or removed background besides the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
     from completesplat.data.importing.transforms_json import read_photographs
@@ -209,8 +211,8 @@ def _predict(
 ) -> None:
     photograph = model.read(image, config.fov, config.background == REMOVE)
     visible = visible_part(config, image, model.image_size)
-    if found := remarks(photograph, model, whole=visible is None):
-        log.warning("%s: %s", printable(image.name), "; ".join(found))
+    if warnings := remarks(photograph, model, whole=visible is None):
+        log.warning("%s: %s", printable(image.name), "; ".join(warnings))
     settings = {name: config[name] for name in ("samples", "seed")}
     how = {}
     if isinstance(model, CompleteSplat):
@@ -232,31 +234,31 @@ def _predict(
     }
     if config.background == REMOVE:
         recorded["background"] = REMOVE
-    shown = photograph.image if visible is None else photograph.image * visible
+    visible_image = photograph.image if visible is None else photograph.image * visible
     camera = model.camera(photograph)
-    write_prediction(folder, shown, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
+    write_prediction(folder, visible_image, scenes, camera, rasterizer, model.up, wanted, recorded, on_sample)
 
 
 def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]:
-    """What makes a photograph unlike those that the model was trained on; its contents count if it is shown whole."""
-    found = [unusual_field_of_view(photograph, model.fov_degrees.item())]
+    """Return warnings about a photo that is unlike the training images; its contents are compared only if `whole`."""
+    warnings = [unusual_field_of_view(photograph, model.fov_degrees.item())]
     distance = model.distance(photograph) if whole else None
     if distance is not None and distance > UNLIKE:
-        found.append(
+        warnings.append(
             f"colours, contrast or detail lie {distance:.1f} standard deviations from the training pictures'"
             f" ({UNLIKE:g} is far): expect little of it in the scenes"
         )
-    return [remark for remark in found if remark]
+    return [remark for remark in warnings if remark]
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
-    """A warning if the field of view is far from training's: the tangents of their halves differ 1.5 times or more.
+    """Return a warning if the field of view is far from that in training: tan(fov / 2) differs by 1.5 times or more.
 
-    The networks see pixels, not angles, and put them at the depths that they have learnt. Across the picture lengths
-    go with the tangent, along the depth they do not: so the ratio of the tangents is that of the wrong proportions.
+    The networks see pixels, not angles, and put them at the depths that they have learnt. Lengths across the image
+    grow with the tangent, lengths along the depth do not; so the proportions are wrong by the ratio of the tangents.
     """
-    own, trained = (math.tan(math.radians(fov) / 2) for fov in (photograph.fov_degrees, trained_degrees))
-    ratio = own / trained
+    tangent, trained_tangent = (math.tan(math.radians(fov) / 2) for fov in (photograph.fov_degrees, trained_degrees))
+    ratio = tangent / trained_tangent
     if 1 / FAR < ratio < FAR:
         return None
     wrong = f"{ratio:.1f} times too flat" if ratio > 1 else f"{1 / ratio:.1f} times too deep"
@@ -268,10 +270,10 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
 
 
 def visible_part(config: Any, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
-    """0 where `mask` or `box` hide the photograph, 1 elsewhere; None without them.
+    """Return 0 where `mask` or `box` hides the photo and 1 elsewhere; None without them.
 
     Raises:
-        ImageError: the mask is not a readable picture.
+        ImageError: the mask is not a readable image.
         CompleteSplatError: mask and box at once, a box without four numbers, or a mask that hides nothing.
     """
     if config.mask is not None and config.box is not None:

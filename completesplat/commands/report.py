@@ -1,4 +1,4 @@
-"""`completesplat report`: the paper's tables with our results beside them, a page with all, summaries of sweeps."""
+"""`completesplat report`: the paper's tables beside our results, a page of all results, and summaries of sweeps."""
 
 import logging
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class Most(TypedDict):
-    """How much a page holds; `conf/report_task/html.yaml` explains each."""
+    """Limits on the contents of a page; `conf/report_task/html.yaml` explains each."""
 
     frames: Positive
     samples: Positive
@@ -39,9 +39,10 @@ def tables(runs: str | None, out: Path) -> None:
 
 
 def summary(sweeps: Sequence[str], out: Path) -> None:
-    """Write the summary of one sweep whose jobs lie in several folders, as `fit -m` writes that of one; print it.
+    """Write and print the summary of one sweep whose jobs lie in several folders, as `fit -m` does for one folder.
 
-    `CompleteSplatError` where there is no such folder.
+    Raises:
+        CompleteSplatError: there is no such folder.
     """
     folders = [Path(sweep) for sweep in sweeps]
     for folder in folders:
@@ -51,7 +52,7 @@ def summary(sweeps: Sequence[str], out: Path) -> None:
 
 
 def html(runs: str, most: Most, out: Path) -> None:
-    """Write `report.html`, the `page` on all below the folder `runs`, and print its size."""
+    """Write `report.html`, the `page` on all results below the folder `runs`, and print its size."""
     text, warnings = page(Path(runs), out, most, origin(out, levels=0))
     with atomic_path(out / "report.html") as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -1,4 +1,8 @@
-"""`completesplat report`: studies of a trained model's samples."""
+"""`completesplat report`: studies of a trained model's samples.
+
+Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
+and, if it draws samples, `diffusion_of`. Skip and guidance weights outside of [0, 1] are refused.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,10 +31,7 @@ Numbers = Annotated[Sequence[float], Entries(1)]
 
 
 class Run(TypedDict):
-    """A run (`Trained`), and how many samples are drawn of how many of its first test scenes.
-
-    What is drawn refuses weights outside of [0, 1] and runs that are missing or draw nothing (`_open`).
-    """
+    """A run (`Trained`), the number of its first test scenes, and the number of samples for each."""
 
     ckpt: str
     overrides: Sequence[str]
@@ -48,10 +49,12 @@ def samplers(
     out: Path,
     **run: Unpack[Run],
 ) -> None:
-    """Write `samplers.json` and `samplers.png`, print the table and the fewest steps that are enough.
+    """Write `samplers.json` and `samplers.png`; print the table and the fewest steps that are enough.
 
-    Configurations of samplers and numbers of steps are by the sampler's name; see `conf/report_task/samplers.yaml`.
-    `CompleteSplatError`: steps of a sampler that is not there, or impossible ones.
+    Samplers' configs and numbers of steps are by the sampler's name; see `conf/report_task/samplers.yaml`.
+
+    Raises:
+        CompleteSplatError: steps belong to an unknown sampler, or are impossible.
     """
     for name in steps:
         if name not in samplers:
@@ -61,8 +64,8 @@ def samplers(
     with _status() as tick:
         rows = samplers_study.rows(renderer, samplers, steps, scenes, weights, tick)
     best = samplers_study.fewest(rows)
-    found = {"machine": machine(), "settings": settings | weights, "rows": rows, "fewest": dict(best)}
-    write_json(out / "samplers.json", found)
+    report = {"machine": machine(), "settings": settings | weights, "rows": rows, "fewest": dict(best)}
+    write_json(out / "samplers.json", report)
     title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
     samplers_study.plot_samplers(rows, out / "samplers.png", title)
     Console(width=120).print(table(f"Samplers, from the same noise. {SSIM_NOTE}", SAMPLERS, rows))
@@ -78,7 +81,7 @@ def controls(
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
-    All pairs of the weights are measured, and the paper's three; `conf/report_task/controls.yaml` explains the rest.
+    All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
     renderer, scenes, settings = _open(run)
@@ -96,10 +99,9 @@ def controls(
 
 
 def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[Run]) -> None:
-    """Write `masked.png`: inputs with boxes over them, several completions of each.
+    """Write `masked.png`: inputs with boxes over them, and several completions of each.
 
-    Boxes are [x0, y0, x1, y1] in shares of the picture, as `check_box` has them; `conf/report_task/masked.yaml`
-    explains the rest.
+    Boxes are [x0, y0, x1, y1] in fractions of the image (`check_box`); see `conf/report_task/masked.yaml` for the rest.
     """
     for box in boxes:
         controls_study.check_box(box)
@@ -142,32 +144,26 @@ def views(
     counts: Annotated[Sequence[Positive], Entries(1)],
     out: Path,
 ) -> None:
-    """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings.
-
-    Refused as by `Trained.open`, `first_scenes` and `rows_of_views`.
-    """
-    module, found = _open_stage1(ckpt, overrides, trust, scenes)
+    """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings."""
+    module, test_scenes = _open_stage1(ckpt, overrides, trust, scenes)
     with _status() as tick:
-        rows = stage1_study.rows_of_views(module, counts, found, tick)
+        rows = stage1_study.rows_of_views(module, counts, test_scenes, tick)
     write_json(out / "views.json", {"settings": {"scenes": scenes}, "rows": rows})
     stage1_study.plot_views(rows, out / "views.png", f"{scenes} scenes, posterior's mean")
     Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
 
 
 def layers(ckpt: str, overrides: Sequence[str], trust: bool, scenes: Positive, out: Path) -> None:
-    """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings.
-
-    Refused as by `Trained.open`, `first_scenes` and `rows_of_layers`.
-    """
-    module, found = _open_stage1(ckpt, overrides, trust, scenes)
+    """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings."""
+    module, test_scenes = _open_stage1(ckpt, overrides, trust, scenes)
     with _status() as tick:
-        rows = stage1_study.rows_of_layers(module, found, tick)
+        rows = stage1_study.rows_of_layers(module, test_scenes, tick)
     write_json(out / "layers.json", {"settings": {"scenes": scenes}, "rows": rows})
     Console(width=120).print(table("Layers on the object, behind what the picture shows (scene units)", LAYERS, rows))
 
 
 def _open_stage1(ckpt: str, overrides: Sequence[str], trust: bool, scenes: int) -> tuple[Any, list[SceneBatch]]:
-    """A run's module and its first test scenes, on a GPU where there is one."""
+    """Return a run's module and its first test scenes, on a GPU if there is one."""
     quieten()
     module, data = Trained(ckpt, overrides, trust).open()
     module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
@@ -175,18 +171,15 @@ def _open_stage1(ckpt: str, overrides: Sequence[str], trust: bool, scenes: int) 
 
 
 def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
-    """What draws a run's samples, the first test scenes, and the settings that are written beside what is found.
-
-    Refused as by `Trained.open`, `diffusion_of` and `first_scenes`.
-    """
+    """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results."""
     quieten()
-    module, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
-    model = diffusion_of(module)
+    stage, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
+    model = diffusion_of(stage)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     scenes = [scene.to(device) for scene in first_scenes(data, run["scenes"])]
     settings = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
-    shown = SampleRenderer(model.to(device).eval(), module.rasterizer, module.background, run["samples"], run["seed"])
-    return shown, scenes, settings
+    renderer = SampleRenderer(model.to(device).eval(), stage.rasterizer, stage.background, run["samples"], run["seed"])
+    return renderer, scenes, settings
 
 
 @contextmanager

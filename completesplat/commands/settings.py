@@ -1,4 +1,4 @@
-"""Settings of verbs and of the parts that they are made of: checked before anything is done with them."""
+"""Checks of the settings of verbs and of their parts, made before any work begins."""
 
 import math
 import re
@@ -18,7 +18,7 @@ REFERENCE = re.compile(r"\$\{(\w[\w.]*)\}")
 NOT_THERE = re.compile(r"Could not override '([^']+)'")
 REMOVE = "remove"
 HYDRAS = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
-# Of a part's size: each level but the last halves the picture's sides.
+# Channels of a network by level; each level but the last halves the sides of the image.
 LEVELS = (
     "model.completesplat.autoreconstructor.encoder.channels",
     "model.completesplat.denoiser.channels",
@@ -38,7 +38,7 @@ class Trainer(TypedDict):
 
 
 class Fit(TypedDict):
-    """Of `completesplat fit`."""
+    """Settings of `completesplat fit`."""
 
     trainer: Trainer
     seed: Annotated[int, Range(0, 2**32 - 1)]
@@ -60,7 +60,7 @@ class SceneSettings(TypedDict):
 
 
 class Predict(SceneSettings):
-    """Of `completesplat predict`. All samples of a picture, and all frames of a video, are in memory at once."""
+    """Settings of `completesplat predict`. All samples of an image, or frames of a video, are in memory at once."""
 
     samples: Annotated[int, Range(1, 1000)]
     seed: Seed
@@ -70,7 +70,7 @@ class Predict(SceneSettings):
 
 
 class View(SceneSettings):
-    """Of `completesplat view`."""
+    """Settings of `completesplat view`."""
 
     samples: Annotated[int, Range(1, 8)]
     seed: Annotated[int, Range(0, 2**31)]
@@ -78,13 +78,13 @@ class View(SceneSettings):
 
 
 class OfRun(TypedDict):
-    """Of every verb that reads a run."""
+    """Settings of every verb that reads a run."""
 
     overrides: Sequence[str]
 
 
 class Test(OfRun):
-    """Of `completesplat test`."""
+    """Settings of `completesplat test`."""
 
     ckpt: str | None
     weights: str | None
@@ -96,14 +96,14 @@ OF_VERBS: dict[str, type] = {"fit": Fit, "predict": Predict, "view": View, "test
 
 
 def check_verb(verb: str, config: Any) -> None:
-    """Raise `CompleteSplatError` for the first setting of a verb or of its parts (not `view`'s) that does not fit."""
+    """Raise CompleteSplatError for the first unfit setting of a verb or, except for `view`, of its parts."""
     check_settings(OF_VERBS.get(verb, OfRun), config)
-    if verb != "view":  # which shows its page before it imports torch, and checks its parts later
+    if verb != "view":  # `view` shows its page before it imports torch, so it checks its parts later
         check_parts(config)
 
 
 def check_parts(config: Any, place: str = "") -> None:
-    """Check each mapping with a `_target_`, and what is below it, against the arguments of that class or function."""
+    """Check each mapping with a `_target_`, and all below it, against the arguments of that class or function."""
     hints, complete = _arguments(config)
     name: Any
     for name in config if isinstance(config, DictConfig) else range(len(config)):
@@ -126,7 +126,7 @@ def check_parts(config: Any, place: str = "") -> None:
 
 
 def _arguments(config: Any) -> tuple[Mapping[str, Any], bool]:
-    """What a part is called with; nothing is known of one that cannot be imported, which is said where it is made."""
+    """Return a part's `arguments_of`, or none if it cannot be imported, because building the part reports that."""
     try:
         target = None if isinstance(config, ListConfig) else config.get("_target_")
         return ({}, False) if target is None else arguments_of(get_object(target))
@@ -135,11 +135,11 @@ def _arguments(config: Any) -> tuple[Mapping[str, Any], bool]:
 
 
 def _origin(config: Any, name: Any, place: str) -> str:
-    """The setting from which a place has its value, if it is another's."""
+    """Return the setting to which a place refers for its value, or the place itself."""
     root = config._get_root()
     raw = config._get_node(name)
-    while (found := REFERENCE.fullmatch(str(raw._value()) if raw is not None else "")) is not None:
-        place = found[1]
+    while (reference := REFERENCE.fullmatch(str(raw._value()) if raw is not None else "")) is not None:
+        place = reference[1]
         *above, last = place.split(".")
         parent = OmegaConf.select(root, ".".join(above)) if above else root
         raw = parent._get_node(last) if isinstance(parent, DictConfig) else None
@@ -147,18 +147,18 @@ def _origin(config: Any, name: Any, place: str) -> str:
 
 
 def check_image_size(config: Any) -> None:
-    """`CompleteSplatError`: pictures of a training cannot be halved as often as its networks do."""
+    """Raise CompleteSplatError if training images cannot be halved as often as the networks halve them."""
     channels = [OmegaConf.select(config, key, throw_on_missing=False) for key in LEVELS]
     multiple = 2 ** sum(len(widths) - 1 for widths in channels if widths is not None)
     size = config.data.get("image_size")
     if size is not None and size % multiple:
         near = max(multiple, round(size / multiple) * multiple)
-        said = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
-        raise CompleteSplatError(f"data.image_size={size}: {said}")
+        message = f"must be a multiple of {multiple} for the levels of these networks, such as {near}"
+        raise CompleteSplatError(f"data.image_size={size}: {message}")
 
 
 def check_optimizer(config: Any) -> None:
-    """Raise `CompleteSplatError` for settings that an optimizer refuses, if there is one, before there is a model."""
+    """Raise CompleteSplatError for settings that the optimizer refuses, if there is one, before a model is built."""
     from torch import nn, zeros
 
     try:
@@ -169,26 +169,26 @@ def check_optimizer(config: Any) -> None:
 
 
 def misspelt(error: Exception, verb: str, arguments: Sequence[str], compose: Any) -> CompleteSplatError | None:
-    """Return hydra's refusal with the nearest names; None if no name is wrong. `compose` gives a verb's config."""
+    """Return Hydra's error with the nearest names, None if no name is wrong; `compose` returns a verb's config."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
         named = [name for name in error.options or () if not name.startswith("_")]
         kind = f"task of completesplat {verb}" if group == f"{verb}_task" else group
         return CompleteSplatError(f"no {kind} {option!r}: there are {', '.join(named)}{meant(option, named)}")
     if str(error).startswith("Config group override must be"):
-        empty = [one.partition("=")[0] for one in arguments if one.endswith("=null") and options(one[:-5])]
+        empty = [text.partition("=")[0] for text in arguments if text.endswith("=null") and options(text[:-5])]
         return CompleteSplatError(f"{empty[0]}=null: choose one of {', '.join(options(empty[0]))}") if empty else None
-    if not isinstance(error, HydraException) or (found := NOT_THERE.match(str(error))) is None:
+    if not isinstance(error, HydraException) or (unknown := NOT_THERE.match(str(error))) is None:
         return None
-    key, names = found[1], set(_keys(_composed(verb, arguments, found[1], compose)))
+    key, names = unknown[1], set(_keys(_composed(verb, arguments, unknown[1], compose)))
     nearest = meant(key, {name for name in names if name.count(".") == key.count(".")}) or meant(key, names)
-    said = nearest or f"; completesplat {verb} --help shows those that there are, and +{key}=VALUE adds one"
-    return CompleteSplatError(f"no setting {key!r} of completesplat {verb}{said}")
+    hint = nearest or f"; completesplat {verb} --help shows those that there are, and +{key}=VALUE adds one"
+    return CompleteSplatError(f"no setting {key!r} of completesplat {verb}{hint}")
 
 
 def _composed(verb: str, arguments: Sequence[str], key: str, compose: Any) -> Any:
-    """The configuration without what is wrong in the arguments."""
-    settings = [one for one in arguments if not one.startswith("-") and one.lstrip("+~").partition("=")[0] != key]
+    """Compose a verb's config without the setting `key`, or without any arguments if that fails."""
+    settings = [text for text in arguments if not text.startswith("-") and text.lstrip("+~").partition("=")[0] != key]
     try:
         return compose(verb, *settings)
     except Exception:
@@ -196,7 +196,7 @@ def _composed(verb: str, arguments: Sequence[str], key: str, compose: Any) -> An
 
 
 def _keys(config: Any, place: str = "") -> Iterator[str]:
-    """All keys of a configuration with their places; what is only referred to is named where it is."""
+    """Yield all keys of a config with their places, without following references."""
     for name in config:
         key = f"{place}{name}"
         yield key

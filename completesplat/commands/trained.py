@@ -1,4 +1,4 @@
-"""Trained models: a run's checkpoint with its configuration, or a folder of weights, with data where it is measured."""
+"""Trained models: a run's checkpoint with its config, or a folder of weights; with data for evaluation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no 
 class Trained:
     """A trained model with its data: a run's checkpoint, or a folder of weights.
 
-    `conf/test.yaml` explains the arguments; the configurations of data and rasterizer belong to `weights`. What the run
-    may name, and when it has to be trusted: `config_of_run`.
+    `conf/test.yaml` explains the arguments; the configs `data` and `rasterizer` are used with `weights` only.
+    `config_of_run` explains what a run's config may name, and when it needs `trust`.
     """
 
     ckpt: str | None
@@ -40,10 +40,10 @@ class Trained:
     seed: int = 0
 
     def configuration(self) -> Any:
-        """The configuration of model and data.
+        """Return the config of model and data.
 
         Raises:
-            WeightsError: the checkpoint, its run's configuration or the weights are missing or not trusted.
+            WeightsError: the checkpoint, its run's config or the weights are missing or not trusted.
             CompleteSplatError: neither is given, or both, or weights without data.
         """
         if (self.ckpt is None) == (self.weights is None):
@@ -57,16 +57,16 @@ class Trained:
         return self._config_of_weights(str(self.weights))
 
     def open(self) -> tuple[Any, Any]:
-        """The model and the data module, as `open_module` and with the errors of `configuration`."""
+        """Return the model and the data module; raise the errors of `configuration` and `open_module`."""
         configuration = self.configuration()
         return self.open_module(configuration), instantiate(configuration.data, _convert_="all")
 
     def open_module(self, configuration: Any) -> Any:
-        """The model of the configuration, with its weights and the sampler that is to draw.
+        """Return the model of the config, with its weights and, if given, another sampler.
 
         Raises:
             WeightsError: the weights do not fit.
-            CompleteSplatError: a sampler for a model that draws nothing.
+            CompleteSplatError: a sampler is given for a model that draws no samples.
         """
         from completesplat.weights.checkpoint_reading import load_part
 
@@ -78,7 +78,7 @@ class Trained:
         return module
 
     def facts(self) -> dict[str, Any]:
-        """As `checkpoint_facts`; a folder of weights does not say how training ended."""
+        """Return `checkpoint_facts`; for a folder of weights, path and checksum but not how training ended."""
         if self.ckpt is not None:
             return checkpoint_facts(Path(self.ckpt))
         weights = str(self.weights)
@@ -86,7 +86,7 @@ class Trained:
         return {"checkpoint": {"path": weights, "sha256": sha256_of(file), "step": None}, "ema": None}
 
     def _config_of_weights(self, weights: str) -> Any:
-        """A stage's module around a model that is loaded; what it would be trained with does not matter."""
+        """Return the config of a stage's module around a loaded model; its loss and optimizer are never used."""
         published = is_published(weights)
         folder = weights if published else str(weights_folder(weights))
         architecture = {} if published else read_architecture(Path(folder))
@@ -99,27 +99,25 @@ class Trained:
             }
         else:
             loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": folder}
-            stage = {
-                "_target_": "completesplat.training.latent_diffusion.LatentDiffusion",
-                "completesplat": loaded,
-            }
+            stage = {"_target_": "completesplat.training.latent_diffusion.LatentDiffusion", "completesplat": loaded}
         model = {
             **stage,
             "rasterizer": self.rasterizer,
             "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True},
             "schedule": {"_target_": "completesplat.training.optimization.constant", "_partial_": True},
         }
-        found = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
+        config = OmegaConf.create({"seed": self.seed, "data": self.data, "model": model})
         if published:
-            return _as_published(found, weights)
-        found.data.image_size = architecture["image_size"]
-        return found
+            return _as_published(config, weights)
+        config.data.image_size = architecture["image_size"]
+        return config
 
 
 def _as_published(config: Any, weights: str) -> Any:
-    """Data as published weights know them, objects only on their background, and renders of such Gaussians.
+    """Adapt data and rasterizer to published weights, which know only objects on one background.
 
-    `CompleteSplatError`: weights that have to be told where objects are, and data that do not.
+    Raises:
+        CompleteSplatError: the weights need the distance of the object, and the data do not contain it.
     """
     known = find(weights).data
     config.model.rasterizer = {
@@ -136,20 +134,20 @@ def _as_published(config: Any, weights: str) -> Any:
 
 
 def network_of(weights: str) -> Any:
-    """The network of weights that give one answer."""
+    """Return the network of weights that give one scene for an image and draw no samples."""
     from completesplat.generation import CompleteSplat
 
     return CompleteSplat.from_pretrained(weights).reconstructing
 
 
 def open_generator(config: Any) -> Any:
-    """The model of `config.weights`, with `config.sampler` if given; what it cannot do is printed.
+    """Return the model of `config.weights`, with `config.sampler` if given, and print its limits.
 
-    Of one that draws nothing, `config.samples` becomes 1.
+    If the model draws no samples, `config.samples` is set to 1.
 
     Raises:
         WeightsError: as `from_pretrained`.
-        CompleteSplatError: a sampler for a model that draws nothing.
+        CompleteSplatError: a sampler is given for a model that draws no samples.
     """
     from completesplat.generation import CompleteSplat
     from completesplat.published import PublishedGenerator
@@ -171,7 +169,11 @@ def open_generator(config: Any) -> Any:
 
 
 def diffusion_of(module: Any) -> Any:
-    """The generator of a latent diffusion model; `CompleteSplatError` for another model."""
+    """Return the generator of a latent diffusion model.
+
+    Raises:
+        CompleteSplatError: the module is another model.
+    """
     from completesplat.training.latent_diffusion import LatentDiffusion
 
     if not isinstance(module, LatentDiffusion):
@@ -180,13 +182,13 @@ def diffusion_of(module: Any) -> Any:
 
 
 def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
-    """Return model and data of the configuration saved beside a checkpoint's folder, with changes that `fit` takes.
+    """Return model and data of the config saved beside a checkpoint's folder, with changes that `fit` accepts.
 
     The file may come from anyone (`check_names` of `completesplat.opening`); the changes may name anything.
 
     Raises:
-        WeightsError: one of both is missing or not readable, or the configuration names something else.
-        CompleteSplatError: the changes cannot be read, or `fit` refuses them, too.
+        WeightsError: the checkpoint or its config is missing or not readable, or the config names something else.
+        CompleteSplatError: the changes cannot be read, or `fit` would refuse them, too.
     """
     path = checkpoint.parent.parent / "config.yaml"
     if not checkpoint.is_file():

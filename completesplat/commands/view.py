@@ -1,4 +1,4 @@
-"""`completesplat view`: a page on which to look at scenes and to draw new ones."""
+"""`completesplat view`: a page in the browser that shows scenes and draws new ones."""
 
 import time
 from collections.abc import Sequence
@@ -17,15 +17,15 @@ from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, W
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
 MOST_CAMERAS = 24
-PAUSE = 2.0  # seconds after which a run is looked at again
+PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
 
 
 def run(config: Any, out: Path) -> None:
-    """Open the page, fill it and stay until Ctrl-C; with `export`, write it as a file instead.
+    """Open the page, fill it and stay until Ctrl-C; with `export`, write it to a file instead.
 
-    The page comes first, and says that it is loading: torch alone takes a second to import, the model longer.
+    The page first says that it is loading, because importing torch takes a second and loading the model longer.
     """
     try:
         import viser  # noqa: F401
@@ -58,9 +58,10 @@ def run(config: Any, out: Path) -> None:
 
 
 def settings_of(path: Path) -> dict[str, str]:
-    """The setting that a path stands for: `scene`, `image`, `weights`, or `watch`, of a run that trains just now.
+    """Return the setting that a path stands for: `scene`, `image`, `weights`, or `watch` for a run in training.
 
-    `CompleteSplatError`: none of these.
+    Raises:
+        CompleteSplatError: the path is none of these.
     """
     if path.is_file():
         return {KINDS.get(path.suffix.lower(), "image"): str(path)}
@@ -85,7 +86,7 @@ def settings_of(path: Path) -> dict[str, str]:
 
 
 def make_page(server: Any, config: Any, out: Path) -> Any:
-    """Fill the page of a server with what the settings name."""
+    """Create a server's page and fill it with what the settings name."""
     with importing():
         import torch
         from hydra.utils import instantiate
@@ -133,9 +134,10 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
 
 
 def newest_scenes(run: Path) -> tuple[list[Any], tuple[float, ...]]:
-    """The newest fixed scenes of a run, and where up is; it is waited for the first of them.
+    """Return the newest fixed scenes of a run and the up direction; wait until there are scenes.
 
-    `CompleteSplatError`: it is no run of `fit` that draws fixed scenes, or they cannot be read.
+    Raises:
+        CompleteSplatError: the folder is no run of `fit` that draws fixed scenes, or they cannot be read.
     """
     from completesplat.viewer.sample import NEWEST_FILE, read_newest
 
@@ -151,28 +153,29 @@ def newest_scenes(run: Path) -> tuple[list[Any], tuple[float, ...]]:
 
 
 def step_of(samples: Sequence[Any]) -> str:
-    """What the page says of a run's scenes; nothing of others."""
+    """Return the page's note on the training step of a run's scenes; an empty one for other scenes."""
     steps = [sample.settings["step"] for sample in samples if "step" in sample.settings]
     return f"step {steps[0]} of the training" if steps else ""
 
 
 def show_newest(page: Any, run: Path) -> None:
-    """Show what the run has written since the page was last drawn, if anything."""
+    """Show the scenes that the run has written since the page was last drawn, if any."""
     from completesplat.viewer.sample import read_newest
 
-    shown = {sample.settings["step"] for sample in page.stage.samples}
+    steps = {sample.settings["step"] for sample in page.stage.samples}
     try:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
-        return  # it is just being written, or was taken away: what is shown stays
-    if shown != {step} and samples:
+        return  # the scenes are just being written, or were removed: the page stays as it is
+    if steps != {step} and samples:
         page.show(samples, step_of(samples))
 
 
 def data_cameras(config: Any) -> Any:
-    """Cameras of the first training sequence that can be read, in the frame of its first one: at most 24, evenly.
+    """Return at most 24 evenly spaced cameras of the first readable training sequence, relative to its first camera.
 
-    `DataError`: no sequence can be read.
+    Raises:
+        DataError: no sequence can be read.
     """
     import torch
     from hydra.utils import instantiate
@@ -191,7 +194,11 @@ def data_cameras(config: Any) -> Any:
 
 
 def export(page: Any, path: Path) -> None:
-    """Write what the page shows when its work is done; `CompleteSplatError` if it shows nothing."""
+    """Write the page to a file when its work is done.
+
+    Raises:
+        CompleteSplatError: the page shows no scene.
+    """
     from completesplat.viewer.page import write_page
 
     page.worker.wait()
