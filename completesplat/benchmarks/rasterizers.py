@@ -14,10 +14,8 @@ from lightning import LightningModule
 from rich.console import Console
 
 from completesplat.atomic import atomic_path
-from completesplat.benchmarks import thread_scaling
 from completesplat.benchmarks.agreement import agreement_rows
 from completesplat.benchmarks.printing import device_of, print_results
-from completesplat.benchmarks.thread_scaling import scaling_rows
 from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     DEFAULTS,
@@ -60,7 +58,7 @@ class TrainingStep(TypedDict):
 
 def run(
     scene: str | None, backends: Sequence[str], sizes: Sequence[Positive], views: Sequence[Positive], repeats: Positive,
-    threads: Sequence[Positive], growth: Growth | Literal[False], training_step: TrainingStep | Literal[False],
+    growth: Growth | Literal[False], training_step: TrainingStep | Literal[False],
     model: Mapping[str, Any], constants: Mapping[str, Any], out: Path,
 ) -> None:  # fmt: skip
     """Time the rasterizers, or compare them on a scene; write `rasterizers.json` and a plot, print tables.
@@ -70,7 +68,6 @@ def run(
         backends: keys of `CLASSES`; those that do not work here are left out, with the reason.
         sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
         repeats: timed calls of each.
-        threads: numbers of threads to compare on the same pairs, where the machine has the cores; [] leaves it out.
         growth, training_step: False leaves them out.
         model: configuration of the module whose steps are timed.
         constants: configuration of the `RenderingConstants` that all backends share.
@@ -91,9 +88,6 @@ def run(
         else:
             quieten()
             figures = {"rows": speed_rows(working, sizes, views, repeats, tick)}
-            tiled = [backend for backend in working if backend.name == "tiled"]
-            if threads and tiled:
-                figures["threads"] = scaling_rows(tiled[0], threads, sizes, views, repeats, tick)
             if growth:
                 chosen = [backend for backend in working if backend.name in growth["backends"]]
                 figures["growth"] = growth_rows(chosen, tick, growth["most_gaussians"])
@@ -145,10 +139,9 @@ def _on_a_scene(
     }
 
 
-# `torch_tiled` and `gsplat_torch` are baselines: kept for this comparison, not to be chosen for training.
+# `gsplat_torch` is a baseline, kept for this comparison, not to be chosen for training.
 CLASSES = {
     "reference": "completesplat.rasterizers.reference.ReferenceRasterizer",
-    "torch_tiled": "completesplat.benchmarks.torch_tiled.TorchTiledRasterizer",
     "gsplat_torch": "completesplat.benchmarks.gsplat_torch.GsplatTorchRasterizer",
     "tiled": "completesplat.rasterizers.tiled.TiledRasterizer",
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
@@ -329,7 +322,6 @@ AGREEMENT: list[Column] = [
 # Key in the results, title, columns.
 SECTIONS = [
     ("rows", "Speed", SPEED),
-    ("threads", "Threads of tiled", thread_scaling.COLUMNS),
     ("growth", "Growth", GROWTH),
     ("training_step", "Share of a training step", STEP),
     (

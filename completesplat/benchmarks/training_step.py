@@ -17,7 +17,7 @@ from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 
 UNTIMED_STEPS, TIMED_STEPS = 3, 15
-SLOW = {"torch_tiled": (1, 3)}  # untimed and timed steps; the others of the slow ones would take minutes
+SLOW = {"gsplat_torch": (1, 3)}  # untimed and timed steps; the others of the slow ones would take minutes
 
 
 class StopWatch:

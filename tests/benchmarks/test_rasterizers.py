@@ -231,7 +231,7 @@ def test_all_that_was_measured_is_shown_with_the_machine(capsys: pytest.CaptureF
     results = {
         "machine": {"processor": "Some CPU", "threads": 2, "torch": "2.10", "date": "2026-01-31"},
         "not_measured": {"cuda": reason},
-        "rows": [row("tiled", 10.0), row("torch_tiled", 70.0)],
+        "rows": [row("tiled", 10.0), row("gsplat_torch", 70.0)],
         "growth": [row("tiled", 10.0, axis="views")],
         "training_step": [step | {"share": 0.06}],
         "agreement": [agreement],
@@ -242,7 +242,7 @@ def test_all_that_was_measured_is_shown_with_the_machine(capsys: pytest.CaptureF
     assert all(text in said for text in (*shown, "Speed", "Growth", "Share of a training step"))
     (line,) = (line for line in said.splitlines() if "False" in line)
     assert line.count("1.5e-06") == 2
-    (line,) = (line for line in said.splitlines() if "torch_tiled" in line)
+    (line,) = (line for line in said.splitlines() if "gsplat_torch" in line)
     assert "7.0" in line
 
 

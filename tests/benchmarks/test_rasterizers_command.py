@@ -5,10 +5,9 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-import torch
 from support import strict_json
 
-from completesplat.benchmarks import rasterizers, thread_scaling, training_step
+from completesplat.benchmarks import rasterizers, training_step
 from completesplat.benchmarks.workloads import splatter_scene
 
 QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
@@ -27,7 +26,7 @@ def garden(tmp_path: Path) -> Path:
 def test_speed_is_written_and_shown(command, tmp_path, monkeypatch):
     """What does not work here is named with the reason."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    switched_off = ["growth=false", "training_step=false", "threads=[]"]
+    switched_off = ["growth=false", "training_step=false"]
     finished = command(*QUICK, "backends=[tiled,reference,cuda]", *switched_off, f"out={tmp_path / 'out'}")
     assert finished.status == 0
     assert finished.out.splitlines()[-1] == str(tmp_path / "out")
@@ -59,28 +58,6 @@ def test_growth_and_the_share_of_a_step_are_written_and_plotted(command, tmp_pat
     assert (step["backend"], step["size"], step["batch"], step["views"]) == ("tiled", 32, 1, 2)
     assert imageio.imread(tmp_path / "out/rasterizers.png").ndim == 3
     assert all(title in finished.out for title in ("Growth", "Share of a training step"))
-
-
-def test_threads_are_compared_as_far_as_there_are_cores(command, tmp_path, monkeypatch):
-    """Of n threads that take the same time as one, the efficiency is 1 / n."""
-    monkeypatch.setattr("os.cpu_count", lambda: 3)
-    used = []
-
-    def milliseconds(*inputs):
-        used.append(torch.get_num_threads())
-        return (2.0, 5.0 if used[-1] == 1 else 4.0)
-
-    monkeypatch.setattr(thread_scaling, "milliseconds", milliseconds)
-    before = torch.get_num_threads()
-    only = ["backends=[tiled]", "growth=false", "training_step=false", "threads=[1,2,3,4]"]
-    finished = command(*QUICK, *only, f"out={tmp_path / 'out'}")
-    assert finished.status == 0
-    assert used == [1, 2, 3] * 2
-    assert torch.get_num_threads() == before
-    rows = strict_json(tmp_path / "out/rasterizers.json")["threads"]
-    found = [(row["threads"], row["forward_efficiency"], row["efficiency"]) for row in rows]
-    assert found == [(1, 1, 1), (2, 1 / 2, 5 / 8), (3, 1 / 3, 5 / 12)]
-    assert all(said in finished.out for said in ("Threads of tiled", "62%", "42%"))
 
 
 def test_backends_are_compared_on_a_scene_from_a_file(command, tmp_path, garden):

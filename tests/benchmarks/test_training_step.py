@@ -104,10 +104,10 @@ def test_the_synthetic_batch_is_one_of_a_data_module() -> None:
     assert near < DISTANCE < far
 
 
-@pytest.mark.parametrize(("name", "steps"), [("tiled", 3), ("torch_tiled", 2)])
+@pytest.mark.parametrize(("name", "steps"), [("tiled", 3), ("gsplat_torch", 2)])
 def test_the_rasterizer_takes_a_share_of_a_step(name: str, steps: int, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    for setting, value in (("UNTIMED_STEPS", 1), ("TIMED_STEPS", 2), ("SLOW", {"torch_tiled": (1, 1)})):
+    for setting, value in (("UNTIMED_STEPS", 1), ("TIMED_STEPS", 2), ("SLOW", {"gsplat_torch": (1, 1)})):
         monkeypatch.setattr(training_step, setting, value)
     drawn: list[tuple[int, ...]] = []
 
