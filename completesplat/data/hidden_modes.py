@@ -18,7 +18,7 @@ class HiddenModes(TensorDataclass):
     Attributes:
         scene: a batch of one scene, with the modes' views among its targets.
         views: indices of the targets that show the modes.
-        truths: images of these views in every mode, in [0, 1], at the data set's own resolution.
+        truths: images of these views in every mode, in [0, 1], with the same pixels as the data set's own images.
         region: pixels of these views that differ between the modes.
         probabilities: probabilities of the modes given the reference image.
         unseen: pixels of all targets whose surface the reference image does not show.
