@@ -136,10 +136,7 @@ class ShardWriter:
         refused.append(Refusal.of(error))
 
     def kept_record(self, plan: ShardPlan) -> ShardRecord | None:
-        """Return the record of a shard that an earlier run completed, or None.
-
-        If `on_bad` is "raise", an incomplete shard does not count.
-        """
+        """Return the record of a shard that an earlier run wrote (without errors, if `on_bad` is "raise"), or None."""
         path = self.folder / plan.file
         try:
             record: ShardRecord = parsed(ShardRecord, read_json(_record_path(path)))

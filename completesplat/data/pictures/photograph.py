@@ -70,8 +70,7 @@ def read_photograph(
             an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
-        remove_background: cut out the object (`without_background`) from the square; with `object_share`, from the
-            whole image.
+        remove_background: remove it (`without_background`) from the square; with `object_share`, from the whole image.
         background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
         object_share: for an image with a transparent or removed background, crop the square around the object such that
             the object's longer side fills this share of it; None: crop the central square.
@@ -285,10 +284,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
 
 
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
-    """Return the same for a mask image that is white where the photo is hidden, and that is cropped like the photo.
-
-    The mask must be readable and must have white pixels.
-    """
+    """Return the same for a mask image, which is white where the photo is hidden, and is cropped like the photo."""
     hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
     if not hidden.any():
         raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")

@@ -67,7 +67,7 @@ class ToyHiddenModes:
     """Scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
 
     `folder` is that of their category, a key of `DRAW`, and must hold a complete set of this version. Only the
-    reference returned by `choose` is used.
+    reference that `choose` returns is used.
     """
 
     folder: Path
