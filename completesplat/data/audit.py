@@ -75,9 +75,8 @@ class Findings:
 def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:
     """Read every sequence and every image once, even if several splits share them.
 
-    A sequence without errors that is not usable has too few frames, and is refused for that.
-
-    `workers` are processes (None: one for each core); with several, the sources (by split) must be picklable.
+    A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
+    each core); with several, the sources (by split) must be picklable.
     """
     refused = [error for source in sources.values() for error in _before_reading(source)]
     sequences, batches = list[_Sequence](), _batches(sources)

@@ -37,8 +37,8 @@ from completesplat.weights import sha256_of
 HEADER: dict[str, str | int] = {"format": 4, "kind": "latent_cache"}
 ARRAYS = ("mean", "log_variance", "condition")
 CHECKSUMS = "checksum"
-"""The array with the CRC-32 of each row of the others. A row is checked when it is read, because the files may have
-hundreds of gigabytes and each process opens them. This array and the manifest are checked when they are opened."""
+"""Name of the array with the CRC-32 of each row of the others. A row is checked when it is read, because the files may
+have hundreds of gigabytes and each process opens them. This array and the manifest are checked when they are opened."""
 NO_SUM = "0" * 64
 
 

@@ -24,7 +24,7 @@ from completesplat.tensors import stack
 
 DEPTH_MAPS = 8
 DEPTH_QUANTILE = 0.99
-FOREGROUND = 128  # of 255
+FOREGROUND = 128  # smallest mask value, of 255
 # Optical axes count as parallel if the smallest eigenvalue (at most 1) is below this.
 PARALLEL = 1e-4
 UP = 1
@@ -136,7 +136,7 @@ def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
 
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
-    """World points [n 3] of a depth map's foreground; the map may be smaller than the picture."""
+    """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
     if frame.depth is None:
         return np.zeros((0, 3))
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
@@ -171,7 +171,7 @@ class ObjectFraming:
 
 
 class CO3DSource(SequenceSource):
-    """The sequences of one split; see `SequenceSource`."""
+    """Sequences of one split; see `SequenceSource`."""
 
     def __init__(
         self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]

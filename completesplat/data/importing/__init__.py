@@ -1,4 +1,4 @@
-"""Import of own captures into CO3D v2's layout: undistorted images, masks, cameras and, if known, points."""
+"""Import of a user's captures into CO3D v2's layout: undistorted images, masks, cameras and, if known, points."""
 
 import logging
 import re

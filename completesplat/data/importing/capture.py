@@ -83,8 +83,7 @@ def check_lens(lens: Lens) -> Lens:
     """Return the lens itself, if it is valid.
 
     Raises:
-        BadCamera: a size or focal length is not positive, a number is not finite, or the principal point lies outside
-            of the image.
+        BadCamera: a size or focal length is not positive, a number is not finite, or the principal point is outside.
     """
     (height, width), (x, y) = lens.image_size, lens.center
     if not np.isfinite([*lens.focal, *lens.center, *lens.distortion]).all():

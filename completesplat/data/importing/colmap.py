@@ -129,7 +129,7 @@ def _after_image(content: bytes, offset: int) -> int:
 
 
 def _after_point(content: bytes, offset: int) -> int:
-    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, position, color, error
+    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, xyz, colour, error
 
 
 def _after_rig(content: bytes, offset: int) -> int:

@@ -201,7 +201,7 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def cached_latents(self) -> LatentCache:
-        """The cache in `latent_cache`, checked for damage and against the training data."""
+        """Latent cache in the folder `latent_cache`, checked for damage and against the training data."""
         assert self.latent_cache is not None
         store = LatentCache(self.latent_cache)
         store.must_belong_to(self.source("train"), self.packed_settings())

@@ -92,7 +92,7 @@ class SceneLoader:
         return len(self._loader)
 
     @property
-    def _items(self) -> int:  # of this process in an epoch
+    def _items(self) -> int:  # number of this process's items in an epoch
         return len(self.dataset if self.sampler is None else self.sampler)
 
     def __iter__(self) -> Iterator[Any]:

@@ -21,6 +21,9 @@ def local_root(root: str) -> Path:
     """Return a local folder as it is; for an address, fetch the manifest into a folder below `COMPLETESPLAT_CACHE`.
 
     A store that was made again at the same address gets another folder, which depends on the manifest's digest.
+
+    Raises:
+        DataError: nothing can be fetched from the address.
     """
     if "://" not in root:
         return Path(root)

@@ -52,7 +52,7 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
             if not wrong and wanted != size:
                 return cut_square(image, Square(0, 0, size), wanted)
             pixels = None if wrong else np.array(image)
-    # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+    # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
         raise BadPicture(f"cannot be decoded: {error}") from error
     if pixels is None or pixels.dtype != np.uint8:
@@ -134,8 +134,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
     """Return the sequence in a table with one row. Its images have `image_size` and are decoded when they are read.
 
     Raises:
-        DataError: the row is damaged, is not the sequence `name`, has columns of different lengths or numbers that are
-            not finite.
+        DataError: the row is damaged or of another sequence, its columns differ in length, or a number is not finite.
     """
     with at(file=file, sequence=name):
         try:

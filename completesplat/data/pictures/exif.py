@@ -29,7 +29,7 @@ def read_exif(picture: Image.Image) -> dict[int, Any]:
     When Pillow decodes a TIFF, it turns it upright and removes the orientation from its record.
     """
     tags: dict[int, Any] = {}
-    with suppress(Exception):  # Pillow's parser raises nearly anything on a damaged record.
+    with suppress(Exception):  # Pillow's parser raises almost any exception on a damaged record.
         exif = picture.getexif()
         tags.update(exif)
         tags.update(exif.get_ifd(ExifTags.IFD.Exif))

@@ -122,7 +122,7 @@ def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Ima
             raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
         except Image.DecompressionBombError:
             raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
-        # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+        # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ImageError(f"cannot be decoded: {reason}") from error

@@ -70,7 +70,7 @@ def read_photograph(
             an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
-        remove_background: remove it (`without_background`) from the square; with `object_share`, from the whole image.
+        remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
         background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
         object_share: for an image with a transparent or removed background, crop the square around the object such that
             the object's longer side fills this share of it; None: crop the central square.

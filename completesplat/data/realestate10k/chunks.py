@@ -47,7 +47,7 @@ class ChunkedClips:
         for key, name in index.items():
             with refused_to(self.refused.append), at(path, key):
                 paths[key] = inside(folder, name)
-        # `Path.is_file` raises where a name is too long.
+        # `Path.is_file` raises if a name is too long.
         existing = {path for path in set(paths.values()) if isfile(path)}
         self.folder = folder
         self._files = {key: path for key, path in paths.items() if path in existing}

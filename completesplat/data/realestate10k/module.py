@@ -152,7 +152,7 @@ class RE10KDataModule(SceneDataModule):
 
     @cached_property
     def index(self) -> EvaluationIndex | None:
-        """The content of `evaluation_index`."""
+        """Content of the file `evaluation_index`."""
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:

@@ -28,7 +28,7 @@ FROM_THE_FRONT = 0.35
 """Largest azimuth (radians) between the first camera and the nose, so that this camera never sees the patch."""
 
 PATCH_EDGE, PATCH_TILT = 0.5, 0.2
-"""The patch is where the normal lies within 60 degrees of the nose's opposite, tilted down by 0.2 radians."""
+"""The patch covers normals within 60 degrees of the direction opposite to the nose, tilted down by 0.2 radians."""
 
 
 def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:

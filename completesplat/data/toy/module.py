@@ -33,11 +33,10 @@ def _must_make(root: Path, folder: Path, make: bool) -> bool:
 class ToyObjectsDataModule(CO3DDataModule):
     """`CO3DDataModule` of toy objects, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Existing scenes are used as they are, whatever their number is.
-
-    `category` is a key of `DRAW`; `scenes`, `frames` and `data_seed` determine the data to write; the others are
-    settings of `CO3DDataModule`. The default of `depth_before` is smaller than there and equals that in
-    `conf/data/toy_objects.yaml`, because a model knows the depth range that it was trained with.
+    Existing scenes are used as they are, whatever their number is. `category` is a key of `DRAW`; `scenes`, `frames`
+    and `data_seed` determine the data to write; the others are settings of `CO3DDataModule`. The default of
+    `depth_before` is smaller than there and equals that in `conf/data/toy_objects.yaml`, because a model knows the
+    depth range that it was trained with.
     """
 
     def __init__(
@@ -73,10 +72,9 @@ class ToyObjectsDataModule(CO3DDataModule):
 class ToyRoomsDataModule(RE10KDataModule):
     """`RE10KDataModule` of toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Existing clips are used as they are, whatever their number is.
-
-    `form` selects one of RealEstate10K's two forms, "text" or "chunks", which have the same content. `scenes`,
-    `frames`, `height` and `data_seed` determine the data to write; the others are settings of `RE10KDataModule`.
+    Existing clips are used as they are, whatever their number is. `form` selects one of RealEstate10K's two forms,
+    "text" or "chunks", which have the same content. `scenes`, `frames`, `height` and `data_seed` determine the data to
+    write; the others are settings of `RE10KDataModule`.
     """
 
     def __init__(
