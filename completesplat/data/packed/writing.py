@@ -227,8 +227,7 @@ def prepare(
 ) -> Path:
     """Write sequences into a packed store. Its bytes depend on the input only, not on the number of workers.
 
-    An interrupted run continues when it is started again. A complete store of the same data remains unchanged. A shard
-    that is missing or has another size is written again.
+    A run that is started again keeps a complete store, or only writes shards that are missing or of another size.
 
     Args:
         codec: image codec, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are lossless, "jpeg" is not.
