@@ -1,1 +1,1 @@
-"""Everything that knows a data set's name: readers, data modules, toy scenes, photographs."""
+"""All code that is specific to data sets: readers, data modules, toy scenes, photos."""

@@ -1,4 +1,4 @@
-"""Reading a whole data set once: what of it can be used, and what cannot and why."""
+"""Check of a whole data set: numbers of usable sequences and frames, and reasons for those that are not usable."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -24,21 +24,21 @@ LARGEST_BATCH = 16
 EXAMPLES = 3
 
 Sources = Mapping[str, SequenceSource]
-# Names, each with the splits that have it.
+# Names of sequences, each with the splits that contain it.
 _Batch = list[tuple[str, list[str]]]
 
 
 class LeftOut(DataError, kind="left out"):
-    """A sequence in which nothing is broken, but which the settings leave out."""
+    """Intact sequence that the settings leave out."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What reading everything showed: the numbers of usable sequences (of two usable frames or more) and their frames.
+    """Result of a check, with the numbers of usable sequences (with at least two usable frames) and of their frames.
 
     Attributes:
-        refused: each thing once, in the order of the data set.
-        splits: the same two numbers for each split alone.
+        refused: errors without duplicates, in the order of the data set.
+        splits: the same two numbers for each split.
         shared: the sequences that two splits share, see `shared_names`.
     """
 
@@ -49,7 +49,7 @@ class Findings:
     shared: dict[str, list[str]]
 
     def by_kind(self) -> dict[str, list[DataError]]:
-        """The refusals by what is wrong, and those left out by their reason; the most frequent first."""
+        """Group errors by kind, and sequences left out by reason; the most frequent group comes first."""
         kinds: dict[str, list[DataError]] = {}
         for error in self.refused:
             kind = f"{error.kind}: {error.reason}" if isinstance(error, LeftOut) else error.kind
@@ -57,7 +57,7 @@ class Findings:
         return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
 
     def json(self) -> dict[str, Any]:
-        """The contents of `check.json`."""
+        """Return the content of `check.json`."""
         parts = ("sequence", "frame", "file", "reason")
         return {
             "usable": {"sequences": self.sequences, "frames": self.frames},
@@ -68,16 +68,15 @@ class Findings:
         }
 
     def write(self, path: Path) -> None:
-        """Write `json()` as a file."""
+        """Write `json()` to a file."""
         write_text(path, json.dumps(self.json(), indent=2, allow_nan=False) + "\n")
 
 
 def check(sources: Sources, workers: int | None = None, progress: bool = True) -> Findings:
-    """Read every sequence and every picture once, also where several splits share them.
+    """Read every sequence and every image once, even if several splits share them.
 
-    A sequence that is not usable although nothing of it was refused counts as refused: it has too few frames.
-
-    The sources, by split, must be picklable where there are several `workers`: processes, by default one a core.
+    A sequence without errors that is not usable is refused for too few frames. `workers` are processes (None: one for
+    each core); with several, the sources (by split) must be picklable.
     """
     refused = [error for source in sources.values() for error in _before_reading(source)]
     sequences, batches = list[_Sequence](), _batches(sources)
@@ -104,7 +103,7 @@ def check(sources: Sources, workers: int | None = None, progress: bool = True) -
 
 
 def show(findings: Findings) -> None:
-    """Print refusals by kind, with the first few of each, and what is usable."""
+    """Print errors by kind, with the first few of each, and the numbers of usable sequences and frames."""
     console = Console(width=None if Console().is_terminal else 120)
     if findings.refused:
         table = Table(title="not usable", show_lines=True)
@@ -124,7 +123,7 @@ def show(findings: Findings) -> None:
 
 @dataclass
 class _Sequence:
-    """One sequence, read: its frames in each split, and which of all of them are usable."""
+    """Result of reading one sequence: its frames in each split, usable frames of all splits, and errors."""
 
     name: str
     frames: dict[str, set[int]] = field(default_factory=dict)
@@ -140,7 +139,7 @@ def _before_reading(source: SequenceSource) -> Iterator[DataError]:
 
 
 def _batches(sources: Sources) -> list[_Batch]:
-    """All names, each once, in pieces of what is best read by one process."""
+    """Divide all names, each once, into batches that are best read by one process."""
     splits: dict[str, list[str]] = {}
     for split, source in sources.items():
         for name in dict.fromkeys(source.names):

@@ -1,4 +1,4 @@
-"""Scenes of which it is known what the reference picture hides: all that could be there, and how probable each is."""
+"""Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -13,16 +13,16 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class HiddenModes(TensorDataclass):
-    """One scene whose hidden part takes one of several forms, the modes.
+    """One scene whose hidden part has several alternatives, the modes.
 
     Attributes:
-        scene: a batch of one, with the modes' views among its targets.
-        views: the places in the targets of the views that show the modes.
-        truths: the pictures of those views in every mode, in [0, 1], in the pixels of the data set's own pictures.
-        region: pixels of those views that differ between the modes.
-        probabilities: of the modes, given the reference picture.
-        unseen: pixels of all targets whose surface the reference picture does not show.
-        true_mode: the mode that the data set's own pictures show.
+        scene: a batch of one scene, with the modes' views among its targets.
+        views: indices of the targets that show the modes.
+        truths: images of these views in every mode, in [0, 1], with the same pixels as the data set's own images.
+        region: pixels of these views that differ between the modes.
+        probabilities: probabilities of the modes given the reference image.
+        unseen: pixels of all targets whose surface the reference image does not show.
+        true_mode: index of the mode that the data set's own images show.
     """
 
     scene: SceneBatch
@@ -37,29 +37,29 @@ class HiddenModes(TensorDataclass):
 
 @runtime_checkable
 class HiddenModeScenes(Protocol):
-    """Scenes that are made one by one, when they are indexed."""
+    """Sequence of scenes, each made when it is indexed."""
 
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> HiddenModes:
-        """One scene.
+        """Return one scene.
 
         Raises:
-            DataError: it is unreadable, its reference view tells the modes apart, or no view shows them well.
-            CompleteSplatError: the files are not those that the data set made.
+            DataError: it is unreadable, its reference view distinguishes the modes, or no view shows them well.
+            CompleteSplatError: the files were not made by the data set.
         """
 
 
 @runtime_checkable
 class KnowsHiddenModes(Protocol):
-    """A data module that can tell what else could be where the reference picture shows nothing."""
+    """Data module that knows the alternatives for what the reference image hides."""
 
     def hidden_modes(self, views: int, spread_views: int) -> HiddenModeScenes:
-        """All test scenes: at most `views` views that show the modes best, and further targets evenly spread."""
+        """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets."""
 
 
 def hidden_modes(data: Any, views: int, spread_views: int) -> HiddenModeScenes:
-    """What `data.hidden_modes` gives; `CompleteSplatError` if it knows of none, or has files that it did not make."""
+    """Return `data.hidden_modes(views, spread_views)`, after a check that the data module has this method."""
     if not isinstance(data, KnowsHiddenModes):
         raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")
     return data.hidden_modes(views, spread_views)

@@ -1,4 +1,4 @@
-"""A latent cache on disk: rows written, read back memory-mapped, and drawn as training items."""
+"""Latent cache on disk: it is written row by row, read memory-mapped, and used as a training set."""
 
 import math
 import os
@@ -37,14 +37,14 @@ from completesplat.weights import sha256_of
 HEADER: dict[str, str | int] = {"format": 4, "kind": "latent_cache"}
 ARRAYS = ("mean", "log_variance", "condition")
 CHECKSUMS = "checksum"
-"""The array with the CRC-32 of each row of the others. A row is checked whenever it is read, because the files may have
-hundreds of gigabytes and each process opens them; this array, and the manifest, are checked when they are opened."""
+"""Name of the array with the CRC-32 of each row of the others. A row is checked when it is read, because the files may
+have hundreds of gigabytes and each process opens them. This array and the manifest are checked when they are opened."""
 NO_SUM = "0" * 64
 
 
 @dataclass(frozen=True)
 class Array:
-    """One `.npy` file; its first axis is the store's rows, one for each encoded picture."""
+    """One `.npy` file, whose first axis has one row for each encoded image."""
 
     file: str
     dtype: str
@@ -53,7 +53,7 @@ class Array:
 
 @dataclass(frozen=True)
 class CachedSequence:
-    """The rows of one sequence: from `first` on, one for each of the frames `stored` (places in the sequence)."""
+    """Rows of one sequence, which start at `first`, one for each of the frames `stored` (indices in the sequence)."""
 
     name: str
     frames: int
@@ -61,30 +61,30 @@ class CachedSequence:
     stored: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        # Strictly increasing from 0 on and below `frames`.
+        # They must be strictly increasing, at least 0 and below `frames`.
         if not self.stored or any(b <= a for a, b in pairwise((-1, *self.stored, self.frames))):
             raise BadAnnotation("stored frames must be places in the sequence, in order")
 
 
 @dataclass(frozen=True)
 class Origin:
-    """What a store was made from. Another store with the same origin would hold the same."""
+    """Inputs that determine the content of a store."""
 
-    encoder: str  # fingerprints
-    conditioning: str | None  # the frozen one whose features are stored; None: pictures are
+    encoder: str  # a fingerprint, as are the next two
+    conditioning: str | None  # of the frozen conditioning whose features are stored; None: images are stored
     data: str
-    settings: dict[str, Scalar]  # of the data module: what pictures and splits depend on
+    settings: dict[str, Scalar]  # of the data module: those that determine images and splits
     image_size: int
-    frames: int | None  # the largest number of frames of a sequence, evenly spaced; None: all
-    views: int  # other views that the posterior saw; 0: it sees the reference alone
+    frames: int | None  # largest number of evenly spaced frames of a sequence; None: all frames
+    views: int  # other views that the posterior sees; 0: it sees the reference only
     precision: str
 
 
 @dataclass(frozen=True)
 class LatentCacheManifest:
-    """A whole store; `sequences` are those of the training set, in its order; `mean` and `std` are of a latent.
+    """Manifest of a store, with the sequences of the training set in order, and mean and std of latents by channel.
 
-    `checksums` is the SHA-256 of the array of checksums, `sha256` that of the manifest, with zeros in its place.
+    `checksums` is the SHA-256 of the array of checksums. `sha256` is that of the manifest with zeros in its place.
     """
 
     version: str
@@ -111,18 +111,18 @@ class LatentCacheManifest:
 
 
 def is_latent_cache(root: Path) -> bool:
-    """Whether a folder holds a finished store."""
+    """Return whether a folder holds a finished store."""
     return (root / MANIFEST).is_file()
 
 
 def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
-    """Finish the store."""
+    """Write the manifest, which marks the store as finished."""
     text = json_text(manifest, HEADER)
     write_text(root / MANIFEST, text.replace(NO_SUM, sha256(text.encode()).hexdigest()))
 
 
 def row_checksums(rows: Mapping[str, Shaped[np.ndarray, "row _ _ _"]]) -> Shaped[np.ndarray, "row 1 1 1"]:
-    """Return the CRC-32 of each row of the arrays, one after the other."""
+    """Return one CRC-32 for each row, computed over all arrays in order."""
     sums = [
         reduce(lambda value, name: crc32(rows[name][i].tobytes(), value), ARRAYS, 0) for i in range(len(rows["mean"]))
     ]
@@ -130,9 +130,9 @@ def row_checksums(rows: Mapping[str, Shaped[np.ndarray, "row _ _ _"]]) -> Shaped
 
 
 class ArrayWriter:
-    """Writes rows of the shape `row` behind each other; leaving the context puts their number into the header.
+    """Context manager that appends rows of the shape `row` to a file, and writes their number into its header at exit.
 
-    After an exception the file is removed. `DiskError`: the disk is full.
+    After an exception, such as a DiskError because the disk is full, the file is removed.
     """
 
     def __init__(self, path: Path, row: tuple[int, ...], dtype: str) -> None:
@@ -150,7 +150,7 @@ class ArrayWriter:
         return self
 
     def append(self, rows: Shaped[np.ndarray, "_ _ _ _"]) -> None:
-        """Some more rows, of the writer's dtype."""
+        """Append rows of the writer's dtype."""
         assert (rows.shape[1:], rows.dtype) == (self.row, self.dtype)
         self.count += len(rows)
         with writing(self.path, self.count * self.bytes_of_row):
@@ -161,7 +161,7 @@ class ArrayWriter:
         try:
             with writing(self.path, self.count * self.bytes_of_row), self._file:
                 self._file.seek(0)
-                # NumPy pads headers so that a first axis of any length fits.
+                # The header keeps its size, because NumPy pads it for a first axis of any length.
                 assert self._write_header() == self._begin
                 self._file.flush()
                 os.fsync(self._file.fileno())
@@ -176,34 +176,34 @@ class ArrayWriter:
         return self._file.tell()
 
     def described(self) -> Array:
-        """For the manifest."""
+        """Return the manifest's entry of this array."""
         return Array(self.path.name, self.dtype.name, (self.count, *self.row))
 
 
 def open_array(root: Path, array: Array) -> np.memmap:
-    """A stored array, of which nothing is read yet; `DataError` if missing, cut short or not as the manifest says."""
+    """Map a stored array into memory without reading it, after checking its shape, dtype and length."""
     with at(file=root / MANIFEST):
         path = inside(root, array.file)
     with at(file=require_file(path)):
         try:
-            found = np.load(path, mmap_mode="r", allow_pickle=False)
+            mapped = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
             raise UnreadableFile(f"damaged or no NumPy array: encode the pictures again ({error})") from None
-        if not isinstance(found, np.memmap) or found.shape != array.shape or found.dtype != np.dtype(array.dtype):
+        if not isinstance(mapped, np.memmap) or mapped.shape != array.shape or mapped.dtype != np.dtype(array.dtype):
             raise ChangedFile("not the array that the manifest describes: encode the pictures again")
-        if path.stat().st_size != found.offset + found.nbytes:
+        if path.stat().st_size != mapped.offset + mapped.nbytes:
             raise ChangedFile("longer than it was written: encode the pictures again")
-        return found
+        return mapped
 
 
 class LatentCache:
-    """The latent cache of a training set, opened.
+    """Latent cache of a training set, open for reading.
 
-    `mean` and `std` are those of each channel of latents drawn from the posteriors of all stored frames;
-    `arrays` are memory-mapped, with one row for each picture.
+    `mean` and `std` are statistics by channel of latents drawn from the posteriors of all stored frames.
+    `arrays` are memory-mapped and have one row for each image.
 
     Raises:
-        DataError: no finished store, or one that is damaged.
+        DataError: the store is unfinished or damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -225,9 +225,10 @@ class LatentCache:
         self.holds_pictures = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
-        """Return the frame at a place in a sequence, without batch axis, in float32.
+        """Return the frame with this index in a sequence, without batch axis, in float32.
 
-        `DataError`: it was not encoded, or is not what was written.
+        Raises:
+            DataError: the frame was not encoded, or its rows differ from their checksum.
         """
         sequence = self.sequences[name]
         if frame not in sequence.stored:
@@ -238,36 +239,35 @@ class LatentCache:
             raise ChangedFile("its checksum is another: encode the pictures again", str(self.folder), name, frame)
         mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
         if self.holds_pictures:
-            # The same division as of pictures that are read, bit by bit.
+            # The same division as for images that are read from the data set, for bitwise equal results.
             condition = torch.from_numpy(np.divide(rows["condition"][0], 255, dtype=np.float32))
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
 
     def must_belong_to(self, source: SequenceSource, settings: dict[str, Scalar]) -> None:
-        """`must_be_of`, and refuse a store that was made with other settings too."""
+        """Refuse a store that was made with other settings or from another data set."""
         differing = differences(self.origin.settings, settings)
         if differing:
             raise DataError(f"encoded with {differing}: set these as they were, or encode again", str(self.folder))
         self.must_be_of(source)
 
     def must_be_of(self, source: SequenceSource) -> None:
-        """Refuse a store that was made from another data set, with `DataError`."""
+        """Refuse a store that was made from another data set."""
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Worker processes map the files themselves; a pickled array would hold all of it.
+        # Worker processes map the files themselves, because pickling an array would copy all of it.
         return LatentCache, (self.folder,)
 
 
 class CachedTrainingScenes(TrainingScenes):
-    """The items of `TrainingScenes`, without targets: the same sequence and reference frame for (seed, epoch, index).
+    """Items of `TrainingScenes` without targets, with the same sequence and reference frame for (seed, epoch, index).
 
-    Where only some frames of a sequence were encoded, the nearest of those that are there takes the reference's place
-    (the earlier one of two). The store's names and groups tell the order; it is not read. Box masks hide parts of the
-    pictures as `augment` does.
+    If only some frames of a sequence were encoded, the nearest one (the earlier of two) replaces the reference frame.
+    `store` determines the order of items; its images are not read. Box masks hide parts of images as in `augment`.
 
     Raises:
-        CompleteSplatError: box masks, but the store holds features instead of pictures.
+        CompleteSplatError: there are box masks, but the store holds features instead of images.
     """
 
     def __init__(
@@ -288,7 +288,7 @@ class CachedTrainingScenes(TrainingScenes):
         self.box_masks = box_masks
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> CachedScene:
-        """An encoded reference frame of the sequence of this name."""
+        """Draw a random reference frame of the sequence `name` and return its encoding."""
         sequence = self.cache.sequences[name]
         reference, _ = self.choose(sequence.frames, epoch, rng)
         stored = np.array(sequence.stored)

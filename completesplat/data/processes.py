@@ -1,4 +1,4 @@
-"""Work for several processes: the same results in the same order, however many they are."""
+"""Parallel map over processes, whose results and order do not depend on the number of processes."""
 
 import os
 import pickle
@@ -20,17 +20,17 @@ Result = TypeVar("Result")
 def map_in_processes(
     function: Callable[[Item], Result], items: Sequence[Item], workers: int | None
 ) -> Iterator[Result]:
-    """`function` of every item, in order, by `workers` processes (None: one a core), each of which gets it once.
+    """Yield `function` of every item in order, by `workers` processes (None: one for each core) that get it once.
 
     Raises:
         CompleteSplatError: a process ended unexpectedly.
-        Interrupted: the processes end, too; what `function` was doing ends with the same exception.
+        Interrupted: the run was interrupted; the processes end with the same exception.
     """
     workers = min(workers or os.cpu_count() or 1, len(items))
     if workers <= 1:
         yield from map(function, items)
         return
-    # As bytes: torch would share each tensor as an open file, and a data set has more cameras than those may be.
+    # Pickled to bytes, because torch would share each tensor as an open file, and there are too many cameras for that.
     contents = pickle.dumps(function)
     with ProcessPoolExecutor(workers, get_context("spawn"), _start, (contents,)) as pool:
         try:
@@ -50,15 +50,15 @@ _function: Callable[[Any], Any]
 
 
 def _start(contents: bytes) -> None:
-    """Remember in a new process what it is for."""
+    """Prepare a new process and store its function."""
     global _function
     end_with_parent()
     torch.set_num_threads(1)  # There is one process for each core.
-    _function = pickle.loads(contents)  # by this process's parent
+    _function = pickle.loads(contents)  # written by the parent process
 
 
 def _call(item: Any) -> Any:
     try:
         return _function(item)
     except Interrupted as stop:
-        os._exit(128 + stop.signal)  # the pool would send it to the parent as a result, and wait for the next item
+        os._exit(128 + stop.signal)  # the pool would return the exception as a result, and wait for the next item

@@ -1,4 +1,4 @@
-"""Sequences of pictures with cameras: what a data set is, once its own files and conventions are behind it."""
+"""Posed image sequences: the common form of all data sets, independent of their files and conventions."""
 
 import hashlib
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -16,7 +16,7 @@ SPLITS = ("train", "val", "test")
 
 
 class Picture(NamedTuple):
-    """One square picture (sRGB) and its foreground probability (0 to 255), if the data set has one."""
+    """Square image (sRGB) and its foreground probability (0 to 255), if the data set has one."""
 
     image: UInt8[Tensor, "3 size size"]
     mask: UInt8[Tensor, "1 size size"] | None
@@ -24,15 +24,15 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True)
 class PosedSequence:
-    """The frames of one video, cropped to squares and at the common scale.
+    """Frames of one video, cropped to squares and at the common scale.
 
     Attributes:
-        frames: the numbers that the data set gives them, in order.
-        cameras: [view], float64, of the square pictures; the world is the sequence's own.
-        depth_ranges: (near, far) with each of the frames as the reference, float32, in units of the cameras.
-        read: index of a frame (not its number) -> its picture. Raises `DataError` if it cannot be read.
-        read_depth: index of a frame -> depth along the optical axis in units of the cameras, 0 where it is unknown;
-            None: there is no depth. Raises `DataError` if it cannot be read.
+        frames: frame numbers in the data set, in order.
+        cameras: [view], float64, of the square images; the world is the sequence's own.
+        depth_ranges: (near, far) for each frame as the reference, float32, in units of the cameras.
+        read: index of a frame (not its number) -> its image; a DataError if it cannot be read.
+        read_depth: index of a frame -> depth along the optical axis in units of the cameras, 0 where it is unknown; a
+            DataError if it cannot be read; None: there is no depth.
     """
 
     name: str
@@ -45,13 +45,13 @@ class PosedSequence:
 
 @runtime_checkable
 class SequenceSource(Protocol):
-    """The sequences of one split, wherever they lie.
+    """Sequences of one split, in any form of storage.
 
     Attributes:
-        names: of the sequences that can be read, as far as listing them showed.
-        refused: what listing them found broken.
-        left_out: names that were left out although nothing is broken, by reason.
-        listed: how many sequences the data set has for this split, usable or not.
+        names: names of the sequences that can be read, as far as listing them can tell.
+        refused: errors that were found when the sequences were listed.
+        left_out: names of intact sequences that are left out, by reason.
+        listed: number of sequences that the data set has for this split, usable or not.
     """
 
     names: list[str]
@@ -60,11 +60,11 @@ class SequenceSource(Protocol):
     listed: int
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence: its cameras now, its pictures when `PosedSequence.read` is called. `DataError` if unusable."""
+        """Read a sequence's cameras, or raise a DataError; `PosedSequence.read` reads its images later."""
         ...
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Indices into `names` of the sequences that are best read one after the other; by default any order does."""
+        """Return groups of indices into `names` that are best read one after the other; by default one group."""
         return [list(range(len(names)))]
 
     def verify(self) -> Sequence[DataError]:
@@ -72,12 +72,12 @@ class SequenceSource(Protocol):
         return []
 
     def fingerprint(self) -> str:
-        """SHA-256 (hexadecimal) of what the sequences are made from: another one means other data."""
+        """Return a SHA-256 (hexadecimal) of the sequences' sources, which changes with the data."""
         ...
 
 
 def shared_names(splits: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
-    """Return the names that two splits share, by pair: "train and val". Pairs that share nothing are left out."""
+    """Return the names that two splits share, by pair ("train and val"), without pairs that share nothing."""
     pairs = {f"{one} and {other}": sorted({*splits[one]} & {*splits[other]}) for one, other in combinations(splits, 2)}
     return {pair: names for pair, names in pairs.items() if names}
 
@@ -88,22 +88,22 @@ def overlaps(shared: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def shortened(names: Sequence[str], most: int = 5) -> str:
-    """The first few names, for a message."""
+    """Return the first few names for a message."""
     return ", ".join([*names[:most], *(["..."] if len(names) > most else [])])
 
 
 def spread_places(count: int, most: int | None) -> list[int]:
-    """At most `most` of `count` places: the middles of equal parts; None: all."""
+    """Return at most `most` of `count` indices, the middles of equal parts; None: all."""
     if most is None or most >= count:
         return list(range(count))
     return [(2 * part + 1) * count // (2 * most) for part in range(most)]
 
 
 def split_by_hash(names: Sequence[str], fraction: float, seed: int) -> tuple[list[str], list[str]]:
-    """Training and held-out sequences, in the given order.
+    """Return training and held-out sequences in the order of `names`.
 
-    A sequence's side depends on its name and the seed only, so that it stays where it is when others come; only where
-    none would be held out is it the one with the smallest hash.
+    A sequence's side depends only on its name and the seed, so it does not change when sequences are added. If no
+    sequence would be held out, the one with the smallest hash is.
     """
     position = {name: int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8]) / 2**64 for name in names}
     held_out = {name for name in names if position[name] < fraction}

@@ -1,4 +1,4 @@
-"""Refusals of bad input: one class of `DataError` for each kind, and the checks that they come from."""
+"""Errors about bad input, one subclass of `DataError` for each kind, and the checks that raise them."""
 
 import json
 import os
@@ -15,10 +15,10 @@ from completesplat.errors import DataError, PlyError
 from completesplat.ply_files import read_vertices
 
 MOST_BYTES = 2**32
-# Beyond this size a gzipped file may be smaller than its content by no more than this factor. Deflate gets up to 1032,
-# annotations of frames 6, those of sequences 23.
+# Content above the first size may be larger than its gzipped file by at most the second factor. Deflate reaches 1032;
+# annotations of frames have 6, those of sequences 23.
 BYTES_OF_ANY_RATIO, LARGEST_RATIO = 2**24, 40
-CHUNK = 2**20  # of a file that is read
+CHUNK = 2**20  # bytes that are read at once
 ROTATION_TOLERANCE = 1e-3
 
 T = TypeVar("T")
@@ -26,48 +26,48 @@ Refuse = Callable[[DataError], None]
 
 
 class MissingFile(DataError, kind="missing file"):
-    """A file that an annotation or a layout promises is not there."""
+    """File that an annotation or a layout requires, and that does not exist."""
 
 
 class OutsidePath(DataError, kind="path outside of the data"):
-    """A path in an annotation that leads out of the data's folder, or nowhere."""
+    """Path in an annotation that leads out of the data's folder, or nowhere."""
 
 
 class UnreadableFile(DataError, kind="unreadable file"):
-    """A file other than a picture that is damaged, too large, unsafe to read or of another format."""
+    """File other than an image that is damaged, too large, unsafe to read or of another format."""
 
 
 class BadAnnotation(DataError, kind="malformed annotation"):
-    """An annotation without a key that is needed, or with a value of another type or shape."""
+    """Annotation without a required key, or with a value of another type or shape."""
 
 
 class BadCamera(DataError, kind="impossible camera"):
-    """A pose or intrinsics that no camera has."""
+    """Pose or intrinsics that no camera can have."""
 
 
 class BadPicture(DataError, kind="unusable picture"):
-    """A picture, mask or depth map that is damaged, too large, of another size or without a plain meaning."""
+    """Image, mask or depth map that is damaged, too large, of another size or ambiguous."""
 
 
 class BadPlacement(DataError, kind="object without a place"):
-    """Nothing shows where a sequence's object is and how large."""
+    """Sequence whose object has an unknown position or size."""
 
 
 class TooFewFrames(DataError, kind="too few frames"):
-    """A sequence with too few (usable) frames."""
+    """Sequence with too few (usable) frames."""
 
 
 class SharedSequences(DataError, kind="shared sequence"):
-    """A list of sequences to train or validate on that names some to test on."""
+    """List of training or validation sequences that contains test sequences."""
 
 
 class ChangedFile(DataError, kind="changed file"):
-    """A file that is no longer what its checksum was taken of."""
+    """File that has changed since its checksum was computed."""
 
 
 @contextmanager
 def at(file: Path | str | None = None, sequence: str | None = None, frame: int | None = None) -> Iterator[None]:
-    """Tell refusals from within where they happened, as far as they do not know it themselves."""
+    """Add file, sequence and frame to a DataError raised within the context, unless it already has them."""
     try:
         yield
     except DataError as error:
@@ -77,7 +77,7 @@ def at(file: Path | str | None = None, sequence: str | None = None, frame: int |
 
 @contextmanager
 def refused_to(refuse: Refuse) -> Iterator[None]:
-    """Hand a refusal from within to `refuse`, which may collect it or raise it."""
+    """Pass a DataError raised within the context to `refuse`, which may collect it or raise it."""
     try:
         yield
     except DataError as error:
@@ -85,26 +85,26 @@ def refused_to(refuse: Refuse) -> Iterator[None]:
 
 
 def require_file(path: Path) -> Path:
-    """The path itself; `MissingFile` if there is no such file."""
-    # `Path.is_file` raises where a name is too long or a folder may not be entered.
+    """Return the path itself if the file exists, or refuse it as missing."""
+    # `Path.is_file` raises if a name is too long or a folder may not be entered.
     if not os.path.isfile(path):
         raise MissingFile("no such file", str(path))
     return path
 
 
 def inside(root: Path, relative: str) -> Path:
-    """The path below `root` that an annotation names. Links are followed as long as they stay below `root`.
+    """Return the path below `root` that an annotation names. Links are followed if they stay below `root`.
 
     Raises:
-        OutsidePath: no plain relative path (absolute, with `..`, a backslash, a drive, a scheme or a NUL), or one that
-            leads out of `root` through a link.
+        OutsidePath: the path is empty or absolute, has `..`, a backslash, a drive, a scheme or a NUL, or leads out of
+            `root` through a link.
     """
     path, windows = PurePath(relative), PureWindowsPath(relative)
     plain = path.parts and not path.is_absolute() and ".." not in path.parts and not windows.drive
     if not plain or any(text in relative for text in ("\0", "\\", "://")):
         raise OutsidePath(f"leads outside of {root}, or nowhere: {_shortened(relative)}")
     try:
-        # It also takes a path that does not exist, and one whose links form a ring.
+        # `realpath` also accepts a path that does not exist, and one whose links form a ring.
         real_root, real_path = os.path.realpath(root), os.path.realpath(root / path)
     except ValueError:
         raise OutsidePath(f"characters that no file name has: {_shortened(relative)}") from None
@@ -114,14 +114,14 @@ def inside(root: Path, relative: str) -> Path:
 
 
 def read_json(path: Path, allow_nan: bool = False) -> Any:
-    """The content of a JSON file, gzipped if its name ends in `.jgz`.
+    """Read a JSON file, which is gzipped if its name ends in `.jgz`.
 
     Args:
-        allow_nan: take NaN and Infinity, which are no JSON but written by Python, as numbers.
+        allow_nan: accept NaN and Infinity as numbers; they are no JSON, but Python writes them.
 
     Raises:
-        MissingFile: no such file.
-        UnreadableFile: no (gzipped) JSON in UTF-8, or too large, unpacked or not.
+        MissingFile: the file does not exist.
+        UnreadableFile: it is no (gzipped) JSON in UTF-8, or too large, unpacked or not.
     """
     try:
         text = _read(path, MOST_BYTES).decode("utf-8")
@@ -131,7 +131,7 @@ def read_json(path: Path, allow_nan: bool = False) -> Any:
 
 
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
-    """The content of a text file in UTF-8; `MissingFile` if there is none, `UnreadableFile` if no text or too large."""
+    """Read a text file in UTF-8; errors as in `read_json`."""
     try:
         return _read(path, most_bytes).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -139,7 +139,7 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
 
 
 def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The vertices of a PLY file as `read_vertices`, and their places [n 3] in float64; errors as of `read_text`."""
+    """Read a PLY file's vertices (`read_vertices`) and their positions [n 3] in float64; errors as in `read_json`."""
     require_file(path)
     try:
         vertices = read_vertices(path, "xyz")
@@ -149,7 +149,7 @@ def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:
-    """A value of a JSON object; `BadAnnotation` if it is missing or of another type than `kind` (true is no `int`)."""
+    """Return a value of a JSON object, or refuse one that is missing or has another type than `kind`."""
     if type(entry) is not dict or key not in entry:
         raise BadAnnotation(f"no {key} in {_shortened(entry)}")
     value = entry[key]
@@ -160,7 +160,7 @@ def field(entry: object, key: str, kind: type[T]) -> T:
 
 
 def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Numbers from JSON as a float64 array; `BadAnnotation` for anything else, another shape, NaN or infinity."""
+    """Convert numbers from JSON to a float64 array, and refuse other types, another shape, NaN and infinity."""
     try:
         array = np.array(value)
     except ValueError:  # Lists of unequal length.
@@ -175,7 +175,7 @@ def finite_array(value: object, shape: tuple[int, ...], what: str) -> np.ndarray
 
 
 def require_rotation(matrix: np.ndarray, what: str) -> None:
-    """Raise `BadCamera` for a 3 x 3 matrix that is no rotation, within 1e-3 for each entry of R R^T."""
+    """Refuse a 3 x 3 matrix that is no rotation; the tolerance is 1e-3 for each entry of R R^T."""
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROTATION_TOLERANCE:
         raise BadCamera(f"{what} is not orthonormal")
     if np.linalg.det(matrix) < 0:
@@ -188,7 +188,7 @@ def _shortened(value: object) -> str:
 
 
 def _read(path: Path, most_bytes: int) -> bytearray:
-    """The bytes of a file, unpacked if its name ends in `.jgz`."""
+    """Read the bytes of a file, unpacked if its name ends in `.jgz`."""
     raw, size, packed = bytearray(), require_file(path).stat().st_size, path.suffix == ".jgz"
     limit = min(most_bytes, max(BYTES_OF_ANY_RATIO, LARGEST_RATIO * size)) if packed else most_bytes
     with GzipFile(path) if packed else path.open("rb") as file:

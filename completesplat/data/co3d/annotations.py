@@ -1,7 +1,4 @@
-"""CO3D v2's annotations: frames and their cameras, read and written without PyTorch3D.
-
-Layout: facebookresearch/co3d, `co3d/dataset/data_types.py`.
-"""
+"""Annotations of CO3D v2, read and written without PyTorch3D (facebookresearch/co3d, `co3d/dataset/data_types.py`)."""
 
 import gzip
 import json
@@ -37,7 +34,7 @@ VIEWPOINT_SHAPES = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_poi
 
 
 class DepthMap(NamedTuple):
-    """A depth map's file and the factor that brings its values to the sequence's units."""
+    """File of a depth map, and the factor that converts its values to the sequence's units."""
 
     path: Path
     scale_adjustment: float
@@ -45,7 +42,7 @@ class DepthMap(NamedTuple):
 
 @dataclass(frozen=True)
 class CO3DFrame:
-    """One picture with its mask; `camera` is in float64, in the sequence's own units."""
+    """One image with its mask; `camera` is in float64 and in the sequence's own units."""
 
     number: int
     image: Path
@@ -56,7 +53,7 @@ class CO3DFrame:
 
 @dataclass(frozen=True)
 class CO3DVideo:
-    """What is annotated of a whole sequence; the qualities are None where they are not given, or NaN."""
+    """Annotation of a whole sequence; a quality is None if it is missing or NaN."""
 
     point_cloud: Path | None
     point_cloud_quality: float | None
@@ -64,10 +61,10 @@ class CO3DVideo:
 
 
 def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
-    """The sequences in `sequence_annotations.jgz` by name. Entries that are none are handed to `refuse`.
+    """Read the sequences in `sequence_annotations.jgz` by name; errors of single entries are passed to `refuse`.
 
     Raises:
-        DataError: the file is missing, unreadable or no list.
+        DataError: the file is missing, unreadable or not a list.
     """
     videos: dict[str, CO3DVideo] = {}
     for index, entry in enumerate(_read_list(path)):
@@ -84,7 +81,7 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
 
 def _optional_number(entry: dict[str, Any], key: str) -> float | None:
     value = entry.get(key)
-    # CO3D's writer has NaN where there was nothing to compute a score from.
+    # CO3D's annotations have NaN for scores that could not be computed.
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return None
     return float(finite_array(value, (), key))
@@ -93,7 +90,7 @@ def _optional_number(entry: dict[str, Any], key: str) -> float | None:
 def read_frames(
     root: Path, path: Path, wanted: Callable[[str, int], bool], refuse: Refuse
 ) -> dict[str, dict[int, CO3DFrame]]:
-    """The frames in `frame_annotations.jgz` by sequence and number, as far as they are `wanted`; see `read_videos`."""
+    """Read those frames in `frame_annotations.jgz` that are `wanted`, by sequence and number; see `read_videos`."""
     frames: dict[str, dict[int, CO3DFrame]] = {}
     for index, entry in enumerate(_read_list(path)):
         with refused_to(refuse), at(path):
@@ -116,7 +113,7 @@ def _name(entry: object, index: int) -> str:
 
 
 def _read_list(path: Path) -> list[Any]:
-    # CO3D is written by Python's `json`, which writes NaN; every number that is used is checked.
+    # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
     if type(content) is not list:
         raise BadAnnotation("must hold a list", str(path))
@@ -127,31 +124,31 @@ def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
     image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), entry.get("depth")
     size = field(image, "size", list)
     if [type(side) for side in size] != [int, int] or not 0 < min(size) <= max(size) <= MOST_PIXELS:
-        said = f"two positive integers of at most {MOST_PIXELS:,}"
-        raise BadAnnotation(f"the image's size must be {said}, not {str(size)[:80]}")
+        expected = f"two positive integers of at most {MOST_PIXELS:,}"
+        raise BadAnnotation(f"the image's size must be {expected}, not {str(size)[:80]}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
     image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
     if depth is not None:
         path = inside(root, field(depth, "path", str))
-        # Some writers leave out the fraction of a whole number.
+        # Some writers write whole numbers as integers.
         depth = DepthMap(path, float(finite_array(depth.get("scale_adjustment"), (), "scale_adjustment")))
     return CO3DFrame(number, image_path, mask_path, depth, camera)
 
 
 def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) -> Cameras:
-    """OpenCV camera (float64, no batch axis) of a PyTorch3D viewpoint for an image of (height, width).
+    """Convert a PyTorch3D viewpoint to an OpenCV camera (float64, no batch axis) for an image of (height, width).
 
-    PyTorch3D: X_cam = X_world R + T with row vectors, +x left, +y up, and coordinates on the image in units of half
-    its width and height (`ndc_norm_image_bounds`) or of half its shorter side (`ndc_isotropic`), from its centre
+    In PyTorch3D, X_cam = X_world R + T with row vectors, +x is left and +y is up. Image coordinates start at the image
+    centre; their unit is half the width and height (`ndc_norm_image_bounds`) or half the shorter side (`ndc_isotropic`)
     (`pytorch3d/implicitron/dataset/frame_data.py:756`, `renderer/camera_conversions.py:64`).
 
     Raises:
-        BadAnnotation: missing keys, anything but finite numbers in the right shapes, or another intrinsics format.
-        BadCamera: no rotation (to 1e-3), a focal length that is not positive, a principal point outside of the image.
+        BadAnnotation: a key is missing, a value is not finite or has another shape, or the format is unknown.
+        BadCamera: R is no rotation (to 1e-3), a focal length is not positive, or the principal point is outside.
     """
     height, width = image_size
     half = np.array([width, height]) / 2
-    # Annotations older than the field carry the default of the format.
+    # Older annotations lack this field; then the format's default applies.
     layout = viewpoint.get("intrinsics_format", "ndc_norm_image_bounds")
     if layout not in ("ndc_norm_image_bounds", "ndc_isotropic"):
         raise BadAnnotation(f"unknown intrinsics format {layout!r}")
@@ -172,7 +169,7 @@ def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) 
 def viewpoint(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], focal: list[float], center: list[float]
 ) -> dict[str, Any]:
-    """The inverse of `camera_from_viewpoint`; `focal` and `center` are in units of half the picture's sides."""
+    """Invert `camera_from_viewpoint`; `focal` and `center` are in units of half the image's sides."""
     return {
         "R": (FLIP @ rotation).T.tolist(),
         "T": (FLIP @ translation).tolist(),
@@ -183,14 +180,14 @@ def viewpoint(
 
 
 def sequence_annotation(category: str, name: str, points: int) -> dict[str, Any]:
-    """A sequence without a video, with a point cloud at `name`/pointcloud.ply if it has points."""
+    """Return the annotation of a sequence without a video; with points, its cloud is `name`/pointcloud.ply."""
     cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
     sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud if points else None}
     return sequence | {"viewpoint_quality_score": 1.0}
 
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]) -> None:
-    """A point cloud as a binary PLY file."""
+    """Write a point cloud as a binary PLY file."""
     properties = [(axis, "float") for axis in "xyz"] + [(channel, "uchar") for channel in ("red", "green", "blue")]
     types = [(name, f"<{TYPES[kind]}") for name, kind in properties]
     vertices = np.rec.fromarrays([*points.T, *colors.T], dtype=types)
@@ -200,9 +197,9 @@ def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.
 def write_annotations(
     category: Path, frames: list[dict[str, Any]], sequences: list[dict[str, Any]], subset: str, lists: dict[str, Any]
 ) -> None:
-    """A category's annotations and its set list `subset`: [sequence, frame number, picture] of each split's frames."""
+    """Write a category's annotations and set list `subset`; `lists` has [sequence, frame number, image] by split."""
     for name, content in (("frame_annotations", frames), ("sequence_annotations", sequences)):
-        # A fixed time stamp and no file name in the gzip header: equal content gives equal bytes.
+        # A fixed time stamp and no file name in the gzip header, so that equal content gives equal bytes.
         (category / f"{name}.jgz").write_bytes(gzip.compress(json.dumps(content).encode(), mtime=0))
     (category / "set_lists").mkdir()
     (category / "set_lists" / f"set_lists_{subset}.json").write_text(json.dumps(lists))

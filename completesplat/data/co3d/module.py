@@ -1,4 +1,4 @@
-"""One category of CO3D v2 (Reizenstein et al., ICCV 2021), or of anything in its layout, as a data module."""
+"""Data module for one category of CO3D v2 (Reizenstein et al., ICCV 2021), or of data in its layout."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -15,26 +15,25 @@ from completesplat.schema import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(SceneDataModule):
-    """Scenes of one category.
+    """Scenes of one category, read without PyTorch3D and without the `co3d` package.
 
-    Training draws a random reference and random targets of a sequence; validation and test take a sequence's first
-    frame as the reference and others as targets. Needs neither PyTorch3D nor the `co3d` package.
+    Training draws a random reference and random targets of a sequence. Validation and test take a sequence's first
+    frame as the reference and other frames as targets.
 
     Args:
         root: folder of the categories, or a prepared category.
         category: a folder below `root`, such as "hydrant".
-        subset: the set list that splits the frames, which is named after what is tested (Splatter Image:
-            `fewview_dev`); None: split by seed.
-        allow_shared_sequences: take a set list also where it tests on sequences of training, as CO3D's `fewview_train`
-            does, or of validation; all lists that divide the frames of one sequence do (`manyview_...`, `imported`).
+        subset: name of the set list that splits the frames (Splatter Image: `fewview_dev`); None: split by seed.
+        allow_shared_sequences: accept a set list that tests on sequences of training or validation. CO3D's
+            `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`, `imported`).
         val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
-        validation_targets: the same of a validation scene; None: as many as of a test scene.
-        spread_targets: targets of training evenly spread around the reference (the sequence taken as a ring), in random
-            order, for a posterior that sees them; else random ones.
-        depth_before, depth_after: the depth range around the object's centre, where the object's half size is 0.57
-            (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full pictures).
+        validation_targets: the same for a validation scene; None: as for a test scene.
+        spread_targets: spread the training targets evenly around the reference (the sequence taken as a ring), in
+            random order, for a posterior that sees them; false: draw random targets.
+        depth_before, depth_after: depth range in front of and behind the object's centre; the object's half size is
+            0.57 (Splatter Image: 2 and 2, for masked objects; not stated by the paper for full images).
         **settings: of `SceneDataModule`.
     """
 
@@ -80,7 +79,7 @@ class CO3DDataModule(SceneDataModule):
         }
 
     def _split(self) -> str:
-        """How sequences are divided, in words."""
+        """Describe in words how sequences are split."""
         val, test, seed = self.seeded
         if self.subset is None:
             return f"by seed {seed}: {val:g} of the sequences for validation, {test:g} for the test"
@@ -89,21 +88,21 @@ class CO3DDataModule(SceneDataModule):
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
     def packed_settings(self) -> dict[str, Any]:
-        given = ("category", "subset", "allow_shared_sequences")
+        names = ("category", "subset", "allow_shared_sequences")
         seeded = dict(zip(("val_fraction", "test_fraction", "split_seed"), self.seeded, strict=True))
-        return {name: getattr(self, name) for name in given} | seeded | vars(self.filters) | vars(self.framing)
+        return {name: getattr(self, name) for name in names} | seeded | vars(self.filters) | vars(self.framing)
 
     def open(self, split: str) -> Mapping[str, CO3DSource]:
-        """All splits: the annotations are read once."""
+        """Open all splits at once, because they share the annotations."""
         which = self.root, self.category, self.subset
         splits, files, refused = read_category(*which, self.seeded, self.filters, self.allow_shared_sequences)
         return {name: CO3DSource(members, self.framing, files, refused) for name, members in splits.items()}
 
     def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        """A random reference and random targets, or targets all around."""
+        """Draw a random reference and targets at random, or spread around it."""
         return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """The first frame as reference, others as targets."""
+        """Return the first frame as reference and others as targets."""
         targets = self.validation_targets if split == "val" else self.evaluation_targets
         return evaluation_views(len(sequence.frames), targets)

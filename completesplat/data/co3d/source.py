@@ -1,4 +1,4 @@
-"""CO3D sequences as posed sequences: cropped, placed at the common scale, with a depth range around the object."""
+"""CO3D sequences as posed sequences: cropped, scaled to a common object size, with a depth range around the object."""
 
 import hashlib
 from collections.abc import Sequence
@@ -24,14 +24,14 @@ from completesplat.tensors import stack
 
 DEPTH_MAPS = 8
 DEPTH_QUANTILE = 0.99
-FOREGROUND = 128  # of 255
-# Smaller eigenvalues than this (of at most 1) mean that the optical axes are parallel.
+FOREGROUND = 128  # smallest mask value, of 255
+# Optical axes count as parallel if the smallest eigenvalue (at most 1) is below this.
 PARALLEL = 1e-4
 UP = 1
 # The object's half size (see `Placement`) after scaling (Splatter Image: 1.2 * 0.95 / 2).
 OBJECT_HALF_SIZE = 0.57
 SMALLEST_NEAR = 0.1
-# Cameras that stay within this share of their distance to the object show nothing but one view of it.
+# Cameras that move by less than this share of their distance to the object show only one view of it.
 SMALLEST_BASELINE = 0.01
 
 
@@ -39,10 +39,10 @@ Axes = Float[np.ndarray, "3 3"]
 
 
 def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> Float[Tensor, "1 size size"]:
-    """Depth along the optical axis at the centre of each pixel of the square picture; 0 where it is unknown.
+    """Return depth along the optical axis at the pixel centres of the square image; 0 where it is unknown.
 
-    The nearest pixel of the map counts: a mean across an edge would be the depth of nothing. The map may have another
-    size than the picture that it belongs to. `factor` leads from the sequence's units to the common scale.
+    Sampling is nearest-neighbour, because a mean across an edge is the depth of no surface. The depth map may differ in
+    size from its image. `factor` converts the sequence's units to the common scale.
 
     Raises:
         DataError: the depth map cannot be read.
@@ -60,21 +60,21 @@ def square_depth(frame: CO3DFrame, square: Square, size: int, factor: float) -> 
 
 
 class Placement(NamedTuple):
-    """Centre of the object and half its size: the largest distance from the centre along one of the upright axes."""
+    """Centre and half size of the object; the latter is the largest distance from the centre along an upright axis."""
 
     center: Float[Tensor, "3"]
     half_size: float
 
 
 def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], captured: Sequence[CO3DFrame]) -> Placement:
-    """From the point cloud; without one from the frames' depth maps; without those from their cameras alone.
+    """Locate the object by the point cloud, else by the frames' depth maps, else by their cameras.
 
-    All frames of the sequence, `captured`, tell the axes.
+    The axes come from `captured`, all frames of the sequence.
 
     Raises:
         DataError: the point cloud, a depth map or a mask is missing or unreadable.
-        BadPlacement: points that are none, in one place or not finite; no foreground with a known depth; optical axes
-            that are parallel, or meet behind the cameras.
+        BadPlacement: the points are missing, not finite or all in one place; no foreground has a known depth; or the
+            optical axes are parallel or meet behind the cameras.
     """
     if point_cloud is not None:
         return from_point_cloud(point_cloud, upright_axes(captured))
@@ -83,10 +83,10 @@ def object_placement(point_cloud: Path | None, frames: Sequence[CO3DFrame], capt
 
 
 def upright_axes(frames: Sequence[CO3DFrame]) -> Axes:
-    """The axes of an upright frame in the sequence's world, as columns; the second points up, or down.
+    """Return the axes of an upright frame in the sequence's world, as columns; the second points up or down.
 
-    People hold a camera level: its x axis varies least upwards and most along the first of these axes (Splatter Image,
-    `co3d_normalisation.py`).
+    People hold a camera level, so its x axis varies least along the vertical. It varies most along the first of these
+    axes (Splatter Image, `co3d_normalisation.py`).
     """
     sideways = torch.stack([frame.camera.world_to_camera[0, :3] for frame in frames]).numpy()
     sideways = sideways - sideways.mean(axis=0)
@@ -95,10 +95,10 @@ def upright_axes(frames: Sequence[CO3DFrame]) -> Axes:
 
 
 def from_point_cloud(path: Path, axes: Axes) -> Placement:
-    """As Splatter Image places it (`co3d_normalisation.py`).
+    """Place the object as Splatter Image does (`co3d_normalisation.py`).
 
-    The centre is the points' mean, but upwards the middle between the lowest and the highest; half the size is the
-    largest coordinate from there, along the upright axes.
+    The centre is the points' mean, but its height is the middle between the lowest and the highest point. The half size
+    is the largest absolute coordinate relative to this centre, along the upright axes.
     """
     _, points = read_points(path)
     with at(path):
@@ -106,10 +106,9 @@ def from_point_cloud(path: Path, axes: Axes) -> Placement:
 
 
 def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
-    """From what up to 8 evenly spaced depth maps show of the foreground, as if that were the point cloud.
+    """Place the object by the foreground points of up to 8 evenly spaced depth maps, as with a point cloud.
 
-    Depth maps have outliers: the 99 % quantile counts instead of the largest value, and the 1 % quantile instead of
-    the smallest.
+    The 99 % and 1 % quantiles replace the largest and smallest values, because depth maps have outliers.
     """
     count, points = min(len(frames), DEPTH_MAPS), []
     for frame in (frames[i * len(frames) // count] for i in range(count)):
@@ -119,7 +118,7 @@ def from_depth_maps(frames: Sequence[CO3DFrame], axes: Axes) -> Placement:
 
 
 def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
-    """The point nearest to all optical axes; the object is taken to fill the largest square of the pictures."""
+    """Place the object at the point nearest to all optical axes; assume that it fills the images' largest square."""
     world_to_camera = torch.stack([frame.camera.world_to_camera for frame in frames])
     axes, eyes = world_to_camera[:, 2, :3], invert_rigid(world_to_camera)[:, :3, 3]
     # The squared distance of x to an axis is (x - eye)^T P (x - eye), where P takes out the part along the axis.
@@ -137,7 +136,7 @@ def from_cameras(frames: Sequence[CO3DFrame]) -> Placement:
 
 
 def _foreground(frame: CO3DFrame) -> np.ndarray:
-    """World points [n 3] of a depth map's foreground; the map may be smaller than the picture."""
+    """Return the world points [n 3] of a depth map's foreground; the map may be smaller than the image."""
     if frame.depth is None:
         return np.zeros((0, 3))
     depth = read_depth(frame.depth.path, frame.depth.scale_adjustment)[0]
@@ -164,7 +163,7 @@ def _placement(points: np.ndarray, axes: Axes, quantile: float, what: str) -> Pl
 
 @dataclass(frozen=True)
 class ObjectFraming:
-    """How pictures and cameras are made from files; see `CO3DDataModule`."""
+    """Settings of images and cameras; see `CO3DDataModule`."""
 
     image_size: int
     depth_before: float
@@ -172,7 +171,7 @@ class ObjectFraming:
 
 
 class CO3DSource(SequenceSource):
-    """The sequences of one split; see `SequenceSource`."""
+    """Sequences of one split; see `SequenceSource`."""
 
     def __init__(
         self, members: SplitMembers, framing: ObjectFraming, files: Sequence[Path], refused: list[DataError]
@@ -187,11 +186,11 @@ class CO3DSource(SequenceSource):
         self._sequences: dict[str, PosedSequence] = {}
 
     def fingerprint(self) -> str:
-        """SHA-256 of the annotations; pictures are not looked at."""
+        """Return the SHA-256 of the annotations, not of the images."""
         return hashlib.sha256(b"".join(hashlib.sha256(f.read_bytes()).digest() for f in self._files)).hexdigest()
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence; its cameras are made on first use."""
+        """Return one sequence; its cameras are computed at the first call."""
         if name not in self._sequences:
             with at(sequence=name):
                 self._sequences[name] = self._make(name)
@@ -209,7 +208,7 @@ class CO3DSource(SequenceSource):
         if not baseline > SMALLEST_BASELINE * depths.abs().mean():
             raise BadCamera("the cameras do not move", str(self._files[0]))
         near = (depths - self.framing.depth_before).clamp(min=SMALLEST_NEAR)
-        # An object behind the camera (a broken pose) still gets a range of positive length.
+        # If a broken pose puts the object behind the camera, the depth range still has a positive length.
         return PosedSequence(
             name,
             tuple(frame.number for frame in frames),

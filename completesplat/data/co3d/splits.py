@@ -1,4 +1,4 @@
-"""Which sequences and frames of a CO3D category belong to which split, and which are left out."""
+"""Splits of a CO3D category into training, validation and test, with the sequences that are left out."""
 
 import logging
 import os
@@ -28,9 +28,10 @@ logger = logging.getLogger(__name__)
 
 
 class SeededSplit(NamedTuple):
-    """Shares of the sequences that are held out by seed, at least one sequence each.
+    """Shares of the sequences that are held out by seed, at least one sequence for each share.
 
-    Without a set list, of all sequences; with one that has no validation, `val_fraction` of its training sequences.
+    Without a set list, they are shares of all sequences. For a list without validation, `val_fraction` is held out of
+    its training sequences.
     """
 
     val_fraction: float
@@ -39,19 +40,19 @@ class SeededSplit(NamedTuple):
 
 
 def set_list_path(category: Path, subset: str | None) -> Path | None:
-    """The set list of that name (`DataError` if it is not there); None where the sequences are to be split by seed."""
+    """Return the path of the set list `subset`, which must exist; None if the sequences are split by seed."""
     if subset is None:
         return None
     folder = category / "set_lists"
-    there = sorted(path.stem.removeprefix("set_lists_") for path in folder.glob("set_lists_*.json"))
-    if subset not in there:
-        advice = f"choose data.subset among {', '.join([*there, 'null'])}; data.subset=null splits by seed"
+    subsets = sorted(path.stem.removeprefix("set_lists_") for path in folder.glob("set_lists_*.json"))
+    if subset not in subsets:
+        advice = f"choose data.subset among {', '.join([*subsets, 'null'])}; data.subset=null splits by seed"
         raise DataError(f"no set list {subset!r} there; {advice}", str(folder))
     return folder / f"set_lists_{subset}.json"
 
 
 def read_set_list(path: Path, refuse: Refuse) -> Listed:
-    """The frames of each split. Entries that are none are handed to `refuse`.
+    """Read the frames of each split; errors of single entries are passed to `refuse`.
 
     Raises:
         DataError: the file is missing, unreadable, or has no list for a split.
@@ -71,14 +72,14 @@ def read_set_list(path: Path, refuse: Refuse) -> Listed:
 
 
 def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, list[str]]:
-    """Return a set list whose splits share no sequence, and the names that validation lost for that.
+    """Return a set list whose splits share no sequence, and the names removed from validation.
 
-    CO3D's `fewview_train` tests on all that it trains on (facebookresearch/co3d, issue 49); Splatter Image takes
-    `fewview_dev` (`data_preprocessing/preprocess_co3d.py`). Validation loses what is in training too. Where it then
-    has nothing, it gets a seeded share of the training sequences.
+    CO3D's `fewview_train` tests on all its training sequences (facebookresearch/co3d, issue 49); Splatter Image uses
+    `fewview_dev` (`data_preprocessing/preprocess_co3d.py`). Validation loses sequences that are in training too. If it
+    is then empty, it gets a seeded share of the training sequences.
 
     Raises:
-        SharedSequences: some sequences are tested that are trained on, or that validation chooses a model by.
+        SharedSequences: a test sequence is also used for training or validation.
     """
     names = {split: {name for name, _ in listed[split]} for split in SPLITS}
     shared = shared_names(names)
@@ -99,11 +100,11 @@ def kept_apart(path: Path, listed: Listed, rule: SeededSplit) -> tuple[Listed, l
 
 
 def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Listed:
-    """Whole sequences for each split; `DataError` if there are fewer than three."""
+    """Split at least three sequences by seed, each as a whole."""
     if len(frames) < 3:
         raise DataError(f"{len(frames)} sequences cannot be split into train, val and test; write a set list")
     rest, test = split_by_hash(sorted(frames), rule.test_fraction, rule.seed)
-    # The rest's hashes lie above the test fraction, so the next share of them is validation's.
+    # The hashes of the remaining names lie above the test fraction; validation gets the next interval.
     train, val = split_by_hash(rest, rule.test_fraction + rule.val_fraction, rule.seed)
     if not train:
         fractions = f"val_fraction={rule.val_fraction}, test_fraction={rule.test_fraction}"
@@ -114,13 +115,13 @@ def split_by_seed(frames: Mapping[str, Iterable[int]], rule: SeededSplit) -> Lis
 
 @dataclass(frozen=True)
 class Filters:
-    """Which sequences are taken, of those that are not broken.
+    """Criteria for the sequences that are used.
 
     Attributes:
-        min_frames: with fewer in a split, a sequence is left out of it.
-        min_viewpoint_quality, min_point_cloud_quality: CO3D's scores; None: any. Where one is set, a sequence
-            without the score is left out.
-        most_training_sequences: those with the best viewpoint quality (DFM takes 500); None: all.
+        min_frames: a sequence with fewer frames in a split is left out of the split.
+        min_viewpoint_quality, min_point_cloud_quality: smallest CO3D scores; None: any. If one is set, sequences
+            without this score are left out.
+        most_training_sequences: largest number, taken by best viewpoint quality (DFM: 500); None: all.
     """
 
     min_frames: int = 2
@@ -131,11 +132,11 @@ class Filters:
 
 @dataclass(frozen=True)
 class SplitMembers:
-    """What one split is made of, by sequence, and what is left out of it, by reason.
+    """Frames and point clouds of one split by sequence, and the names left out by reason.
 
     Attributes:
-        listed: how many sequences the split has by its list, usable or not.
-        captured: all frames of the same sequences, also those of other splits: they tell which way is up.
+        listed: number of sequences in the split's list, usable or not.
+        captured: all frames of the same sequences, also those of other splits; the up direction is estimated from them.
     """
 
     listed: int
@@ -146,7 +147,7 @@ class SplitMembers:
 
 
 class Category(NamedTuple):
-    """The splits, the files that say so, and what was found broken."""
+    """Splits of a category, the files that define them, and the errors in these files."""
 
     splits: dict[str, SplitMembers]
     files: list[Path]
@@ -156,13 +157,13 @@ class Category(NamedTuple):
 def read_category(
     root: Path, category: str, subset: str | None, seeded: SeededSplit, filters: Filters, allow_shared: bool = False
 ) -> Category:
-    """The sequences of a category, their frames divided as the set list `subset` says, or else by seed.
+    """Read a category, split by the set list `subset`, or by seed if there is none.
 
-    Frames that the set list does not name are not looked at. `allow_shared` takes the list without `kept_apart`.
+    Annotations of frames that the set list does not name are ignored. `allow_shared` skips `kept_apart`.
 
     Raises:
         DataError: the category, its annotations or its set list is missing, unreadable as a whole, or not below
-            `root`; or sequences are tested that are in another split.
+            `root`; or a test sequence is in another split too.
     """
     folder = inside(root, category)
     if not os.path.isdir(folder):
@@ -200,21 +201,21 @@ def _members(
     videos: dict[str, CO3DVideo],
     filters: Filters,
 ) -> SplitMembers:
-    found: dict[str, list[CO3DFrame]] = {}
+    members: dict[str, list[CO3DFrame]] = {}
     for name, number in sorted(listed):
         if number in frames.get(name, ()):
-            found.setdefault(name, []).append(frames[name][number])
-    out = {n: why for n in found if (why := _reason_to_leave_out(len(found[n]), videos[n], filters))}
+            members.setdefault(name, []).append(frames[name][number])
+    out = {n: why for n in members if (why := _reason_to_leave_out(len(members[n]), videos[n], filters))}
     most = filters.most_training_sequences
     if split == "train" and most is not None:
-        best = sorted(found.keys() - out.keys(), key=lambda name: (-(videos[name].viewpoint_quality or 0.0), name))
+        best = sorted(members.keys() - out.keys(), key=lambda name: (-(videos[name].viewpoint_quality or 0.0), name))
         out |= dict.fromkeys(best[most:], f"not among the {most} with the best viewpoint quality")
-    kept = [name for name in found if name not in out]
+    names = [name for name in members if name not in out]
     return SplitMembers(
         listed=len({name for name, _ in listed}),
-        frames={name: found[name] for name in kept},
-        captured={name: list(frames[name].values()) for name in kept},
-        point_clouds={name: videos[name].point_cloud for name in kept},
+        frames={name: members[name] for name in names},
+        captured={name: list(frames[name].values()) for name in names},
+        point_clouds={name: videos[name].point_cloud for name in names},
         left_out={why: [name for name in out if out[name] == why] for why in dict.fromkeys(out.values())},
     )
 

@@ -1,4 +1,4 @@
-"""Own captures, written in CO3D v2's layout: undistorted pictures, masks, cameras and, where known, points."""
+"""Import of a user's captures into CO3D v2's layout: undistorted images, masks, cameras and, if known, points."""
 
 import logging
 import re
@@ -29,18 +29,19 @@ def import_capture(
     most_missing: Share = 0.5,
     progress: bool = True,
 ) -> Path:
-    """Write a capture to `out`/`category`, as the only sequence of that category; all of it or nothing.
+    """Write a capture atomically to `out`/`category`, as the only sequence of this category.
 
     Args:
         transforms: a `transforms.json`; or `colmap`, the folder of a COLMAP model, with `images` and perhaps `masks`.
-        sequence: its name; by default that of the folder the capture lies in.
-        hold_out: one of every `hold_out` frames (at least two) goes to validation and test, the others to training.
-        quality: of JPEG files that are written anew.
-        most_missing: largest share of the frames of a `transforms.json` that may have no picture; they are left out.
+        sequence: name of the sequence; by default that of the capture's folder.
+        hold_out: one of every `hold_out` frames (at least two) is for validation and test, the others for training.
+        quality: JPEG quality of images that are encoded again.
+        most_missing: largest share of the frames of a `transforms.json` that may lack an image and are left out.
 
     Raises:
-        CompleteSplatError: settings that do not go together, or pycolmap is missing.
-        DataError: something is missing, malformed or impossible, or the folder exists. DiskError: the disk is full.
+        CompleteSplatError: the settings contradict each other, or pycolmap is missing.
+        DataError: something is missing, malformed or impossible, or the folder exists.
+        DiskError: the disk is full.
     """
     if (transforms is None) == (colmap is None):
         raise CompleteSplatError("give either transforms=FILE or colmap=FOLDER images=FOLDER")
@@ -48,9 +49,9 @@ def import_capture(
         raise CompleteSplatError("colmap=FOLDER goes with images=FOLDER (masks=FOLDER), transforms=FILE with neither")
     if category is None:
         raise CompleteSplatError("category is needed: give category=NAME")
-    for what, given in {"category": category, "sequence": "capture" if sequence is None else sequence}.items():
-        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", str(given)):
-            raise CompleteSplatError(f"{what} must be a name of letters, digits, '_', '-' and '.', not {given!r}")
+    for what, chosen in {"category": category, "sequence": "capture" if sequence is None else sequence}.items():
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", str(chosen)):
+            raise CompleteSplatError(f"{what} must be a name of letters, digits, '_', '-' and '.', not {chosen!r}")
     folder = Path(out) / str(category)
     if folder.exists():
         raise DataError("is there already: remove it or choose another category", str(folder))
@@ -72,7 +73,7 @@ def _report(folder: Path, sequence: str, written: Written) -> None:
     logger.info("%s: sequence %s, %d pictures (%s), %s", folder, sequence, written.frames, files, use)
     logger.info("point cloud: %s", f"{written.points} points" if written.points else "none")
     root, batches = shlex.quote(f"data.root={folder.parent}"), "data.batch_size=8 data.references_per_sequence=64"
-    # A capture is one sequence, some of whose frames are held out.
+    # All splits share the one sequence of a capture.
     lists = f"data.subset={SUBSET} data.allow_shared_sequences=true"
     data = f"data=co3d_category {root} data.category={folder.name} {lists}"
     logger.info("to look at it:  completesplat data show %s", data)

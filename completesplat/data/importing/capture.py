@@ -1,4 +1,4 @@
-"""What a capture is, once its own files and conventions are behind it, and its pictures."""
+"""Common form of captures, independent of their files and conventions, and reading of their images."""
 
 import re
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames
 from completesplat.errors import ImageError
 
 FEWEST_FRAMES = 6
-PNG_BIT_DEPTH = 24  # byte of the file
+PNG_BIT_DEPTH = 24  # index of the byte in the file
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels with OpenCV's distortion; the top left pixel has its corner at (0, 0)."""
+    """Intrinsics in pixels with OpenCV's distortion; the outer corner of the top left pixel is at (0, 0)."""
 
     focal: tuple[float, float]  # along x and y
     center: tuple[float, float]  # the principal point (x, y)
@@ -40,7 +40,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One picture of a capture, with its number in the capture's own file and OpenCV's pose."""
+    """One image of a capture, with its number in the capture's own file and its pose in OpenCV's convention."""
 
     number: int
     image: Path
@@ -59,7 +59,7 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Capture:
-    """The frames of one capture, in the order of their file names; its folder's name, and the file of its cameras."""
+    """Frames of one capture in the order of their file names, the name of its folder, and the file of its cameras."""
 
     name: str
     file: Path
@@ -68,7 +68,7 @@ class Capture:
 
 
 def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
-    """The frames by file name; `TooFewFrames` if fewer than 6, `BadAnnotation` where a picture is there twice."""
+    """Sort frames by file name, and refuse fewer than 6 frames or an image that occurs twice."""
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"{len(frames)} frames; a capture needs at least {FEWEST_FRAMES}")
     seen: dict[Path, int] = {}
@@ -80,11 +80,10 @@ def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
 
 
 def check_lens(lens: Lens) -> Lens:
-    """The lens itself.
+    """Return the lens itself, if it is valid.
 
     Raises:
-        BadCamera: a size or focal length that is not positive, numbers that are not finite, or a principal point
-            outside of the picture.
+        BadCamera: a size or focal length is not positive, a number is not finite, or the principal point is outside.
     """
     (height, width), (x, y) = lens.image_size, lens.center
     if not np.isfinite([*lens.focal, *lens.center, *lens.distortion]).all():
@@ -97,7 +96,7 @@ def check_lens(lens: Lens) -> Lens:
 
 
 def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
-    """A point cloud, or None if there are no points; `BadAnnotation` where coordinates are not finite."""
+    """Return a point cloud, or None if there are no points; refuse coordinates that are not finite."""
     if not len(points):
         return None
     if not np.isfinite(points).all():
@@ -106,16 +105,16 @@ def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts `r_2` before `r_10`."""
+    """Return a sorting key that puts `r_2` before `r_10`."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
 
 
 class CapturedPicture(NamedTuple):
-    """A decoded picture in RGB, transparency laid over white, and its opacity (grey), if it has transparency data.
+    """Decoded RGB image, composited over white, and its opacity (grey) if it has transparency data.
 
     Attributes:
-        lossy: it was a JPEG.
-        plain: the file is a JPEG or PNG of just these 8-bit RGB pixels.
+        lossy: whether the file is a JPEG.
+        plain: whether the file is a JPEG or PNG with exactly these 8-bit RGB pixels.
     """
 
     image: Image.Image
@@ -125,16 +124,16 @@ class CapturedPicture(NamedTuple):
 
 
 def read_picture(path: Path, image_size: tuple[int, int]) -> CapturedPicture:
-    """Decode a picture of (height, width). Alpha is straight and mixed in sRGB, as in the pictures of NeRF (synthetic).
+    """Decode an image of (height, width). Alpha is straight and mixed in sRGB, as in the images of NeRF (synthetic).
 
     Raises:
-        MissingFile: no such file.
-        BadPicture: damaged, too large, of another size, or to be turned by its EXIF orientation: the programs that
-            estimate poses look at the pixels as they are stored, so that pose and upright picture do not agree.
+        MissingFile: the file does not exist.
+        BadPicture: it is damaged, too large, of another size, or its EXIF orientation turns it. Programs that estimate
+            poses use the pixels as they are stored, so the pose would not fit the upright image.
     """
     require_file(path)
     with refused_as_bad(str(path)), opened(path, FORMATS) as picture:
-        orientations = {read_exif(picture).get(ORIENTATION)}  # A TIFF loses its own when it is decoded.
+        orientations = {read_exif(picture).get(ORIENTATION)}  # Decoding a TIFF removes its orientation.
         check_sums(picture, path)
         picture.load()
         orientations.add(read_exif(picture).get(ORIENTATION))

@@ -1,4 +1,4 @@
-"""Captures as a COLMAP model (sparse reconstruction) with its pictures."""
+"""Reader of captures as a COLMAP model (sparse reconstruction) with its images."""
 
 import struct
 from os.path import isfile
@@ -20,24 +20,24 @@ from completesplat.data.validation import (
 )
 from completesplat.errors import CompleteSplatError
 
-# Number of parameters by the id that binary models use (colmap, `src/colmap/sensor/models.h`); other ids are refused.
+# Number of parameters by camera model id in binary files (colmap, `src/colmap/sensor/models.h`); others are refused.
 PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
 
 
 def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture:
-    """Read a model, binary or text, of registered pictures.
+    """Read a binary or text model with its registered images.
 
     COLMAP's poses are world-to-camera with OpenCV's axes, and the centre of the first pixel is (0.5, 0.5)
-    (colmap.github.io/format.html): both are this package's own conventions. A picture's mask has its name with `.png`
-    behind it, or in place of its suffix; it is the foreground.
+    (colmap.github.io/format.html). Both are this package's conventions too. The file name of an image's mask is the
+    image's name with `.png` appended or as its suffix; a mask is the foreground.
 
     Args:
         model: folder with `cameras`, `images` and `points3D`, `.bin` or `.txt`.
-        images: folder that the pictures' names are relative to.
+        images: folder of the images; their names in the model are relative to it.
 
     Raises:
         CompleteSplatError: pycolmap is not installed.
-        DataError: whatever is missing, damaged or impossible, with the file and COLMAP's number of the picture.
+        DataError: something is missing, damaged or impossible; the error has the file and COLMAP's image number.
     """
     try:
         import pycolmap
@@ -50,7 +50,7 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
         numbers = list(reconstruction.reg_image_ids())
-    except Exception as error:  # Among them are ValueError, IndexError and RuntimeError.
+    except Exception as error:  # such as ValueError, IndexError and RuntimeError
         raise UnreadableFile(f"not a COLMAP model ({' '.join(str(error).split())})", str(model)) from None
     frames = []
     with at(model):
@@ -78,14 +78,14 @@ def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | No
 
 def _find_mask(masks: Path, name: str) -> Path:
     appended, replaced = (inside(masks, file) for file in (f"{name}.png", str(Path(name).with_suffix(".png"))))
-    # `Path.is_file` raises where a name is too long.
+    # `Path.is_file` raises if a name is too long.
     if not (isfile(appended) or isfile(replaced)):
         raise MissingFile(f"no such file, nor {replaced.name}", str(appended))
     return appended if isfile(appended) else replaced
 
 
 def _lens_of(camera: Any) -> Lens:
-    """Parameters in the order of colmap.github.io/cameras.html."""
+    """Convert a COLMAP camera, whose parameters have the order of colmap.github.io/cameras.html."""
     name, size = camera.model_name, (camera.height, camera.width)
     values = [float(value) for value in camera.params]
     match name, values:
@@ -100,7 +100,7 @@ def _lens_of(camera: Any) -> Lens:
 
 
 def _check_complete(model: Path) -> None:
-    """Walk through the binary files: of cut ones pycolmap takes what is not there for numbers, or reads forever."""
+    """Check the length of binary files, because pycolmap reads wrong numbers, or forever, from truncated ones."""
     for name, skip in RECORDS.items():
         path = model / f"{name}.bin"
         if not path.is_file():
@@ -110,7 +110,7 @@ def _check_complete(model: Path) -> None:
             (count,), offset = struct.unpack_from("<Q", content), 8
             for _ in range(count):
                 offset = skip(content, offset)
-        except (struct.error, ValueError, OverflowError):  # the last: a number of bytes that no file has
+        except (struct.error, ValueError, OverflowError):  # OverflowError: an offset that no file has
             offset = -1
         if offset != len(content):
             raise UnreadableFile("cut off, or not COLMAP's", str(path))
@@ -129,12 +129,12 @@ def _after_image(content: bytes, offset: int) -> int:
 
 
 def _after_point(content: bytes, offset: int) -> int:
-    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, place, colour, error
+    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, xyz, colour, error
 
 
 def _after_rig(content: bytes, offset: int) -> int:
     (sensors,), offset = struct.unpack_from("<I", content, offset + 4), offset + 8  # after id
-    for number in range(sensors):  # its kind and id, and of others than the first whether there is a pose, and that
+    for number in range(sensors):  # kind and id; all but the first sensor also have a flag, and a pose if it is set
         has_pose = bool(number) and struct.unpack_from("<B", content, offset + 8)[0]
         offset += 8 + bool(number) + (56 if has_pose else 0)
     return offset
@@ -151,4 +151,4 @@ RECORDS = {
     "rigs": _after_rig,
     "frames": _after_frame,
 }
-"""What each binary file has records of, after their number."""
+"""Functions that skip one record of each binary file; the records follow their number."""

@@ -1,4 +1,4 @@
-"""Writes a capture as a category in CO3D v2's layout, its pictures without lens distortion."""
+"""Writer of a capture as a category in CO3D v2's layout, with undistorted images."""
 
 import shutil
 from dataclasses import replace
@@ -22,26 +22,26 @@ from completesplat.data.validation import BadCamera, at
 from completesplat.geometry.cameras import pixel_centers
 
 ROWS_AT_ONCE = 64
-SMALLEST_SHARE = 0.5  # A lens whose picture keeps less of its area is not what its coefficients say.
+SMALLEST_SHARE = 0.5  # If less of an image's area is left, the distortion coefficients must be wrong.
 
 SUBSET = "imported"
-# Points further from the median point than this multiple of their median distance are taken for stray: the farthest
-# point gives the scale of the scene.
+# Points whose distance from the median point exceeds this multiple of the median distance are removed as outliers,
+# because the farthest point determines the scale of the scene.
 FARTHEST = 5.0
 FEWEST_HELD_OUT = 2
 
 
 class Undistortion:
-    """Resamples the pictures of one lens.
+    """Resampling of the images of one lens to a pinhole camera with the same focal lengths.
 
-    Focal lengths stay as they are. Pixels that the source does not show, and those where the model folds the picture
-    over, are cut off at the borders, which moves the principal point in pixels.
+    Pixels that the source does not show, and those where the distortion model folds the image over, are cropped at the
+    borders. This moves the principal point in pixels.
 
     Attributes:
         pinhole: the lens of the results.
 
     Raises:
-        BadCamera: less than half of the picture is left, or nothing around the principal point.
+        BadCamera: less than half of the image is left, or the principal point is cropped.
     """
 
     def __init__(self, lens: Lens) -> None:
@@ -52,15 +52,15 @@ class Undistortion:
         size = bottom - top, right - left
         inside = 0 < center[0] < size[1] and 0 < center[1] < size[0]
         if not inside or size[0] * size[1] < SMALLEST_SHARE * height * width:
-            kept = f"{size[1]} x {size[0]} of {width} x {height} pixels"
-            raise BadCamera(f"distortion {lens.distortion} leaves {kept} usable")
+            remaining = f"{size[1]} x {size[0]} of {width} x {height} pixels"
+            raise BadCamera(f"distortion {lens.distortion} leaves {remaining} usable")
         self.pinhole = replace(lens, center=center, image_size=size, distortion=(0.0,) * 5)
-        # Where `grid_sample` finds the picture's borders: at -1 and 1.
+        # For `grid_sample`, the image's borders are at -1 and 1.
         scale = torch.tensor([2 / width, 2 / height], dtype=positions.dtype)
         self._grid = positions[top:bottom, left:right] * scale - 1
 
     def __call__(self, picture: Image.Image) -> Image.Image:
-        """The undistorted picture, RGB (bicubic) or grey (a mask; bilinear)."""
+        """Undistort an image, RGB (bicubic) or grey (a mask; bilinear)."""
         pixels = np.array(picture)
         source = torch.from_numpy(pixels.reshape(*pixels.shape[:2], -1)).permute(2, 0, 1)[None].float()
         mode = "bicubic" if picture.mode == "RGB" else "bilinear"
@@ -70,7 +70,7 @@ class Undistortion:
 
 
 def _source_positions(lens: Lens) -> Float[Tensor, "height width 2"]:
-    """Where the distorted picture shows what the pinhole sees in each of its pixel centres."""
+    """Return the position in the distorted image for each pixel centre of the pinhole camera."""
     (fx, fy), (cx, cy) = lens.focal, lens.center
     matrix = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
     distortion = torch.tensor(lens.distortion, dtype=torch.float64)
@@ -79,7 +79,7 @@ def _source_positions(lens: Lens) -> Float[Tensor, "height width 2"]:
 
 
 def _seen(positions: Float[Tensor, "height width 2"], image_size: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
-    """Which positions lie on the picture, where neighbours also are neighbours in it, on the same sides."""
+    """Return which positions lie in the source image and are not folded over relative to their neighbours."""
     size = torch.tensor(image_size[::-1], dtype=positions.dtype)
     seen = ((positions >= 0) & (positions <= size)).all(dim=-1)
     right, down = positions[:-1].diff(dim=1), positions[:, :-1].diff(dim=0)
@@ -91,11 +91,11 @@ def _seen(positions: Float[Tensor, "height width 2"], image_size: tuple[int, int
 
 
 def _largest_box(seen: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
-    """A large (left, top, right, bottom) of seen pixels only: sides are cut, worst first, until there are no others."""
+    """Find a large (left, top, right, bottom) of seen pixels, by cutting the worst side until no others are left."""
     sums = np.pad((~seen).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
 
     def unseen(left: int, top: int, right: int, bottom: int) -> float:
-        """The share of pixels in a box that are not seen."""
+        """Return the share of unseen pixels in a box."""
         count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
         return float(count / ((right - left) * (bottom - top)))
 
@@ -114,7 +114,7 @@ def _largest_box(seen: Bool[np.ndarray, "height width"]) -> tuple[int, int, int,
 
 
 class Written(NamedTuple):
-    """Numbers of what was written."""
+    """Numbers of written frames, of files copied as they are, of held-out frames and of points."""
 
     frames: int
     copied: int
@@ -123,29 +123,29 @@ class Written(NamedTuple):
 
 
 class CaptureWriter:
-    """Writes the files of one capture.
+    """Writer of the files of one capture.
 
     Args:
-        folder: the category's, for now; it exists and is empty.
-        category: its final name, with which the paths in annotations start.
-        quality: of JPEG files that are written anew.
+        folder: empty temporary folder of the category.
+        category: final name of the category, with which the paths in annotations start.
+        quality: JPEG quality of images that are encoded again.
     """
 
     def __init__(self, folder: Path, category: str, sequence: str, quality: int) -> None:
         self.folder, self.category, self.sequence, self.quality = folder, category, sequence, quality
-        # Captures have one lens, or one for each frame: keeping more than the last would fill the memory.
+        # A capture has one lens, or one for each frame. Caching more than the last one would fill the memory.
         self._undistortion = lru_cache(maxsize=1)(Undistortion)
         self._copied = 0
 
     def write(self, capture: Capture, hold_out: int, progress: bool) -> Written:
         """Write pictures, masks, point cloud, annotations and the set list `imported`.
 
-        Files that are plain 8-bit RGB JPEG or PNG, of a lens without distortion, are copied byte for byte. All others
-        are written anew: JPEG without chroma subsampling if they were JPEG, else PNG. Frames without a mask of their
-        own get their alpha as the mask, or a white one.
+        Plain 8-bit RGB JPEG or PNG files of a lens without distortion are copied byte for byte. Other images are
+        encoded again: as JPEG without chroma subsampling if they were JPEG, else as PNG. For a frame without a mask
+        file, the mask is its alpha channel, or white.
 
         Raises:
-            DataError: pictures or masks that are missing, unusable or of another size than the lens says.
+            DataError: an image or mask is missing, unusable or differs in size from the lens.
         """
         for kind in ("images", "masks"):
             (self.folder / self.sequence / kind).mkdir(parents=True)
@@ -156,7 +156,7 @@ class CaptureWriter:
             with at(frame.image, self.sequence, frame.number):
                 return self._write_frame(number, frame, number in held_out)
 
-        # What goes wrong passes through the bar, which ends before that is shown.
+        # An exception passes through the progress bar, which ends before the error is printed.
         count = len(capture.frames)
         frames = list(track(map(write_frame, range(count)), "Importing pictures", count, disable=not progress))
         points = 0 if capture.cloud is None else self._write_cloud(capture.cloud)
@@ -195,9 +195,9 @@ class CaptureWriter:
 
     def _write_cloud(self, cloud: PointCloud) -> int:
         distance = np.linalg.norm(cloud.points - np.median(cloud.points, axis=0), axis=-1)
-        kept = distance <= FARTHEST * np.median(distance)
-        write_points(self.folder / self.sequence / "pointcloud.ply", cloud.points[kept], cloud.colors[kept])
-        return int(kept.sum())
+        mask = distance <= FARTHEST * np.median(distance)
+        write_points(self.folder / self.sequence / "pointcloud.ply", cloud.points[mask], cloud.colors[mask])
+        return int(mask.sum())
 
     def _write_lists(self, frames: list[dict[str, Any]], held_out: set[int], points: int) -> None:
         sequence = sequence_annotation(self.category, self.sequence, points)
@@ -208,7 +208,7 @@ class CaptureWriter:
 
 
 def held_out_frames(frames: int, hold_out: int) -> set[int]:
-    """Every `hold_out`-th frame from the first on (the split of LLFF and NeRF), or more often: at least two."""
+    """Return every `hold_out`-th frame from the first on (as LLFF and NeRF), or more for at least two frames."""
     return set(range(0, frames, min(hold_out, frames // FEWEST_HELD_OUT)))
 
 

@@ -1,4 +1,4 @@
-"""Captures as a `transforms.json` with pictures: the format of NeRF, instant-ngp and nerfstudio."""
+"""Reader of captures as a `transforms.json` with images, the format of NeRF, instant-ngp and nerfstudio."""
 
 import logging
 import math
@@ -45,7 +45,7 @@ from completesplat.tensors import stack
 
 logger = logging.getLogger(__name__)
 
-# Which coefficients a model has, of OpenCV's; `k4` means other things in other programs.
+# OpenCV's distortion coefficients, and those that each camera model has; programs disagree on the meaning of `k4`.
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
@@ -55,20 +55,20 @@ SCALE_TOLERANCE = 1e-3
 
 
 def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
-    """Read `transforms.json`; what one frame says goes before what the file says for all.
+    """Read `transforms.json`; values of a frame override those of the file.
 
     `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
-    conventions"). Intrinsics are `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or NeRF's `camera_angle_x`; sizes that are
-    missing are the picture's, a missing principal point is its centre, a missing `fl_y` is `fl_x`. `cx` and `cy` count
-    from the corner of the first pixel, as COLMAP's do, from which they are made (nerfstudio,
-    `process_data/colmap_utils.py`). `mask_path` is the foreground. `ply_file_path` is in the world of the poses
-    (`create_ply_from_colmap`, ibid.). Paths are relative to the file's folder and stay in it.
+    conventions"). Intrinsics are `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, or NeRF's `camera_angle_x`. By default the size
+    is the image's, the principal point its centre, and `fl_y` equals `fl_x`. `cx` and `cy` are relative to the outer
+    corner of the first pixel, as in COLMAP, from which they are converted (nerfstudio, `process_data/colmap_utils.py`).
+    `mask_path` is the foreground. `ply_file_path` is in the world of the poses (`create_ply_from_colmap`, ibid.).
+    Paths are relative to the file's folder and stay in it.
 
-    Frames without a picture are left out (up to the share `most_missing`), as instant-ngp leaves them out where frames
-    have a `sharpness` (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 pictures.
+    Frames without an image are left out (up to the share `most_missing`), as in instant-ngp for frames with a
+    `sharpness` (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 images.
 
     Raises:
-        DataError: whatever is missing, malformed or impossible, with the file and the number of the frame in it.
+        DataError: something is missing, malformed or impossible; the error has the file and the frame's number.
     """
     frames, content = _read_frames(path, most_missing)
     with at(path):
@@ -79,14 +79,14 @@ def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
 
 
 def read_photographs(pictures: Sequence[Path], path: Path, size: int) -> Views:
-    """Photographs with their cameras in `transforms.json`, as `read_photograph` cuts and resizes them.
+    """Read photos as `read_photograph` crops and resizes them, with their cameras in `transforms.json`.
 
     Returns:
-        Views [view ...] in the order of the pictures, in the world of the first camera and the file's units.
+        Views [view ...] in the order of the photos, in the world of the first camera and the file's units.
 
     Raises:
-        DataError: as `read_transforms`, but for the number of frames; a picture of another size, or to be turned.
-        CompleteSplatError: a picture that the file does not have, or one that is distorted.
+        DataError: as in `read_transforms`, except for too few frames; or EXIF turns a photo, or its size differs.
+        CompleteSplatError: a photo is not in the file, or its lens has distortion.
     """
     frames = {frame.image.resolve(): frame for frame in _read_frames(path, most_missing=1)[0]}
     images, cameras = [], []
@@ -95,9 +95,9 @@ def read_photographs(pictures: Sequence[Path], path: Path, size: int) -> Views:
         if frame is None:
             raise CompleteSplatError(f"{picture}: {path} has no frame with this picture")
         if any(frame.lens.distortion):
-            said = "import the capture (completesplat data import), which undistorts it, and use the pictures it writes"
-            raise CompleteSplatError(f"{picture}: its lens distorts; {said}")
-        read_picture(frame.image, frame.lens.image_size)  # refuses what `read_photograph` would turn
+            hint = "import the capture (completesplat data import), which undistorts it, and use the pictures it writes"
+            raise CompleteSplatError(f"{picture}: its lens distorts; {hint}")
+        read_picture(frame.image, frame.lens.image_size)  # refuses images that `read_photograph` would turn
         images.append(read_photograph(frame.image, size).image)
         cameras.append(_of_square(frame, size))
     placed = stack(cameras)
@@ -105,7 +105,7 @@ def read_photographs(pictures: Sequence[Path], path: Path, size: int) -> Views:
 
 
 def _of_square(frame: CapturedFrame, size: int) -> Cameras:
-    """The camera of the central square, resized."""
+    """Return the camera of the resized central square."""
     (height, width), (fx, fy), (x, y) = frame.lens.image_size, frame.lens.focal, frame.lens.center
     whole = Cameras(
         torch.tensor(frame.world_to_camera, dtype=torch.float32),
@@ -117,8 +117,8 @@ def _of_square(frame: CapturedFrame, size: int) -> Cameras:
 
 
 def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], dict[str, Any]]:
-    """All frames that have pictures, and the file's content."""
-    content = read_json(path, allow_nan=True)  # NaN is refused where it stands, by frame.
+    """Return all frames that have images, and the file's content."""
+    content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
     with at(path):
         entries = field(content, "frames", list)
         frames = []
@@ -129,15 +129,15 @@ def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], 
 
 
 def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> dict[int, Path]:
-    """The pictures that are there, by the number of their frame."""
-    found, missing = {}, []
+    """Return the images that exist, by the number of their frame."""
+    paths, missing = {}, []
     for number, entry in enumerate(entries):
         with at(frame=number):
             name = field(entry, "file_path", str)
             candidates = [inside(path.parent, name + suffix) for suffix in SUFFIXES]
-        # `Path.is_file` raises where a name is too long.
-        if there := [candidate for candidate in candidates if isfile(candidate)]:
-            found[number] = there[0]
+        # `Path.is_file` raises if a name is too long.
+        if existing := [candidate for candidate in candidates if isfile(candidate)]:
+            paths[number] = existing[0]
         else:
             missing.append(name)
     if missing:
@@ -146,7 +146,7 @@ def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> d
         if len(missing) > most_missing * len(entries):
             raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
         logger.warning("%s: %s and are left out: %s", path, counted, named)
-    return found
+    return paths
 
 
 def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any, image: Path) -> CapturedFrame:
@@ -156,7 +156,7 @@ def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any, im
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
-    """`world_to_camera` with OpenCV's axes."""
+    """Convert `transform_matrix` to world-to-camera with OpenCV's axes."""
     pose = finite_array(matrix, (4, 4), "transform_matrix")
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")

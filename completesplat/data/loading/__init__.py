@@ -1,1 +1,1 @@
-"""From sequences to batches of scenes: which views, in which order, changed in which way, by which process."""
+"""Batches of scenes from sequences: view selection, order, augmentation and distribution over processes."""

@@ -1,4 +1,4 @@
-"""Random changes to training scenes: one colour jitter for all views, flips, boxes over the reference picture."""
+"""Random augmentation of training scenes: one colour jitter for all views, flips, boxes over the reference image."""
 
 import math
 from collections.abc import Sequence
@@ -18,18 +18,18 @@ from completesplat.scene import SceneBatch, Views
 
 @dataclass(frozen=True)
 class ColorJitter:
-    """Changes of colour, in random order and alike for all views of a scene (strengths as in torchvision).
+    """Random colour changes in random order, the same for all views of a scene (strengths as in torchvision).
 
-    A colour becomes the same new colour in whichever view it is seen: the grey level that contrast is counted from is
-    the mean over all views, not that of each picture. A strength of 0 leaves its change out.
+    Equal colours stay equal in all views, because contrast scales the distance from the mean grey level over all views,
+    not over each image. A strength of 0 leaves its change out.
 
     Args:
         brightness, contrast, saturation: the factor is drawn from [max(0, 1 - strength), 1 + strength]. It multiplies
-            the colours, their distance from the mean grey level, and their distance from the pixel's own grey.
-        hue: the angle is drawn from [-strength, strength] turns, of 0.5 at most.
+            the colours, their distance from the mean grey level, or their distance from the pixel's own grey.
+        hue: the angle is drawn from [-strength, strength] turns; the strength is at most 0.5.
 
     Raises:
-        CompleteSplatError: a strength that is negative or not finite, or a hue above 0.5.
+        CompleteSplatError: a strength is negative or not finite, or the hue is above 0.5.
     """
 
     brightness: float
@@ -47,7 +47,7 @@ class ColorJitter:
     def __call__(
         self, images: Float[Tensor, "view 3 height width"], rng: np.random.Generator
     ) -> Float[Tensor, "view 3 height width"]:
-        """Pictures (sRGB, 0 to 1) with one draw of all changes, as many for all strengths; clamped to 0 to 1."""
+        """Change images (sRGB, clamped to 0 to 1) at random; any strengths use equally many random numbers."""
         strengths = (self.brightness, self.contrast, self.saturation)
         factors = [rng.uniform(max(0.0, 1 - strength), 1 + strength) for strength in strengths]
         factors.append(2 * math.pi * rng.uniform(-self.hue, self.hue))
@@ -58,7 +58,7 @@ class ColorJitter:
             enhance.adjust_hue,
         )
         changes = list(zip(functions, (*strengths, self.hue), factors, strict=True))
-        # All views on top of each other as one picture: this is what makes the mean that of the scene.
+        # All views are stacked into one tall image, so that the mean is taken over the scene.
         column = rearrange(images, "view channel height width -> channel (view height) width")
         for index in rng.permutation(len(changes)):
             change, strength, factor = changes[index]
@@ -71,13 +71,13 @@ class ColorJitter:
 
 @dataclass(frozen=True)
 class BoxMasks:
-    """Boxes that hide parts of the reference picture from the conditioning (paper, masked diffusion).
+    """Boxes that hide parts of the reference image from the conditioning (paper, masked diffusion).
 
-    The paper gives the probability of hiding anything; the fewest and most boxes, and the shortest and longest side (in
-    shares of the picture's; height and width are drawn apart), are choices of this implementation.
+    The paper gives the probability that an image gets boxes. The smallest and largest number of boxes, and the range of
+    their sides (as fractions of the image's; height and width are drawn separately), are our choices.
 
     Raises:
-        CompleteSplatError: probability or sides outside of 0 to 1, or a range that is empty.
+        CompleteSplatError: the probability or the sides lie outside of 0 to 1, or a range is empty.
     """
 
     probability: float = 0.5
@@ -93,7 +93,7 @@ class BoxMasks:
             raise CompleteSplatError(f"box_masks.sides must be a range within 0 to 1, not {self.sides}")
 
     def __call__(self, height: int, width: int, rng: np.random.Generator) -> Float[Tensor, "1 {height} {width}"]:
-        """1 where the picture may be seen, 0 within the boxes; each lies inside the picture, on whole pixels."""
+        """Return 1 where the image is visible and 0 in the boxes, which lie inside the image on whole pixels."""
         visible = torch.ones(1, height, width)
         if rng.random() >= self.probability:
             return visible
@@ -115,10 +115,10 @@ def augment(
     box_masks: BoxMasks | None,
     horizontal_flip: bool,
 ) -> SceneBatch:
-    """One scene (without batch axis), changed at random: colours of all views, a flip in half of all cases, `visible`.
+    """Augment one scene (without batch axis): jitter all views, flip with probability 0.5, draw boxes into `visible`.
 
-    Jitter, flip and boxes draw from three generators spawned from `rng` in this order, so that none of them
-    depends on whether the others are switched on, nor on what was drawn from `rng` before. `rng` itself draws nothing.
+    Jitter, flip and boxes draw from three generators, spawned from `rng` in this order. So each is independent of
+    whether the others are on, and of what was drawn from `rng` before. Nothing is drawn from `rng` itself.
     """
     jitter_rng, flip_rng, boxes_rng = rng.spawn(3)
     if color_jitter is not None:
@@ -134,7 +134,7 @@ def augment(
 
 
 def mirrored(scene: SceneBatch) -> SceneBatch:
-    """The scene in a mirror: pictures, masks and cameras swap left and right, the reference's frame stays the world."""
+    """Mirror images, masks, depths and cameras left to right; the reference camera's frame remains the world frame."""
     parts = (scene.reference, scene.targets)
     reference, targets = (
         Views(

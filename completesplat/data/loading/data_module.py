@@ -1,4 +1,4 @@
-"""What the data modules of all data sets share: loaders and settings."""
+"""Base class of all data modules: settings and loaders."""
 
 import logging
 import os
@@ -28,48 +28,48 @@ from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
 
-MOST_WORKERS = 4  # by default
-WORKERS_OF_A_CORE = 4  # at most
+MOST_WORKERS = 4  # if data.workers is null
+WORKERS_OF_A_CORE = 4  # upper limit of data.workers for each core
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 logger = logging.getLogger(__name__)
 
 
 def _check_settings(settings: Mapping[str, Any], latent_cache: str | None, augmented: bool) -> None:
-    """Refuse settings of `SceneDataModule` that are out of their ranges, or that would change encoded pictures."""
+    """Refuse settings of `SceneDataModule` that are out of range, or that would change images with cached latents."""
     hints, workers, cores = hints_of(SceneDataModule.__init__), settings["workers"], os.cpu_count() or 1
     for name, value in settings.items():
         check_value(f"data.{name}", hints[name], value)
     if workers is not None and workers > WORKERS_OF_A_CORE * cores:
-        said = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
-        raise CompleteSplatError(f"data.workers={workers}: {said}")
+        message = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
+        raise CompleteSplatError(f"data.workers={workers}: {message}")
     if latent_cache is not None and (augmented or settings["background"] is not None):
         unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
         raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
 
 class SceneDataModule(LightningDataModule):
-    """Scenes from the sequences of a data set, as it was published or prepared with `completesplat data prepare`.
+    """Scenes from a data set as published, or as prepared with `completesplat data prepare`.
 
-    What training draws depends on the seed, the epoch and the item only.
+    The random choices of training depend on the seed, the epoch and the item only.
 
     Args:
-        root: folder of the data set or of its prepared form, or the address of the latter (`packed.remote`).
-        batch_size: scenes of an optimizer step, of all training processes and accumulated batches together.
+        root: folder of the data set or of its prepared form, or the address of the prepared form (`packed.remote`).
+        batch_size: scenes of an optimizer step, summed over all training processes and accumulated batches.
         targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which needs none.
-        evaluation_batch_size: scenes of an evaluation batch; 1 is used if they differ in their number of targets.
+        evaluation_batch_size: scenes of an evaluation batch; 1 is used if scenes have different numbers of targets.
         references_per_sequence: training items of a sequence in one epoch.
-        mask_threshold: masks are cut at this probability; None: they stay soft.
-        background: grey value that pictures have where they are masked out ("Objects only"); None: they stay.
-        color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: none.
+        mask_threshold: masks are binarized at this probability; None: they stay soft.
+        background: grey value that replaces the background of images with a mask ("Objects only"); None: it stays.
+        color_jitter, box_masks: settings of `ColorJitter` and `BoxMasks`; None: off.
         horizontal_flip: mirror half of the training scenes horizontally.
         workers: processes that load data; 0: none; None: one for each core, at most four.
-        cache: keep decoded pictures in memory.
-        latent_cache: train stage 2 from the latents in this folder (`CachedTrainingScenes`), without augmentation of
-            pictures; validation and test read pictures.
-        on_bad: "skip" what cannot be read, counted and reported, or "raise" it.
+        cache: keep decoded images in memory.
+        latent_cache: folder of latents from which stage 2 is trained (`CachedTrainingScenes`), without colour jitter,
+            flips or `background`; validation and test read images.
+        on_bad: "skip" items that cannot be read (counted and reported), or "raise" the error.
         max_bad_fraction: skipping more than this share of an epoch's items is an error.
-        allow_changed: a run that is continued may go on with other training data than it had.
+        allow_changed: a resumed run may continue with training data that have changed.
     """
 
     def __init__(
@@ -114,25 +114,25 @@ class SceneDataModule(LightningDataModule):
         self.policy = on_bad, max_bad_fraction
         self.allow_changed = allow_changed
         self.seed = seed
-        # The same data in the smaller pictures that a tested model sees.
+        # The same data in the smaller images that a tested model sees.
         self.at_model_size: SceneDataModule | None = None
         self._sources: dict[str, SequenceSource] = {}
         self._stores: dict[str, SceneStore] = {}
 
     @abstractmethod
     def packed_settings(self) -> dict[str, Any]:
-        """The settings that pictures, cameras and splits depend on: prepared data must have been made with the same."""
+        """Return the settings that determine images, cameras and splits; prepared data must have the same."""
 
     @abstractmethod
     def describe(self) -> Mapping[str, str | None]:
-        """For results: "data_set", "crop" of pictures, "protocol_views"; "subset" and "split" where there are lists."""
+        """Return facts for results: "data_set", "crop", "protocol_views"; "subset" and "split" if there are lists."""
 
     @abstractmethod
     def open(self, split: str) -> Mapping[str, SequenceSource]:
-        """The data set's own files: the sequences of this split, and of others that come with it.
+        """Open the data set's own files; return the sequences of this split, and of splits that are read with it.
 
         Raises:
-            DataError: they are missing or unreadable as a whole.
+            DataError: the files are missing or unreadable as a whole.
         """
 
     @abstractmethod
@@ -141,34 +141,38 @@ class SceneDataModule(LightningDataModule):
 
     @abstractmethod
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Reference and targets of a scene of "val" or "test"; `DataError` if the sequence lacks one of the frames."""
+        """Return reference and targets of a scene of "val" or "test".
+
+        Raises:
+            DataError: the sequence lacks one of the frames.
+        """
 
     def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
-        """Of the sequences of a split those that are used."""
+        """Select the sequences of a split that are used; by default all."""
         return source
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
-        """Whether all evaluation scenes have the same number of targets."""
+        """Return whether all evaluation scenes have the same number of targets."""
         return scenes.stackable()
 
     def setup(self, stage: str | None = None) -> None:
-        """List the sequences (pictures are read later).
+        """List the sequences (images are read later).
 
         Raises:
             DataError: missing or malformed files, no sequences for this stage, or a latent cache of other data.
-            CompleteSplatError: training data that `batch_size` or `targets` ask too much of.
+            CompleteSplatError: too few training scenes for `batch_size`, or too few frames for `targets`.
         """
         for split in SPLITS_OF_STAGE.get(stage or "", ()):
             self.store(split)
         if stage == "fit":
-            _ = self.trained_on  # as they are now, whatever becomes of the files while the run lasts
-            self._check_training()  # what is wrong is an error before training starts
+            _ = self.trained_on  # computed now, because the files could change during the run
+            self._check_training()
 
     def source(self, split: str) -> SequenceSource:
-        """The sequences of a split ("train", "val" or "test"), from the data set's own files or prepared.
+        """Return the sequences of a split ("train", "val" or "test") from the data set's own or prepared files.
 
         Raises:
-            DataError: missing or malformed files, prepared with other settings, or broken where that is to be raised.
+            DataError: files are missing, malformed or prepared with other settings, or broken if `on_bad` is "raise".
         """
         if split not in self._sources:
             if is_packed(self.root):
@@ -182,7 +186,7 @@ class SceneDataModule(LightningDataModule):
         return source
 
     def store(self, split: str) -> SceneStore:
-        """The scenes of a split; `DataError` as `source`, or if it has no sequences."""
+        """Return the scenes of a split, which must have sequences that can be used; errors as in `source`."""
         if split not in self._stores:
             source = self.source(split)
             used = self.evaluated(split, source)
@@ -197,21 +201,21 @@ class SceneDataModule(LightningDataModule):
 
     @cached_property
     def cached_latents(self) -> LatentCache:
-        """The cache in `latent_cache`. Raises `DataError` if it is damaged, or not of this training set."""
+        """Latent cache in the folder `latent_cache`, checked for damage and against the training data."""
         assert self.latent_cache is not None
         store = LatentCache(self.latent_cache)
         store.must_belong_to(self.source("train"), self.packed_settings())
         return store
 
     def train_dataloader(self) -> SceneLoader:
-        """Random views of all training sequences, in random order."""
+        """Load random views of all training sequences in random order."""
         scenes = self._training_scenes()
         accumulated = 1 if self.trainer is None else self.trainer.accumulate_grad_batches
         batch_size = batch_per_process(self.batch_size, processes()[1], accumulated)
         return SceneLoader(scenes, batch_size, EpochSampler(scenes.groups(), self.seed), self.workers, *self.policy)
 
     def _check_training(self) -> None:
-        """Raise if an epoch has fewer scenes than a batch, or each sequence fewer frames than a scene."""
+        """Raise if an epoch has fewer scenes than a batch, or every sequence has fewer frames than a scene needs."""
         scenes, frames = self._training_scenes(), [1]
         names = scenes.store.names
         if self.batch_size > len(scenes):
@@ -223,11 +227,11 @@ class SceneDataModule(LightningDataModule):
             with suppress(DataError):
                 frames.append(len(scenes.store.source.read(name).frames))
         if 1 < max(frames) <= self.targets:
-            said = f"a scene needs {self.targets + 1} frames, training sequences have at most {max(frames)} frames"
-            raise CompleteSplatError(f"data.targets={self.targets}: {said}")
+            message = f"a scene needs {self.targets + 1} frames, training sequences have at most {max(frames)} frames"
+            raise CompleteSplatError(f"data.targets={self.targets}: {message}")
 
     def _drawn_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
-        """Return `training_views` of a sequence; `TooFewFrames` if some of its targets would be the same."""
+        """Return `training_views` of a sequence, after a check that its targets can all be different."""
         if frames <= self.targets:
             raise TooFewFrames(f"{frames} frames, data.targets={self.targets} needs {self.targets + 1}")
         return self.training_views(frames, epoch, rng)
@@ -240,11 +244,11 @@ class SceneDataModule(LightningDataModule):
         return TrainingScenes(*drawing, self.augment, *counting)
 
     def val_dataloader(self) -> SceneLoader:
-        """The same views of all validation sequences each time."""
+        """Load fixed views of all validation sequences."""
         return self._evaluation_loader("val")
 
     def test_dataloader(self) -> SceneLoader:
-        """The same views of all test sequences each time."""
+        """Load fixed views of all test sequences."""
         return self._evaluation_loader("test")
 
     predict_dataloader = test_dataloader
@@ -254,41 +258,45 @@ class SceneDataModule(LightningDataModule):
         choose, depths = partial(self.evaluation_views, split=split), split == "test"
         scenes = EvaluationScenes(self.store(split), choose, seen=seen, depths=depths)
         batch_size = self.evaluation_batch_size if self.stackable(scenes) else 1
-        own = scenes.share(batch_size) if split == "test" else scenes
-        return SceneLoader(own, batch_size, None, self.workers, *self.policy)
+        local = scenes.share(batch_size) if split == "test" else scenes
+        return SceneLoader(local, batch_size, None, self.workers, *self.policy)
 
     @cached_property
     def trained_on(self) -> dict[str, Any]:
-        """Fingerprint and number of sequences of the training data, when first asked for."""
+        """Fingerprint and number of sequences of the training data, as they were at the first access."""
         source = self.source("train")
         return {"fingerprint": source.fingerprint(), "sequences": len(source.names)}
 
     def state_dict(self) -> dict[str, Any]:
-        """What the training data were, for checkpoints."""
+        """Return fingerprint and size of the training data for checkpoints."""
         return dict(self.trained_on)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Of the run that is continued: `DataError` if it had other training data, with `allow_changed` a warning."""
+        """Compare the training data with those of the run that is resumed; with `allow_changed`, only warn.
+
+        Raises:
+            DataError: the training data have changed.
+        """
         now = self.trained_on
         before = now | state_dict  # checkpoints of version 0.1 have no number of sequences
         if before == now:
             return
         counts = f"{before['sequences']} sequences then, {now['sequences']} now"
-        said = f"not the training data that this run had before ({counts})"
+        message = f"not the training data that this run had before ({counts})"
         if not self.allow_changed:
-            raise DataError(f"{said}; data.allow_changed=true goes on with these", str(self.root))
-        logger.warning("%s: %s", self.root, said)
+            raise DataError(f"{message}; data.allow_changed=true goes on with these", str(self.root))
+        logger.warning("%s: %s", self.root, message)
 
     def typical_camera(self) -> TypicalCamera:
-        """See `mean_camera`."""
+        """Return the mean camera of the training images."""
         with at(file=self.root):
             return mean_camera(self.store("train"))
 
     def training_facts(self) -> dict[str, Any]:
-        """What weights say about the pictures that they were trained on, see `completesplat.parts.TrainingPictures`."""
+        """Return the facts about training images that weights store (`completesplat.parts.TrainingPictures`)."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         return {"box_masks": hidden, **feature_moments(self.store("train"))}
 
     def mean_image(self) -> Float[Tensor, "3 height width"]:
-        """Mean of the training pictures, those of `typical_camera`: a guess that knows nothing about the input."""
+        """Return the mean of the images that `typical_camera` averages: a baseline that ignores the input."""
         return mean_image(self.store("train"), self.image_size)

@@ -1,4 +1,4 @@
-"""Which of several processes this is, and what the others know."""
+"""Rank of this training process, and values gathered from all of them."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from completesplat.errors import CompleteSplatError
 
 
 def processes() -> tuple[int, int]:
-    """This training process's number, and how many there are."""
+    """Return this training process's rank and the number of processes."""
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()
@@ -17,12 +17,12 @@ def processes() -> tuple[int, int]:
 
 
 def is_first() -> bool:
-    """Whether this is the first process, or the only one."""
+    """Return whether this is the first process, or the only one."""
     return processes()[0] == 0
 
 
 def gathered(value: Any) -> list[Any]:
-    """The values of all processes, in their order; each of them must call it."""
+    """Gather the values of all processes in rank order; every process must call this."""
     count = processes()[1]
     if count == 1:
         return [value]
@@ -32,7 +32,7 @@ def gathered(value: Any) -> list[Any]:
 
 
 def mean_of_processes(values: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Scalars on one device, averaged over all processes, each of which must call it with the same names."""
+    """Average scalars on one device over all processes; every process must call this with the same names."""
     count = processes()[1]
     if count == 1:
         return values
@@ -42,9 +42,10 @@ def mean_of_processes(values: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def batch_per_process(batch_size: int, count: int, accumulated: int) -> int:
-    """Scenes of one batch of one of `count` processes, so that an optimizer step sees `batch_size` scenes.
+    """Return the batch size of a process, where `count` processes with `accumulated` batches each make one step.
 
-    `accumulated` batches of each process make one step. `CompleteSplatError` if `batch_size` cannot be divided so.
+    Raises:
+        CompleteSplatError: `batch_size`, the scenes of a step, is not a multiple of count * accumulated.
     """
     share, rest = divmod(batch_size, count * accumulated)
     if rest:

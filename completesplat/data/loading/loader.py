@@ -1,4 +1,4 @@
-"""Batches of scenes: in which order, by how many processes, from where after an interruption, and what was left out."""
+"""Loader of scene batches: seeded order, several processes, resumption within an epoch, report of skipped items."""
 
 import logging
 from collections import Counter
@@ -18,10 +18,10 @@ logger = logging.getLogger(__name__)
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """All items, group by group: groups and the items of each in an order drawn from (seed, epoch), with the epoch.
+    """Sampler of (epoch, item), one group after the other; (seed, epoch) determines the order of groups and items.
 
-    Lightning calls `set_epoch` before every epoch, also after a resume. Where several processes train, each has its
-    own items, equally many (the last few may be left out).
+    Lightning calls `set_epoch` before every epoch, also after a resume. Several processes get different items, all
+    equally many (the last few items may be left out).
     """
 
     def __init__(self, groups: Sequence[Sequence[int]], seed: int) -> None:
@@ -31,29 +31,29 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self.start = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """The epoch of the iterations that start from now on."""
+        """Set the epoch of all iterations that start after this call."""
         self.epoch = epoch
 
     def __len__(self) -> int:
         return sum(map(len, self.groups)) // processes()[1]
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        # The index behind the last belongs to no item, so the order is independent of what the items draw.
+        # The index after the last belongs to no item, so the order is independent of what the items draw.
         rng = draws(self.seed, self.epoch, sum(map(len, self.groups)))
         order = [i for group in rng.permutation(len(self.groups)) for i in rng.permutation(self.groups[group])]
         rank, count = processes()
-        own = order[rank::count][: len(self)]
-        return iter([(self.epoch, int(index)) for index in own[self.start :]])
+        local = order[rank::count][: len(self)]
+        return iter([(self.epoch, int(index)) for index in local[self.start :]])
 
 
 class SceneLoader:
-    """Iterates over batches of scenes, and keeps account of what could not be read.
+    """Iterable over batches of scenes that counts and reports the items that cannot be read.
 
-    It is a loader of its own for Lightning, which restores `state_dict` in the middle of an epoch.
+    It wraps a `DataLoader` because Lightning restores `state_dict` in the middle of an epoch.
 
     Args:
-        sampler: the order of a training epoch; None: as they are.
-        on_bad, max_bad_fraction: see `SceneDataModule`; what is skipped is reported at the end of the epoch.
+        sampler: order of a training epoch; None: the order of `scenes`.
+        on_bad, max_bad_fraction: see `SceneDataModule`; skipped items are reported at the end of the epoch.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class SceneLoader:
             batch_size,
             sampler=sampler,
             num_workers=workers,
-            persistent_workers=workers > 0,  # They hold what is cached, so they live on from one epoch to the next.
+            persistent_workers=workers > 0,  # Workers hold the cached images, so they outlive an epoch.
             collate_fn=collate,
             pin_memory=torch.cuda.is_available(),
             worker_init_fn=leave_to_parent,
-            # Its own, so that the numbers which training draws do not depend on the number of workers.
+            # A separate generator, so that the random numbers of training do not depend on the number of workers.
             generator=torch.Generator(),
         )
 
@@ -92,14 +92,14 @@ class SceneLoader:
         return len(self._loader)
 
     @property
-    def _items(self) -> int:  # of this process in an epoch
+    def _items(self) -> int:  # number of this process's items in an epoch
         return len(self.dataset if self.sampler is None else self.sampler)
 
     def __iter__(self) -> Iterator[Any]:
-        """The batches of an epoch (`SceneBatch`, or `CachedScene`), or the rest of it after `load_state_dict`.
+        """Yield the batches (`SceneBatch` or `CachedScene`) of an epoch, or the rest of it after `load_state_dict`.
 
         Raises:
-            DataError: something cannot be read and is not to be skipped, or too much cannot be read, or nothing can.
+            DataError: an item cannot be read and `on_bad` is "raise", too many cannot be read, or none can.
         """
         resume, self._resume = self._resume, {}
         self.refused, self.refused_depths = [], []
@@ -112,17 +112,17 @@ class SceneLoader:
                 self._account(refused, scenes is None)
                 self.refused_depths += refused_depths
                 if self._batches == len(self):
-                    # Not behind the loop: whoever knows how many batches there are, as Lightning, asks for no more.
+                    # Not after the loop, because Lightning knows the number of batches and never exhausts the iterator.
                     self._report()
                 if scenes is not None:
                     yield scenes
-        except GeneratorExit:  # The rest of the epoch is not wanted.
+        except GeneratorExit:  # The caller stopped before the end of the epoch.
             if self._batches < len(self):
                 self._report()
             raise
 
-    # Where Lightning looks for the worker processes when it is done, to end them. Left to the garbage collector, each
-    # would go on waiting for 5 seconds, and the training process with it.
+    # Lightning ends the worker processes that it finds under this name. The garbage collector would wait 5 seconds for
+    # each of them, and delay the training process.
     @property
     def _iterator(self) -> Any:
         return self._loader._iterator
@@ -136,11 +136,11 @@ class SceneLoader:
         return self.sampler.epoch if self.sampler is not None else 0
 
     def state_dict(self) -> dict[str, int]:
-        """Which epoch it is, and how many batches of it were given out."""
+        """Return the current epoch and the number of its batches that were yielded."""
         return {"epoch": self._epoch, "batches": self._batches}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Start the next iteration after the batches of `state`, if it is still that epoch."""
+        """Let the next iteration start after the batches counted in `state`, if the epoch is still the same."""
         self._resume = dict(state)
 
     def _account(self, refused: Sequence[DataError], empty: bool) -> None:
@@ -148,7 +148,7 @@ class SceneLoader:
             raise refused[0]
         self.refused += refused
         too_many = len(self.refused) > max(1, self.max_bad_fraction * self._items)
-        # Evaluation has nothing in the place of what cannot be read.
+        # Training replaces unreadable items, so an empty batch is an error there; evaluation does not replace them.
         nothing = empty and (self.sampler is not None or len(self.refused) == self._items)
         if too_many or nothing:
             limit = f"more than data.max_bad_fraction={self.max_bad_fraction:g} allows"

@@ -1,4 +1,4 @@
-"""Scenes made of sequences: views in the reference's frame; what cannot be read is passed on, not raised."""
+"""Datasets of scenes made from sequences, with views in the reference's frame; read errors are returned, not raised."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -19,16 +19,15 @@ from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
-# So many other items are tried in the place of one that cannot be read.
-ATTEMPTS = 10
+ATTEMPTS = 10  # Items that are tried until one can be read.
 
 Choice = tuple[int, list[int]]  # reference, targets
 
 
 class Loaded(NamedTuple):
-    """A scene, or a batch of them, and why others could not be read.
+    """A scene or a batch of scenes, and the errors of those that could not be read.
 
-    `refused_depths`: why scenes are here without their true depth, although the data have it.
+    `refused_depths` are the errors of scenes that lack their true depth although the data set has it.
     """
 
     scenes: SceneBatch | CachedScene | None
@@ -37,12 +36,12 @@ class Loaded(NamedTuple):
 
 
 class SceneStore:
-    """Makes scenes of some of a source's sequences, which `names` lists in order.
+    """Scenes from those sequences of a source that `names` lists, in this order.
 
     Args:
-        mask_threshold: masks become 1 where the foreground's probability reaches it and 0 elsewhere; None: they stay.
-        cache: keep decoded pictures (uint8) in memory, each from its first use on.
-        background: grey value (0 to 1) that pictures have where they are masked out; None: they stay.
+        mask_threshold: masks are 1 where the foreground probability reaches it, else 0; None: they stay soft.
+        cache: keep decoded images (uint8) in memory after their first use.
+        background: grey value (0 to 1) that replaces the background of images with a mask; None: it stays.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class SceneStore:
         self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
-        """One scene in the reference camera's frame, from the frames of these indices; `DataError` if unreadable."""
+        """Return the scene of the frames with these indices in the reference camera's frame, if all can be read."""
         views = [reference, *targets]
         pictures = [self._picture(sequence, view) for view in views]
         images = _shares([picture.image for picture in pictures])
@@ -71,7 +70,7 @@ class SceneStore:
         return SceneBatch(seen[0], seen[1:], ranges, visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
-        """One picture. Raises `DataError` if it cannot be read."""
+        """Return one image, if it can be read."""
         return self._picture(sequence, view).image
 
     def _picture(self, sequence: PosedSequence, view: int) -> Picture:
@@ -96,18 +95,18 @@ class SceneStore:
 
 
 def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
-    # By NumPy: torch would wake its threads for so little, and they would wait on cores that others need.
+    # NumPy, because torch would start its threads for little work, and they would block cores that others need.
     return torch.from_numpy(np.divide([picture.numpy() for picture in pictures], 255, dtype=np.float32))
 
 
 class TrainingScenes(Dataset[Loaded]):
-    """Scenes of random views; a key is (epoch, index), see `EpochSampler`.
+    """Dataset of scenes with random views; a key is (epoch, index), see `EpochSampler`.
 
-    An item that cannot be read is replaced by another one. What is drawn, also then, depends on (seed, epoch, index)
-    only.
+    An item that cannot be read is replaced by another one. All random choices depend on (seed, epoch, index) only.
 
-    `choose` is (number of a sequence's frames, epoch, random generator) -> views; `references` are items of a sequence
-    in one epoch.
+    Args:
+        choose: (number of frames, epoch, random generator) -> views.
+        references: items of each sequence in one epoch.
     """
 
     def __init__(
@@ -142,25 +141,26 @@ class TrainingScenes(Dataset[Loaded]):
         return Loaded(None, tuple(refused))
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> SceneBatch | CachedScene:
-        """A scene of random views of the sequence of this name; `DataError` if it or a picture cannot be read."""
+        """Draw random views of the sequence `name` and return them as a scene, if all can be read."""
         sequence = self.store.source.read(name)
         scene = self.store.scene(sequence, *self.choose(len(sequence.frames), epoch, rng))
         return self.augment(scene, rng)
 
     def groups(self) -> list[list[int]]:
-        """Items that are best loaded one after the other."""
+        """Return groups of items that are best loaded one after the other."""
         several = range(self.references)
         groups = self.store.source.groups(self.store.names)
         return [[name * self.references + i for name in group for i in several] for group in groups]
 
 
 class EvaluationScenes(Dataset[Loaded]):
-    """Every sequence once, or those of some names.
+    """Dataset of evaluation scenes, one for each sequence.
 
     Args:
-        choose: sequence -> views. Raises `DataError` where it has not got them.
-        seen: makes what a model sees of them, in smaller pictures; None: it sees what the store makes.
-        depths: read the true depth too, where the data have it.
+        choose: sequence -> views; it raises a DataError if the sequence lacks one of them.
+        names: sequences to evaluate; None: all.
+        seen: makes the smaller images that the model sees; None: it sees the images of `store`.
+        depths: also read the true depth if the data set has it.
     """
 
     def __init__(
@@ -181,14 +181,14 @@ class EvaluationScenes(Dataset[Loaded]):
         return len(self.names)
 
     def share(self, batch_size: int) -> "EvaluationScenes":
-        """Return what this process evaluates: whole batches, made up as in one process alone.
+        """Return this process's share, in whole batches, so that batches are the same with any number of processes.
 
-        A process for which none is left evaluates the first scene again, because all must take part in what follows.
+        A process for which no batch is left takes the first scene again, because all processes gather their scores.
         """
         rank, count = processes()
         starts = range(rank * batch_size, len(self.names), count * batch_size)
-        own = [name for start in starts for name in self.names[start : start + batch_size]]
-        return EvaluationScenes(self.store, self.choose, own or self.names[:1], self.seen, self.depths)
+        local = [name for start in starts for name in self.names[start : start + batch_size]]
+        return EvaluationScenes(self.store, self.choose, local or self.names[:1], self.seen, self.depths)
 
     def __getitem__(self, index: int) -> Loaded:
         name = self.names[index]
@@ -208,7 +208,7 @@ class EvaluationScenes(Dataset[Loaded]):
         return Loaded(scene, ())
 
     def stackable(self) -> bool:
-        """Whether all scenes have the same number of targets, as far as they can be read."""
+        """Return whether all scenes that can be read have the same number of targets."""
         counts = set()
         for name in self.names:
             with suppress(DataError):
@@ -222,7 +222,7 @@ def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]
 
 
 def collate(items: Sequence[Loaded]) -> Loaded:
-    """A batch of the scenes that are there; where only some of them have depths, those of the others are 0, unknown."""
+    """Stack the scenes that could be read; if only some have depths, the depths of the others are 0 (unknown)."""
     scenes = [item.scenes for item in items if item.scenes is not None]
     with_depths = [isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes]
     if any(with_depths):

@@ -1,4 +1,4 @@
-"""Means over the training pictures and cameras, or over an excerpt of them where there are many."""
+"""Means over the training images and cameras, or over an excerpt of large data sets."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -14,16 +14,14 @@ from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
-# A mean over all pictures of RealEstate10K's 66,033 training clips would take hours.
+# A mean over all images of RealEstate10K's 66,033 training clips would take hours.
 SEQUENCES, PICTURES = 400, 8192
-# Deviations of eight numbers are known well enough from fewer.
+# Fewer images suffice for the standard deviations of eight features.
 FEATURE_PICTURES, SMALLEST_DEVIATION = 1024, 1e-3
 
 
 class TypicalCamera(NamedTuple):
-    """Means over the training pictures: horizontal field of view, near and far in scene units, and the direction away
-    from the ground in the camera's frame, a unit vector.
-    """
+    """Mean horizontal field of view, near and far in scene units, up direction (unit vector in the camera frame)."""
 
     fov_degrees: float
     depth_range: tuple[float, float]
@@ -31,7 +29,7 @@ class TypicalCamera(NamedTuple):
 
 
 def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Tensor, "_ 2"]]) -> TypicalCamera:
-    """Average over all cameras of all sequences, each [view]."""
+    """Average over all cameras of all sequences; each sequence is a batch [view] of cameras."""
     focal = torch.cat([cameras.intrinsics[:, 0, 0] for cameras in sequences])
     width = sequences[0].image_size[1]
     near, far = torch.cat(list(depth_ranges)).mean(dim=0).tolist()
@@ -41,10 +39,10 @@ def typical_camera(sequences: Sequence[Cameras], depth_ranges: Sequence[Float[Te
 
 
 def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The up direction of a sequence of hand-held cameras [view], in world coordinates.
+    """Estimate the up direction of hand-held cameras [view] in world coordinates.
 
-    People hold cameras level: the direction to which all horizontal image axes are most nearly perpendicular, on the
-    side of the cameras' own up (after `co3d_normalisation.py` of Splatter Image).
+    People hold cameras level, so up is most nearly perpendicular to all horizontal image axes. Its sign follows the
+    cameras' up directions (after `co3d_normalisation.py` of Splatter Image).
     """
     horizontal, down = cameras.world_to_camera[:, 0, :3], cameras.world_to_camera[:, 1, :3]
     up = torch.linalg.svd(horizontal).Vh[-1]
@@ -52,7 +50,7 @@ def world_up(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 def mean_camera(store: SceneStore) -> TypicalCamera:
-    """The typical camera of at most 8,192 frames, in the first 400 sequences; `DataError` if none can be read."""
+    """Return the typical camera of at most 8,192 frames from the first 400 sequences; at least one must be readable."""
     chosen = list(excerpts(store))
     if not chosen:
         raise DataError("no training sequence can be read")
@@ -60,7 +58,7 @@ def mean_camera(store: SceneStore) -> TypicalCamera:
 
 
 def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
-    """Mean of the pictures of the same frames; black if none can be read."""
+    """Average the images of the same frames; return black if none can be read."""
     total, count = torch.zeros(3, size, size, dtype=torch.float64), 0
     for sequence, frames in excerpts(store):
         for frame in frames:
@@ -71,21 +69,21 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
-    """`picture_mean` and `picture_std` of the `picture_features` of about 1,024 pictures; empty if none can be read."""
-    found = []
+    """Return mean and standard deviation of `picture_features` over about 1,024 images; empty if none can be read."""
+    rows = []
     for sequence, frames in excerpts(store, FEATURE_PICTURES):
         for frame in frames:
             with suppress(DataError):
-                found.append(picture_features(store.image(sequence, frame).double() / 255))
-    if not found:
+                rows.append(picture_features(store.image(sequence, frame).double() / 255))
+    if not rows:
         return {}
-    features = torch.stack(found)
+    features = torch.stack(rows)
     deviation = features.std(0, correction=0).clamp(min=SMALLEST_DEVIATION)
     return {"picture_mean": features.mean(0).tolist(), "picture_std": deviation.tolist()}
 
 
 def excerpts(store: SceneStore, pictures: int = PICTURES) -> Iterator[tuple[PosedSequence, list[int]]]:
-    """The first sequences that can be read, each with evenly spaced frames, of about so many pictures in all."""
+    """Yield the first sequences that can be read, each with evenly spaced frames, about `pictures` frames in total."""
     names = store.names[:SEQUENCES]
     most = pictures // len(names)
     for name in names:

@@ -1,4 +1,4 @@
-"""Which frame of a sequence is the reference and which are its targets."""
+"""Selection of a sequence's reference frame and of its target frames."""
 
 from dataclasses import dataclass
 
@@ -9,10 +9,13 @@ from completesplat.errors import CompleteSplatError
 
 @dataclass(frozen=True)
 class GrowingGap:
-    """Largest gap in frames between two views: from `first` it grows linearly, over `epochs`, to `last`.
+    """Largest gap in frames between two views, which grows linearly from `first` to `last` over `epochs`.
 
-    pixelSplat trains like this, on 25 to 45 frames (`config/dataset/view_sampler_dataset_specific_config/
-    bounded_re10k.yaml`). `CompleteSplatError` unless 1 <= first <= last and 0 <= epochs.
+    pixelSplat's gap grows from 25 to 45 frames (`config/dataset/view_sampler_dataset_specific_config/
+    bounded_re10k.yaml`).
+
+    Raises:
+        CompleteSplatError: unless 1 <= first <= last and 0 <= epochs.
     """
 
     first: int
@@ -29,23 +32,23 @@ class GrowingGap:
 
 
 def draws(seed: int, epoch: int, index: int) -> np.random.Generator:
-    """The random generator of one training item: the same in whichever process and order the item is made."""
+    """Return the random generator of one training item, independent of the process and of the loading order."""
     return np.random.default_rng([seed, epoch, index])
 
 
 def training_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
-    """A random reference and `targets` other frames, at any baseline (Splatter Image, `scene/co3d.py:231`).
+    """Draw a random reference and `targets` other frames at any baseline (Splatter Image, `scene/co3d.py:231`).
 
-    Targets repeat only if the sequence of at least two frames is too short.
+    The sequence needs at least two frames. Targets repeat only if it is too short.
     """
     order = rng.permutation(frames)
     return int(order[0]), np.resize(order[1:], targets).tolist()
 
 
 def spread_around(frames: int, reference: int, count: int) -> list[int]:
-    """`count` other frames, evenly spread over a sequence that is taken as a ring, from the one after the reference on.
+    """Return `count` other frames, evenly spread over the sequence as a ring, starting after the reference.
 
-    They repeat where the sequence has fewer others.
+    They repeat if the sequence has fewer other frames.
     """
     steps = 1 + (np.arange(count) + 0.5) * (frames - 1) / max(count, 1)
     places: list[int] = ((reference + np.floor(steps).astype(int).clip(1, frames - 1)) % frames).tolist()
@@ -53,13 +56,13 @@ def spread_around(frames: int, reference: int, count: int) -> list[int]:
 
 
 def spread_views(frames: int, targets: int, rng: np.random.Generator) -> tuple[int, list[int]]:
-    """A random reference and `targets` frames all around it (`spread_around`), in random order."""
+    """Draw a random reference; return it and `targets` frames all around it (`spread_around`) in random order."""
     reference = int(rng.integers(frames))
     return reference, rng.permutation(spread_around(frames, reference, targets)).tolist()
 
 
 def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
-    """The first frame as reference; all others as targets, or at most `targets` of them, evenly spaced."""
+    """Return the first frame as reference, and all others or at most `targets` evenly spaced ones as targets."""
     others = np.arange(1, frames)
     if targets is not None and targets < len(others):
         others = others[np.round((np.arange(targets) + 0.5) * len(others) / targets - 0.5).astype(int)]
@@ -69,10 +72,10 @@ def evaluation_views(frames: int, targets: int | None) -> tuple[int, list[int]]:
 def nearby_views(
     frames: int, targets: int, min_gap: int, max_gap: int, rng: np.random.Generator
 ) -> tuple[int, list[int]]:
-    """A random reference and `targets` random frames that are `min_gap` to `max_gap` frames before or after it.
+    """Draw a random reference and `targets` random frames that are `min_gap` to `max_gap` frames before or after it.
 
-    Only frames that have such a neighbour become the reference; in a sequence (of at least two frames) that is too
-    short for `min_gap` those are the first and the last. Targets repeat where there are too few neighbours.
+    Only frames that have such a neighbour can be the reference. The sequence needs at least two frames; if it is too
+    short for `min_gap`, its first or last frame is the reference. Targets repeat if there are too few neighbours.
     """
     nearest = min(min_gap, frames - 1)
     positions = np.arange(frames)
@@ -84,6 +87,6 @@ def nearby_views(
 def evaluation_views_within(frames: int, targets: int, gap: int) -> tuple[int, list[int]]:
     """Return the first frame as reference and `targets` evenly spaced frames, the last one `gap` frames after it.
 
-    In a shorter sequence the last target is the last frame; targets repeat where there are too few frames.
+    In a shorter sequence the last target is the last frame. Targets repeat if there are too few frames.
     """
     return 0, np.ceil(min(gap, frames - 1) * np.arange(1, targets + 1) / targets).astype(int).tolist()

@@ -1,1 +1,1 @@
-"""Sequences cropped, resized and encoded once: a folder of Arrow files that is read memory-mapped."""
+"""Packed store: a folder of memory-mapped Arrow files with sequences that were cropped, resized and encoded once."""

@@ -1,4 +1,4 @@
-"""What a packed store says of itself, in a `manifest.json` that is written last; reading and writing any manifest."""
+"""Manifest of a packed store (`manifest.json`, which is written last); functions that read and write any manifest."""
 
 import json
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Refusal:
-    """A sequence, or a frame of one, that is not in the store."""
+    """Record of a sequence or a frame that is not in the store because it could not be read."""
 
     kind: str
     reason: str
@@ -31,7 +31,7 @@ class Refusal:
 
     @staticmethod
     def of(error: DataError) -> "Refusal":
-        """What a refusal says, without the exception."""
+        """Make the record of an error."""
         return Refusal(error.kind, error.reason, error.file, error.sequence, error.frame)
 
 
@@ -48,11 +48,11 @@ class Shard:
 
 @dataclass(frozen=True)
 class Split:
-    """The part of a store that one source was made into.
+    """Split of a store, made from one source.
 
     Attributes:
-        listed: how many sequences the source's list has, usable or not.
-        names: those that are here, in the order of the source.
+        listed: number of sequences in the source's list, usable or not.
+        names: stored sequences, in the order of the source.
     """
 
     fingerprint: str
@@ -70,7 +70,7 @@ class Split:
 
 @dataclass(frozen=True)
 class PackedManifest:
-    """A whole store; `settings` are what was baked into its pictures and cameras."""
+    """Manifest of a whole store; its images and cameras depend on `settings`."""
 
     codec: str
     settings: dict[str, Scalar]
@@ -78,12 +78,12 @@ class PackedManifest:
 
 
 def is_packed(root: Path) -> bool:
-    """Whether a folder holds a complete packed store."""
+    """Return whether a folder holds a complete packed store."""
     return (root / MANIFEST).is_file()
 
 
 def read_manifest(root: Path) -> PackedManifest:
-    """The manifest of a store. Raises `DataError` as `read_as`."""
+    """Read the manifest of a store; errors as in `read_as`."""
     path = root / MANIFEST
     with at(file=path):
         now = require_file(path).stat()
@@ -92,31 +92,31 @@ def read_manifest(root: Path) -> PackedManifest:
 
 @lru_cache(maxsize=1)
 def _read_manifest(path: Path, *_: int) -> PackedManifest:
-    """Once for all splits and checks: with all clips of RealEstate10K it takes a third of a second."""
+    """Read a manifest once for all splits and checks; that of all RealEstate10K clips takes a third of a second."""
     return read_as(PackedManifest, path, HEADER, "prepare the data again")
 
 
 def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: str) -> T:
-    """A JSON file that starts with `header` as an instance of a dataclass.
+    """Read a JSON file that starts with `header` into a dataclass.
 
     Raises:
-        DataError: it is missing, no JSON, has another header (then it names the remedy), or is incomplete.
+        DataError: the file is missing, no JSON or incomplete, or has another header (the message has the `remedy`).
     """
     with at(file=path):
         content = read_json(path)
         for key, readable in header.items():
-            found = field(content, key, type(readable))
-            if found != readable:
-                raise UnreadableFile(f"{key} {found}, this version reads {readable}: {remedy}")
+            stored = field(content, key, type(readable))
+            if stored != readable:
+                raise UnreadableFile(f"{key} {stored}, this version reads {readable}: {remedy}")
         manifest: T = parsed(kind, content)
         return manifest
 
 
 def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
-    """A value of JSON as a dataclass, tuple, dictionary, union or plain type says.
+    """Convert a JSON value to `kind`, a dataclass, tuple, dictionary, union or plain type.
 
     Raises:
-        BadAnnotation: it is of another type (true is no `int`), or a field is missing.
+        BadAnnotation: the value has another type (true is no `int`), or a field is missing.
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is tuple and type(value) is list:
@@ -134,26 +134,26 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
 
 
 def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None = None) -> None:
-    """Write a JSON file of a dictionary or a dataclass, there as a whole or not at all."""
+    """Write a dictionary or a dataclass to a JSON file atomically."""
     write_text(path, json_text(content, header))
 
 
 def json_text(content: Any, header: Mapping[str, str | int] | None = None) -> str:
-    """Return what `write_json` writes."""
+    """Return the text that `write_json` writes."""
     entries = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
     return json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n"
 
 
 def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
-    """Refuse a store that was made with other settings, or in smaller images than are asked for.
+    """Refuse a store that was made with other settings, or whose images are smaller than requested.
 
     Raises:
-        DataError: it names every setting that differs.
+        DataError: settings differ; the message names each of them.
     """
     stored, wanted = read_manifest(root).settings, dict(settings)
     sizes = stored.get("image_size"), wanted.get("image_size")
     if isinstance(sizes[0], int) and isinstance(sizes[1], int) and sizes[0] > sizes[1]:
-        wanted["image_size"] = sizes[0]  # images are made smaller when they are read
+        wanted["image_size"] = sizes[0]  # larger images are reduced when they are read
     differing = differences(stored, wanted)
     if differing:
         advice = "set these as they were, or prepare the data again into another folder"
@@ -161,7 +161,7 @@ def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
 
 
 def differences(found: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> str:
-    """`image_size=128 (asked for: 64), ...` for all settings that differ."""
-    # JSON makes no difference between 1 and 1.0, nor does anything that the settings are used for.
+    """Return `image_size=128 (asked for: 64), ...` for all settings that differ."""
+    # 1 and 1.0 are equal, because neither JSON nor any use of the settings distinguishes them.
     keys = [key for key in sorted({*found, *wanted}) if found.get(key) != wanted.get(key)]
     return ", ".join(f"{key}={found.get(key)} (asked for: {wanted.get(key)})" for key in keys)

@@ -1,6 +1,6 @@
-"""A packed store behind an address (http, https, s3, gs, hf, ...): fsspec fetches a shard when it is first read.
+"""Remote packed store (http, https, s3, gs, hf, ...): fsspec fetches a shard when it is first read.
 
-What was fetched lies in a folder of this machine, and is read from there as any packed store, memory-mapped.
+Fetched files lie in a local folder, which is read memory-mapped like any packed store.
 """
 
 import hashlib
@@ -18,9 +18,12 @@ ADDRESS = "address.txt"
 
 
 def local_root(root: str) -> Path:
-    """The folder itself; of an address its folder on this machine, below `COMPLETESPLAT_CACHE`, with the manifest.
+    """Return a local folder as it is; for an address, fetch the manifest into a folder below `COMPLETESPLAT_CACHE`.
 
-    A store that was made anew at the same address gets another folder. `DataError`: nothing can be fetched from there.
+    A store that was made again at the same address gets another folder, which depends on the manifest's digest.
+
+    Raises:
+        DataError: nothing can be fetched from the address.
     """
     if "://" not in root:
         return Path(root)
@@ -38,16 +41,16 @@ def local_root(root: str) -> Path:
 
 
 def address_of(root: Path) -> str | None:
-    """Where a folder's shards are fetched from; None for a store that was made or copied here."""
+    """Return the address of a folder's shards; None for a store that was made or copied here."""
     return (root / ADDRESS).read_text() if (root / ADDRESS).is_file() else None
 
 
 def fetched(address: str, shard: Shard, path: Path) -> Path:
-    """The file of a shard, here, which one of several processes fetches whole while the others wait for it.
+    """Return the local file of a shard; if it is missing, one process fetches it while the others wait.
 
     Raises:
-        MissingFile: it cannot be fetched.
-        ChangedFile: it is not the one that the manifest names.
+        MissingFile: the shard cannot be fetched.
+        ChangedFile: its checksum differs from the manifest's.
     """
     if path.is_file():
         return path
@@ -62,12 +65,12 @@ def fetched(address: str, shard: Shard, path: Path) -> Path:
 
 
 def _get(address: str, name: str, path: Path) -> None:
-    import fsspec  # takes its time
+    import fsspec  # a slow import
 
     try:
         files, folder = fsspec.core.url_to_fs(address.rstrip("/"))
         files.get_file(f"{folder}/{name}", str(path))
-    except Exception as error:  # each kind of store has its own
+    except Exception as error:  # each kind of store raises other exceptions
         reason = " ".join(str(error).split()) or type(error).__name__
         raise MissingFile(f"cannot be fetched ({reason})", f"{address}/{name}") from error
 

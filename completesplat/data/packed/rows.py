@@ -1,4 +1,4 @@
-"""One sequence as one row of an Arrow table, its pictures as bytes, and back."""
+"""Conversion of a sequence to one row of an Arrow table, with encoded images, and back."""
 
 import io
 import zlib
@@ -19,20 +19,19 @@ from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
 from completesplat.geometry.cameras import Cameras, crop_resize
 
-# Arguments of Pillow for each codec. BMP is not compressed: more than twice the bytes of PNG, decoded in a ninth of the
-# time.
+# Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.
 CODECS: dict[str, dict[str, Any]] = {
     "png": {"format": "PNG"},
     "jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
     "bmp": {"format": "BMP"},
 }
-# Numbers of a frame in the columns that `checksum` covers.
+# Number of values for each frame in the columns that `checksum` covers.
 WIDTHS = {"frames": 1, "world_to_camera": 16, "intrinsics": 9, "depth_ranges": 2}
 
 
 def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
-    """A file of three channels (colour) or one (grey); PNG and BMP are without loss."""
-    # Here and below NumPy reorders the channels: PyTorch would wake its threads, which costs more than the picture.
+    """Return an image file with three channels (colour) or one (grey); PNG and BMP are lossless."""
+    # NumPy reorders the channels, here and below, because starting PyTorch's threads costs more than the work itself.
     channels_last = np.ascontiguousarray(picture.numpy().transpose(1, 2, 0))
     image = Image.fromarray(channels_last.squeeze(-1) if len(picture) == 1 else channels_last)
     content = io.BytesIO()
@@ -48,12 +47,12 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
     """
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
-            # The header is looked at before the pixels are, so that no bytes make a huge picture.
+            # The header is checked before the pixels are decoded, so that no file unpacks to a huge image.
             wrong = image.size != (size, size) or len(image.getbands()) != channels
             if not wrong and wanted != size:
                 return cut_square(image, Square(0, 0, size), wanted)
             pixels = None if wrong else np.array(image)
-    # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+    # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
         raise BadPicture(f"cannot be decoded: {error}") from error
     if pixels is None or pixels.dtype != np.uint8:
@@ -63,12 +62,12 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
 
 @cache
 def features() -> Any:
-    """The columns (`datasets.Features`). Numbers of all frames lie flat, one frame after the other, rows first.
+    """Return the columns (`datasets.Features`). Values of all frames are flattened in row-major order.
 
-    `picture_checksums` are CRC-32 of a frame's image and mask, `checksum` of all the other columns; Pillow does not
-    look at those within PNG, and JPEG has none. A mask may be null. Large types, as 2 GB are soon reached.
+    `picture_checksums` are the CRC-32 of each frame's image and mask, because Pillow ignores PNG's checksums and JPEG
+    has none. `checksum` covers the other columns. A mask may be null. Types are large because rows can exceed 2 GB.
     """
-    # Takes a second and 70 MB, which nobody should pay who reads raw data.
+    # A local import, because it takes a second and 70 MB, which users of raw data should not pay.
     from datasets import Features, LargeList, Value
 
     return Features(
@@ -89,18 +88,18 @@ def features() -> Any:
 
 @dataclass(frozen=True)
 class EncodedPicture:
-    """The files of an image and of its mask, if it has one."""
+    """Encoded files of an image and of its mask, if it has one."""
 
     image: bytes
     mask: bytes | None
 
     def checksum(self) -> int:
-        """CRC-32 of both."""
+        """Return the CRC-32 of both files."""
         return zlib.crc32(self.mask or b"", zlib.crc32(self.image))
 
 
 def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPicture:
-    """A frame's picture as files, the mask without loss; `DataError` if unreadable or not of its camera's size."""
+    """Encode a frame's image, and its mask without loss, after a check that both have their camera's size."""
     image, mask = sequence.read(index)
     for part in (image, mask):
         if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
@@ -110,7 +109,7 @@ def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPi
 
 
 def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[EncodedPicture]) -> pa.Table:
-    """A table of one row with the frames of these indices and their pictures."""
+    """Return a table of one row with the frames whose indices are `kept`, and their images."""
     indices, cameras = list(kept), sequence.cameras
     numbers = {
         "frames": np.array([sequence.frames[index] for index in indices], dtype=np.int64),
@@ -132,19 +131,19 @@ def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[Enco
 
 
 def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None) -> PosedSequence:
-    """Return the sequence of a table with one row, in images of `image_size`; they are decoded when they are read.
+    """Return the sequence in a table with one row. Its images have `image_size` and are decoded when they are read.
 
     Raises:
-        DataError: damaged, another sequence than `name`, columns of different lengths, or numbers that are not finite.
+        DataError: the row is damaged or of another sequence, its columns differ in length, or a number is not finite.
     """
     with at(file=file, sequence=name):
         try:
-            row.validate(full=True)  # Offsets within bounds: without it damage could crash the process.
+            row.validate(full=True)  # Without this check, damaged offsets could crash the process.
         except pa.ArrowInvalid as error:
             raise UnreadableFile(f"damaged ({error})") from None
-        found, size, checksum = (row.column(column)[0].as_py() for column in ("name", "size", "checksum"))
-        if found != name:
-            raise BadAnnotation(f"holds sequence {found!r} in its place")
+        stored_name, size, checksum = (row.column(column)[0].as_py() for column in ("name", "size", "checksum"))
+        if stored_name != name:
+            raise BadAnnotation(f"holds sequence {stored_name!r} in its place")
         count = len(_values(row, "frames"))
         numbers = {column: _numbers(row, column, count * width) for column, width in WIDTHS.items()}
         if not isinstance(size, int) or size < 1 or checksum != _checksum(name, size, numbers):
@@ -157,7 +156,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         images, masks = _values(row, "images", count), _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
 
-        def read(index: int) -> Picture:  # The others' bytes are not touched.
+        def read(index: int) -> Picture:  # It does not access the bytes of other frames.
             with at(file=file, sequence=name, frame=frames[index]):
                 image, mask = images[index].as_py(), masks[index].as_py()
                 if image is None or EncodedPicture(image, mask).checksum() != checksums[index]:
@@ -178,7 +177,7 @@ def _numbers(row: pa.Table, column: str, count: int) -> np.ndarray:
     values = _values(row, column, count)
     if values.null_count:
         raise BadAnnotation(f"{column} must be numbers")
-    numbers: np.ndarray = values.to_numpy().copy()  # The map cannot be written to.
+    numbers: np.ndarray = values.to_numpy().copy()  # The memory map is read-only.
     if not np.isfinite(numbers).all():
         raise BadAnnotation(f"{column} is not finite")
     return numbers

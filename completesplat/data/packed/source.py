@@ -1,4 +1,4 @@
-"""Reading a packed store: opened by its manifest, memory-mapped shard by shard when a sequence is read."""
+"""Reader of a packed store, which maps a shard into memory when one of its sequences is read."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,11 +16,10 @@ from completesplat.weights import sha256_of
 
 
 class PackedSource(SequenceSource):
-    """One split of a packed store, in images of `image_size` (None: of the size that it was made with).
+    """One split of a packed store, with images of `image_size` (None: the size that they are stored in).
 
-    The manifest says what was refused while the store was made.
-
-    `DataError` if there is no such split, or for a malformed manifest, or a shard that is missing or of another size.
+    Raises:
+        DataError: the split does not exist, the manifest is malformed, or a shard is missing or has another size.
     """
 
     def __init__(self, root: Path, split: str, image_size: int | None = None) -> None:
@@ -53,7 +52,7 @@ class PackedSource(SequenceSource):
                     raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
-        """One sequence; its pictures are decoded one by one when they are read. `DataError` if its shard is damaged."""
+        """Read one sequence, unless its shard is damaged; its images are decoded one by one when they are read."""
         number, row = self._places[name]
         shard = self.shards[number]
         path = self.root / shard.file
@@ -64,13 +63,13 @@ class PackedSource(SequenceSource):
                 self._opened[number] = open_shard(path, shard)
         with at(file=path, sequence=name):
             try:
-                found = self._opened[number][row]
+                table = self._opened[number][row]
             except (pa.ArrowException, OSError, ValueError) as error:
                 raise UnreadableFile(f"damaged ({error})") from None
-        return from_row(found, str(path), name, self.image_size)
+        return from_row(table, str(path), name, self.image_size)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """Shard by shard where they have to be fetched: training starts with the first one. Else in any order."""
+        """Group sequences by shard if shards have to be fetched, so that training can start after the first one."""
         if self.address is None:
             return super().groups(names)
         groups: dict[int, list[int]] = {}
@@ -79,27 +78,27 @@ class PackedSource(SequenceSource):
         return list(groups.values())
 
     def fingerprint(self) -> str:
-        """That of the source which the store was made from."""
+        """Return the fingerprint of the source that the store was made from."""
         return self._fingerprint
 
     def verify(self) -> list[ChangedFile]:
-        """The shards of this split that are no longer those whose checksums are in the manifest; reads all of them."""
+        """Read all shards of this split and return those whose checksum differs from the manifest's."""
         reason = "its checksum is no longer that of the manifest: remove it and prepare again into the same folder"
         paths = {require_file(self.root / shard.file): shard.sha256 for shard in self.shards}
         return [ChangedFile(reason, str(path)) for path, checksum in paths.items() if sha256_of(path) != checksum]
 
     def __getstate__(self) -> dict[str, Any]:
-        # Worker processes open the files themselves and share their pages.
+        # Worker processes open the files themselves and share their memory pages.
         return {**self.__dict__, "_opened": {}}
 
 
 class OpenShard:
-    """A memory-mapped shard: its rows, one record batch each, are looked up when they are read.
+    """Memory-mapped shard, whose rows are record batches that are parsed when they are read.
 
-    What Arrow knows of a batch takes 8 kB, which for all clips of RealEstate10K were half a gigabyte in every process.
+    Arrow's description of a parsed batch takes 8 kB, or half a gigabyte in every process for all RealEstate10K clips.
 
     Raises:
-        ArrowException, OSError: it is damaged.
+        ArrowException, OSError: the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,7 +110,7 @@ class OpenShard:
         while (place := stream.tell()) < self._content.size:
             try:
                 pa.ipc.read_message(stream)
-            except EOFError:  # the mark at the end
+            except EOFError:  # the end-of-stream mark
                 break
             self._places.append(place)
 
@@ -119,14 +118,14 @@ class OpenShard:
         return len(self._places)
 
     def __getitem__(self, row: int) -> pa.Table:
-        """A table of one row."""
+        """Return a table of one row."""
         stream = pa.BufferReader(self._content)
         stream.seek(self._places[row])
         return pa.Table.from_batches([pa.ipc.read_record_batch(pa.ipc.read_message(stream), self.schema)])
 
 
 def open_shard(path: Path, shard: Shard) -> OpenShard:
-    """A shard, one row a sequence; `DataError` if missing, damaged or not as expected."""
+    """Open a shard, which has one row for each sequence, after a check of its columns and number of rows."""
     with at(file=path):
         try:
             opened = OpenShard(require_file(path))

@@ -1,4 +1,4 @@
-"""Making a packed store: planned, estimated, written by several processes, continued after a break."""
+"""Writer of a packed store, with a size estimate, several processes, and continuation after an interruption."""
 
 import hashlib
 import json
@@ -38,9 +38,9 @@ from completesplat.errors import CompleteSplatError, DataError
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"
 PLAN = "plan.json"
-# The estimate of a store's size looks at so many sequences, and frames of each.
+# Number of sequences, and of frames of each, from which a store's size is estimated.
 SEQUENCES, FRAMES = 3, 2
-# Cameras, depth range, number, checksum and two offsets of a frame.
+# Bytes of a frame's camera, depth range, number, checksum and two offsets.
 BYTES_PER_FRAME = 8 * (16 + 9 + 1 + 1 + 1 + 2)
 
 OnBad = Literal["raise", "skip"]
@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ShardPlan:
-    """A shard's file and the sequences that are to be in it."""
+    """File name and sequences of a shard to be written."""
 
     file: str
     split: str
@@ -59,7 +59,7 @@ class ShardPlan:
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """What became of a shard: what it holds, and what it does not. Lies beside it as JSON."""
+    """Report of one shard, as JSON beside it: sequences planned and written, and errors of those that are missing."""
 
     split: str
     names: tuple[str, ...]
@@ -69,7 +69,7 @@ class ShardRecord:
 
 @dataclass(frozen=True)
 class ShardWriter:
-    """Makes shards in `folder`; it travels to the worker processes, the sources with it."""
+    """Writer of shards in `folder`; it is pickled for the worker processes, with its sources."""
 
     sources: Mapping[str, SequenceSource]
     folder: Path
@@ -77,20 +77,20 @@ class ShardWriter:
     on_bad: OnBad
 
     def write(self, plan: ShardPlan) -> ShardRecord:
-        """Make a shard and, after it, its record; either is there as a whole or not at all.
+        """Write a shard and then its record, each atomically.
 
         Raises:
-            DataError: something cannot be read, and bad input is not to be skipped.
+            DataError: something cannot be read, and `on_bad` is "raise".
             DiskError: the disk is full.
         """
-        # Public within `datasets`, though not in its handbook: the documented ways (`from_list`, `from_generator`)
-        # hold a whole shard in memory or write it into a cache first.
+        # ArrowWriter is public in `datasets` but undocumented. The documented functions (`from_list`, `from_generator`)
+        # hold a whole shard in memory or write it to a cache first.
         from datasets.arrow_writer import ArrowWriter
 
         path = self.folder / plan.file
         refused: list[Refusal] = []
         sequences, frames = [], 0
-        # One record batch for each sequence, so that writing holds no more than one in memory.
+        # One record batch for each sequence, so that memory holds only one sequence.
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
             with (
                 unfinished.open("wb") as stream,
@@ -98,13 +98,13 @@ class ShardWriter:
             ):
                 for name in plan.names:
                     try:
-                        sequence, kept, pictures = self._encode(plan.split, name, refused)
+                        sequence, usable, pictures = self._encode(plan.split, name, refused)
                     except DataError as error:
                         self._refuse(error, refused)
                         continue
-                    writer.write_table(to_row(sequence, kept, pictures))
+                    writer.write_table(to_row(sequence, usable, pictures))
                     sequences.append(name)
-                    frames += len(kept)
+                    frames += len(usable)
                 writer.finalize()
             with unfinished.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -118,17 +118,17 @@ class ShardWriter:
     ) -> tuple[PosedSequence, list[int], list[EncodedPicture]]:
         with at(sequence=name):
             sequence = self.sources[split].read(name)
-            kept, pictures = [], []
+            usable, pictures = [], []
             for index, number in enumerate(sequence.frames):
                 try:
                     with at(sequence=name, frame=number):
                         pictures.append(encode_picture(sequence, index, self.codec))
-                    kept.append(index)
+                    usable.append(index)
                 except DataError as error:
                     self._refuse(error, refused)
-            if len(kept) < FEWEST_FRAMES:
-                raise TooFewFrames(f"{len(kept)} usable frames of {len(sequence.frames)}, {FEWEST_FRAMES} are needed")
-            return sequence, kept, pictures
+            if len(usable) < FEWEST_FRAMES:
+                raise TooFewFrames(f"{len(usable)} usable frames of {len(sequence.frames)}, {FEWEST_FRAMES} are needed")
+            return sequence, usable, pictures
 
     def _refuse(self, error: DataError, refused: list[Refusal]) -> None:
         if self.on_bad == "raise":
@@ -136,10 +136,7 @@ class ShardWriter:
         refused.append(Refusal.of(error))
 
     def kept_record(self, plan: ShardPlan) -> ShardRecord | None:
-        """The record of a shard that an earlier run has made as it should be, or None.
-
-        A shard from which something is missing does not count where bad input is to be raised.
-        """
+        """Return the record of a shard that an earlier run wrote (without errors, if `on_bad` is "raise"), or None."""
         path = self.folder / plan.file
         try:
             record: ShardRecord = parsed(ShardRecord, read_json(_record_path(path)))
@@ -150,7 +147,7 @@ class ShardWriter:
         return record if whole and record.names == plan.names and not refused else None
 
     def plans(self, sequences_per_shard: int) -> list[ShardPlan]:
-        """Which sequences go into which shard; those of one group of a source stay together as far as they fit."""
+        """Assign sequences to shards; a group of a source stays in one shard if it fits."""
         plans = []
         for split, source in self.sources.items():
             parts = _parts(source, sequences_per_shard)
@@ -167,7 +164,7 @@ def _parts(source: SequenceSource, most: int) -> list[tuple[str, ...]]:
     parts: list[tuple[str, ...]] = []
     for group in source.groups(source.names):
         names = [source.names[index] for index in group]
-        # A group that does not fit into one shard is cut into nearly equal parts.
+        # A group that exceeds a shard is divided into nearly equal parts.
         count = -(-len(names) // most)
         edges = [round(len(names) * number / count) for number in range(count + 1)] if count else []
         for start, end in pairwise(edges):
@@ -180,12 +177,12 @@ def _parts(source: SequenceSource, most: int) -> list[tuple[str, ...]]:
 
 
 def _check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
-    """Say how large the shards are going to be, from a few sequences; `DataError` if the disk has less space."""
+    """Estimate the shards' size from a few sequences, and check that the disk has enough space."""
     names = [(plan.split, name) for plan in plans for name in plan.names]
     frames, sizes = [], []
     for place in spread_places(len(names), SEQUENCES):
         split, name = names[place]
-        # What is bad is refused and counted when the shards are made.
+        # Sequences with errors are refused and counted when the shards are written.
         try:
             sequence = writer.sources[split].read(name)
             for index in spread_places(len(sequence.frames), FRAMES):
@@ -205,10 +202,10 @@ def _check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
 
 
 def require_space(size: int, contents: str, folder: Path, advice: str = "") -> None:
-    """Say how many bytes are going to be written for `contents`.
+    """Log how many bytes will be written for `contents`.
 
     Raises:
-        DataError: the disk has less space than that; `advice` says how to need less.
+        DataError: the disk has less space; `advice` says how to reduce the size.
     """
     free = shutil.disk_usage(folder).free
     needed = f"about {decimal(size)} for {contents}; {decimal(free)} are free"
@@ -228,18 +225,18 @@ def prepare(
     max_bad_fraction: float = 0.1,
     progress: bool = True,
 ) -> Path:
-    """Write sequences into a packed store. The same input gives the same bytes, whatever the number of workers.
+    """Write sequences into a packed store. Its bytes depend on the input only, not on the number of workers.
 
-    An interrupted run continues when it is started again; a complete store of the same data is left as it is. A shard
-    that is missing or of another size is made again. `workers` are processes, by default one for each core.
+    A run that is started again keeps a complete store, or only writes shards that are missing or of another size.
 
     Args:
-        codec: of the images, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are without loss, "jpeg" is not.
-        sequences_per_shard: some hundred MB at 128 x 128 pixels and 200 frames.
-        on_bad: leave out (and record) frames and sequences that cannot be read, up to a share of each; or raise.
+        codec: image codec, a key of `CODECS`: "bmp" (fastest) and "png" (smaller) are lossless, "jpeg" is not.
+        sequences_per_shard: the default gives a few hundred MB at 128 x 128 pixels and 200 frames.
+        workers: processes; None: one for each core.
+        on_bad: "skip" and record unreadable frames and sequences, up to `max_bad_fraction` of each; or "raise".
 
     Raises:
-        DataError: the folder holds something else, too little space, too much or (on_bad="raise") anything bad.
+        DataError: the folder holds something else, there is too little space, or too much is unreadable.
     """
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
@@ -251,7 +248,7 @@ def prepare(
     if is_packed(out) and not missing:
         logger.info("%s already holds these sequences", out)
         return out
-    # What the manifest says may no longer be so until it is written again.
+    # The old manifest may be wrong until it is written again.
     for path in (out / MANIFEST, *out.glob(f"*{UNFINISHED}")):
         path.unlink(missing_ok=True)
     listed = [error for source in writer.sources.values() for error in source.refused]
@@ -270,7 +267,7 @@ def prepare(
 
 
 def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[ShardPlan]) -> dict[str, Any]:
-    """All that the shards' bytes depend on."""
+    """Return everything that determines the shards' bytes."""
     shards = json.dumps([[plan.file, *plan.names] for plan in plans])
     return {
         "settings": dict(settings),
@@ -290,20 +287,20 @@ def _claim(out: Path, plan: dict[str, Any]) -> None:
         if is_packed(out) or any(out.glob("*.arrow")):
             raise DataError("already holds other prepared sequences: choose another folder", str(out))
         write_json(path, plan)
-    found = read_json(path)
+    existing = read_json(path)
     for part, wanted in plan.items():
-        differing = differences(field(found, part, dict), wanted)
+        differing = differences(field(existing, part, dict), wanted)
         if differing:
             raise DataError(f"was made with {differing}: choose another folder, or remove this one", str(out))
 
 
 def _split(name: str, source: SequenceSource, made: Iterable[ShardRecord | None]) -> Split:
     records = [record for record in made if record is not None and record.split == name]
-    there = {name for record in records for name in record.shard.sequences}
+    stored = {name for record in records for name in record.shard.sequences}
     return Split(
         source.fingerprint(),
         source.listed,
-        tuple(name for name in source.names if name in there),
+        tuple(name for name in source.names if name in stored),
         tuple(record.shard for record in records),
         (*map(Refusal.of, source.refused), *(refusal for record in records for refusal in record.refused)),
         {reason: len(names) for reason, names in source.left_out.items()},
@@ -311,22 +308,22 @@ def _split(name: str, source: SequenceSource, made: Iterable[ShardRecord | None]
 
 
 def _finish(manifest: PackedManifest, out: Path, max_bad_fraction: float) -> None:
-    """Refuse a store with too little in it, else write the manifest and say what is in it."""
+    """Refuse a store with too many errors or no sequences; else write the manifest and log a summary."""
     refused = [refusal for split in manifest.splits.values() for refusal in split.refused]
     shards = [shard for split in manifest.splits.values() for shard in split.shards]
-    kept, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)
+    sequences, frames = sum(len(shard.sequences) for shard in shards), sum(shard.frames for shard in shards)
     counts = Counter(refusal.kind for refusal in refused)
     kinds = ", ".join(f"{count:,} x {kind}" for kind, count in counts.most_common()) or "nothing"
-    if not kept:
+    if not sequences:
         raise DataError(f"not one sequence can be used: {kinds}", str(out))
     bad_frames = sum(refusal.frame is not None for refusal in refused)
     bad_sequences = len({refusal.sequence or refusal.file for refusal in refused if refusal.frame is None})
-    share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + kept))
+    share = max(bad_frames / (bad_frames + frames), bad_sequences / (bad_sequences + sequences))
     if share > max_bad_fraction:
         remedy = "put the data right (then remove this folder) or raise data.max_bad_fraction"
         bad = f"{share:.1%} of the data are bad, at most {max_bad_fraction:.1%} may be ({kinds})"
         raise DataError(f"{bad}: see the .json beside the shards, and {remedy}", str(out))
     write_json(out / MANIFEST, manifest, HEADER)
     size = decimal(sum(shard.bytes for shard in shards))
-    held = f"{frames:,} frames of {kept:,} sequences, {size} in {len(shards):,} shards"
+    held = f"{frames:,} frames of {sequences:,} sequences, {size} in {len(shards):,} shards"
     logger.info("%s: %s; refused: %s", out, held, kinds)

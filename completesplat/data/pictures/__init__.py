@@ -1,1 +1,1 @@
-"""Pictures on their way from files to square tensors: reading, orientation, cropping, what of them is hidden."""
+"""Conversion of image files to square tensors: reading, orientation, cropping and hidden regions."""

@@ -1,4 +1,4 @@
-"""Pictures on their way from files to square tensors: the principal-point crop, resizing."""
+"""Crop around the principal point, and resizing."""
 
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -14,7 +14,7 @@ from completesplat.data.validation import BadCamera
 
 
 class Square(NamedTuple):
-    """A square part of an image, in pixels, with fractions."""
+    """Square part of an image, in pixels with fractions."""
 
     left: float
     top: float
@@ -22,9 +22,9 @@ class Square(NamedTuple):
 
 
 def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -> Square:
-    """Largest square centred on the principal point (x, y) within an image of (height, width).
+    """Return the largest square centred on the principal point (x, y) in an image of (height, width).
 
-    Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`). `BadCamera` if the point is not inside.
+    This is Splatter Image's crop (`co3d_normalisation.py`, `get_max_box_side`). The point must lie inside the image.
     """
     (x, y), (height, width) = center, image_size
     half = min(x, y, width - x, height - y)
@@ -36,15 +36,15 @@ def principal_square(center: tuple[float, float], image_size: tuple[int, int]) -
 def read_square(
     path: Path, image_size: tuple[int, int], square: Square, size: int, mode: Literal["RGB", "L"]
 ) -> UInt8[Tensor, "channel size size"]:
-    """A square part of an image file, resized to `size`; see `decode` and `cut_square`."""
+    """Read a square part of an image file, resized to `size`; see `decode` and `cut_square`."""
     return cut_square(decode(path, str(path), mode, image_size), square, size)
 
 
 def cut_square(image: Image.Image, square: Square, size: int) -> UInt8[Tensor, "channel size size"]:
-    """A square part of a picture, resized to `size`: colours with Lanczos' filter, greys (masks) bilinearly."""
+    """Resize a square part of an image to `size`, with a Lanczos filter for colour and bilinearly for grey (masks)."""
     box = (square.left, square.top, square.left + square.side, square.top + square.side)
     resampling = Image.Resampling.LANCZOS if image.mode == "RGB" else Image.Resampling.BILINEAR
-    # Rounding may put a full-size box a hair outside, which Pillow refuses.
+    # Rounding may put a full-size box slightly outside of the image, which Pillow refuses.
     box = tuple(np.clip(box, 0, [image.width, image.height] * 2).tolist())
     pixels = np.asarray(image.resize((size, size), resampling, box=box))
     return torch.from_numpy(pixels.reshape(size, size, -1).transpose(2, 0, 1).copy())

@@ -1,4 +1,4 @@
-"""What the EXIF record of a photograph says: which way is up, and the field of view."""
+"""Orientation and field of view from the EXIF record of a photo."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from typing import Any
 from PIL import ExifTags, Image
 
 ORIENTATION = ExifTags.Base.Orientation
-# How the stored picture becomes upright (EXIF 2.32, tag 0x0112; 1 is upright already).
+# Transposition that makes the stored image upright (EXIF 2.32, tag 0x0112; 1 is already upright).
 TRANSPOSITIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -24,12 +24,12 @@ MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUni
 
 
 def read_exif(picture: Image.Image) -> dict[int, Any]:
-    """All EXIF tags of a picture that is decoded and still open, as far as the record is readable.
+    """Return all readable EXIF tags of an image that is decoded and still open.
 
-    Pillow turns a TIFF upright when it decodes it, and takes the orientation out of its record.
+    When Pillow decodes a TIFF, it turns it upright and removes the orientation from its record.
     """
     tags: dict[int, Any] = {}
-    with suppress(Exception):  # Pillow's parser raises nearly anything on a damaged record.
+    with suppress(Exception):  # Pillow's parser raises almost any exception on a damaged record.
         exif = picture.getexif()
         tags.update(exif)
         tags.update(exif.get_ifd(ExifTags.IFD.Exif))
@@ -37,12 +37,12 @@ def read_exif(picture: Image.Image) -> dict[int, Any]:
 
 
 def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:
-    """Field of view in degrees of the largest centred square, or None if the record does not tell.
+    """Return the field of view in degrees of the largest centred square, or None if it is not recorded.
 
-    The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the picture stands
-    for the 36 mm of a full frame), else FocalLength * FocalPlaneXResolution, brought from the recorded pixel size
-    to the actual one. Then fov = 2 atan(shorter side / (2 focal)). A picture that was cut or stitched after it was
-    taken has another field of view than its record says.
+    The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the image corresponds
+    to the 36 mm of a full frame), else FocalLength * FocalPlaneXResolution, scaled from the recorded to the actual
+    image size. Then fov = 2 atan(shorter side / (2 focal)). The result is wrong for an image that was cropped or
+    stitched after it was taken.
     """
     equivalent = _positive(exif.get(ExifTags.Base.FocalLengthIn35mmFilm))
     focal = equivalent / FULL_FRAME_WIDTH * max(size) if equivalent else _focal_from_sensor(exif, max(size))
@@ -64,7 +64,7 @@ def _focal_from_sensor(exif: Mapping[int, Any], longer_side: int) -> float | Non
 
 
 def _positive(value: Any) -> float | None:
-    """A finite number above 0, or None for anything else (0 stands for "unknown", 0/0 occurs)."""
+    """Return a finite number above 0, or None for anything else (0 means "unknown", and 0/0 occurs)."""
     if not isinstance(value, Real):
         return None
     try:

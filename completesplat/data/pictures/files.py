@@ -1,4 +1,4 @@
-"""Image files that nobody has looked at: complete, upright and 8 bits deep, or refused."""
+"""Strict reader of untrusted image files: the result is complete, upright and has 8 bits, or the file is refused."""
 
 import io
 import warnings
@@ -26,29 +26,29 @@ TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
 QUARTER_TURNS = (5, 6, 7, 8)
 TRANSPARENT = "has transparent pixels; lay it over a background first"
 SMALLEST_NORMAL = 2.0**-14  # of float16
-LARGEST_SCALE = 2.0**112  # times the largest float16 it is still a float32
+LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 
 
 def decode(
     source: Path | bytes, file: str, mode: Literal["RGB", "L"], image_size: tuple[int, int] | None = None
 ) -> Image.Image:
-    """One picture of a data set, of 8 bits, turned upright as its EXIF orientation says.
+    """Decode one image of a data set to 8 bits, and turn it upright by its EXIF orientation.
 
-    Grey of 16 bits is scaled to 8. Pixels that are not opaque are refused: what lies behind them is for the maker of
-    the data set to decide, and metrics depend on it. So is colour where `mode` is "L" (a mask): its brightness would
-    be no probability. Colour profiles are ignored, as the loaders behind all published numbers on these data sets do.
-    Of an MPO (a JPEG with previews behind it) the first picture is taken; other files of several frames are refused.
-    PNG has checksums, which are checked; flipped bits in a JPEG go unnoticed.
+    Grey of 16 bits is scaled to 8. Transparent pixels are refused, because metrics depend on the background, which only
+    the data set's maker can choose. Colour is refused for `mode` "L" (a mask), because its brightness is no
+    probability. Colour profiles are ignored, as by the loaders behind all published numbers on these data sets. Of an
+    MPO (a JPEG followed by previews) the first image is used; other files with several frames are refused. PNG's
+    checksums are checked; flipped bits in a JPEG remain unnoticed.
 
     Args:
         source: the file, or its content.
-        file: what refusals name.
-        image_size: (height, width) that the upright picture must have, if that is known.
+        file: name for error messages.
+        image_size: (height, width) that the upright image must have, if known.
 
     Raises:
-        MissingFile: no such file.
-        BadPicture: too large, damaged, in another format than JPEG, PNG, WebP, TIFF and BMP, of another size than
-            annotated, or with pixels that have no plain meaning in this mode.
+        MissingFile: the file does not exist.
+        BadPicture: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
+            has pixels whose meaning in this mode is unclear.
     """
     with _loaded(source, file, FORMATS) as (picture, exif):
         orientation = exif.get(ORIENTATION)
@@ -59,20 +59,20 @@ def decode(
 
 
 def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
-    """(height, width) of an image file or its content, from its header; errors as of `decode`."""
+    """Return (height, width) of an image file or its content, from its header; errors as in `decode`."""
     with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
         return image.height, image.width
 
 
 def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
-    """A depth map of CO3D: 16-bit grey PNG whose bits are float16, times the frame's `scale_adjustment`.
+    """Read a depth map of CO3D, a 16-bit grey PNG whose bits are float16, and multiply it by `scale_adjustment`.
 
-    0 stands for "unknown", also where the file is not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
+    0 means "unknown", and replaces values that are not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
 
     Raises:
-        MissingFile: no such file.
-        BadPicture: no readable 16-bit PNG, a factor that is not positive and finite, negative depths, no finite depth
-            at all, or nothing but subnormal numbers, which is what integer depths below 1024 look like.
+        MissingFile: the file does not exist.
+        BadPicture: it is no readable 16-bit PNG, the factor is not positive and finite, depths are negative, none is
+            finite, or all are subnormal, as integer depths below 1024 would be.
     """
     if not 0 < scale_adjustment < LARGEST_SCALE:
         raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
@@ -93,7 +93,7 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
 
 @contextmanager
 def refused_as_bad(file: str) -> Iterator[None]:
-    """An `ImageError` from within becomes a `BadPicture` that names the file."""
+    """Convert an ImageError raised within the context to a BadPicture that names the file."""
     try:
         yield
     except ImageError as error:
@@ -102,12 +102,12 @@ def refused_as_bad(file: str) -> Iterator[None]:
 
 @contextmanager
 def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
-    """A picture whose header is read and pixels are not; whatever Pillow raises on it becomes an `ImageError`.
+    """Open an image and read its header, but not its pixels; convert Pillow's exceptions within the context.
 
     Raises:
-        ImageError: damaged, of another format, or of more than 50 million pixels.
+        ImageError: the image is damaged, has another format, or has more than 50 million pixels.
     """
-    # Pillow only warns of images between 89 and 179 million pixels; the limit here is lower and an error.
+    # Pillow only warns about images between 89 and 179 million pixels; the limit here is lower and an error.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -122,61 +122,61 @@ def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Ima
             raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
         except Image.DecompressionBombError:
             raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
-        # The decoders of damaged files raise nearly anything: OSError, SyntaxError, struct.error, KeyError, ...
+        # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ImageError(f"cannot be decoded: {reason}") from error
 
 
 def check_sums(picture: Image.Image, source: str | Path | io.BytesIO) -> None:
-    """Check all checksums of a PNG, from its file; decoding leaves out those of the pixels."""
+    """Check all checksums of a PNG file, because decoding ignores those of the pixels."""
     if picture.format == "PNG":
         with Image.open(source, formats=("PNG",)) as again:
             again.verify()
 
 
 def over_white(picture: Image.Image) -> Image.Image:
-    """The picture in RGB, with its transparency laid over white."""
+    """Composite an image over white and return it in RGB."""
     return over_grey(picture, 1.0)
 
 
 def over_grey(picture: Image.Image, value: float) -> Image.Image:
-    """The same over a grey value from 0 to 1."""
+    """Composite an image over a grey value from 0 to 1 and return it in RGB."""
     grey = Image.new("RGBA", picture.size, (round(255 * value),) * 3)
     return Image.alpha_composite(grey, picture.convert("RGBA")).convert("RGB")
 
 
 def upright(picture: Image.Image, orientation: object) -> Image.Image:
-    """The picture turned and mirrored as EXIF's orientation says; values without a meaning change nothing."""
+    """Turn and mirror an image by its EXIF orientation; undefined values change nothing."""
     transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
     return picture if transposition is None else picture.transpose(transposition)
 
 
 def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
-    """Grey values of more than 8 bits as float32 in [0, 1]. Pillow's own conversion would clip them at 255.
+    """Convert grey values of more than 8 bits to float32 in [0, 1]. Pillow's own conversion would clip them at 255.
 
-    The TIFF tags are those of the opened file, as pictures derived from it have none; empty for other formats.
+    The TIFF tags come from the opened file, because images derived from it have none; they are empty for other formats.
 
     Raises:
-        ImageError: values outside the range from black to white.
+        ImageError: values lie outside the range from black to white.
     """
     bits = tiff_tags.get(TIFF_BITS, (16,))
     values = np.asarray(picture).astype(np.float64)
     if picture.mode != "F":
-        # Pillow gives 12-bit TIFF values as they are; everything else of these modes uses 16 bits.
+        # Pillow does not scale 12-bit TIFF values; all other images of these modes use 16 bits.
         values = values / (4095 if bits == (12,) else 65535)
-    # False for NaN too.
+    # The comparison is false for NaN too.
     if not ((values >= 0) & (values <= 1)).all():
         raise ImageError(f"grey values of mode {picture.mode} outside the range from black to white, or not finite")
     if tiff_tags.get(TIFF_PHOTOMETRIC) == 0:
-        values = 1 - values  # "white is zero", which Pillow undoes for 8 bits only
+        values = 1 - values  # "white is zero", which Pillow inverts for 8 bits only
     if isinstance(picture.info.get("transparency"), int):
         values[np.asarray(picture) == picture.info["transparency"]] = 1
     return values.astype(np.float32)
 
 
 def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
-    """Write a picture in the format of its path's suffix; `OSError` on a full disk, where Pillow cuts a JPEG short."""
+    """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
     content = io.BytesIO()
     image.save(content, Image.registered_extensions()[path.suffix], **options)
     path.write_bytes(content.getvalue())
@@ -184,7 +184,7 @@ def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
 
 @contextmanager
 def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
-    """A picture, decoded completely, and its EXIF record; what is wrong with it becomes a `BadPicture`."""
+    """Decode an image completely and yield it with its EXIF record; convert its errors to BadPicture."""
     with refused_as_bad(file):
         if ImageFile.LOAD_TRUNCATED_IMAGES:
             raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
@@ -202,7 +202,7 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
 
 
 def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
-    """Refuse a picture that has not the (height, width) it should have, with `ImageError`."""
+    """Refuse an image whose (height, width) differs from its annotation."""
     if image.size != annotated[::-1]:
         actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
         if orientation in QUARTER_TURNS and image.size == annotated:

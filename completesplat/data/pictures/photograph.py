@@ -1,6 +1,6 @@
-"""Any photograph as the square image that a model takes, with its field of view, and what of it is hidden.
+"""Conversion of any photo to a model's square input image, with its field of view.
 
-Also what tells pictures of one kind from those of another, and the object cut out of its background.
+Also masks of hidden regions, statistics that characterize a set of images, and removal of the background.
 """
 
 import io
@@ -34,14 +34,14 @@ from completesplat.tensors import TensorDataclass
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
 SMALLEST_SIDE = 8
 DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
-LARGEST_OBJECT = 4096  # pixels; a larger one is reduced before its square is made, which could be of any size
-LANCZOS_REACH = 3  # of the filter, in pixels of the coarser picture
-CUTTER = "u2net"  # rembg's own default is a network under a licence for non-commercial use
+LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
+LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
+CUTTER = "u2net"  # rembg's default network has a licence for non-commercial use only
 
 
 @dataclass(frozen=True)
 class Photograph(TensorDataclass):
-    """A square image (sRGB, 0 to 1) with the field of view across one of its sides, and where that came from."""
+    """Square image (sRGB, 0 to 1) with the field of view across a side, and the source of the field of view."""
 
     image: Float[Tensor, "3 size size"]
     fov_degrees: float
@@ -60,25 +60,25 @@ def read_photograph(
     background: float = 1.0,
     object_share: float | None = None,
 ) -> Photograph:
-    """Turn a picture upright, cut the largest square from its centre and resize that (Lanczos, antialiased).
+    """Turn an image upright, crop the largest central square and resize it (Lanczos, antialiased).
 
-    Transparency is laid over the background; of an animation the first frame is taken; an embedded colour profile is
-    converted to sRGB. Grey images of 16 bits are scaled to [0, 1], grey images of floats must lie in it.
+    Transparency is composited over the background. An animation yields its first frame. An embedded colour profile is
+    converted to sRGB. Grey images of 16 bits are scaled to [0, 1]; grey images of floats must lie in [0, 1].
 
     Args:
-        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, known by its content; a PIL image; an
-            array [height, width, 3] of bytes, or of floats in [0, 1]; a tensor [3, height, width] of the same.
+        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
+            an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
         fov_degrees: field of view of the square crop, if it is known.
-        default_fov_degrees: the same for pictures without usable EXIF focal length (50 is close to a phone's camera).
-        remove_background: cut the object out, see `without_background`: of the square, or for `object_share` of it all.
-        background: grey value from 0 to 1 that lies behind what is transparent or removed, white by default.
-        object_share: of pictures with an object in front of nothing but transparency, also where the background was
-            removed, the square around the object is taken of whose side it fills this share; None: the central square.
+        default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
+        remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
+        background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
+        object_share: for an image with a transparent or removed background, crop the square around the object such that
+            the object's longer side fills this share of it; None: crop the central square.
 
     Raises:
-        ImageError: no such file, not a complete image of one of these formats, more than 50 million pixels (checked
-            before decoding), less than 8 pixels on a side, or pixel values without one plain meaning.
-        CompleteSplatError: a field of view outside (0, 180) degrees, or what `without_background` raises.
+        ImageError: the file is missing or not a complete image of one of these formats, has more than 50 million pixels
+            (checked before decoding) or less than 8 pixels on a side, or its pixel values are ambiguous.
+        CompleteSplatError: the field of view is outside (0, 180) degrees, or errors of `without_background`.
     """
     for fov in (fov_degrees, default_fov_degrees):
         if fov is not None and not 0 < fov < 180:
@@ -98,7 +98,7 @@ def read_photograph(
 def _square(
     picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
-    """The central square, or the object's, resized; the central one's field of view in degrees where EXIF tells it."""
+    """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     if isinstance(picture, (np.ndarray, Tensor)):
         picture = _pixels(picture)
         if isinstance(picture, np.ndarray):
@@ -130,7 +130,7 @@ def _cut_out(picture: Image.Image, background: float) -> Image.Image:
 
 
 def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
-    """The square around what is not transparent, which may reach beyond the picture; None: all of it is opaque."""
+    """Crop the square around the opaque part, which may extend beyond the image; None if all pixels are opaque."""
     if picture.mode not in EIGHT_BIT_MODES or not picture.has_transparency_data:
         return None
     cut_out = picture.convert("RGBA")
@@ -153,14 +153,14 @@ def _check_side(width: int, height: int) -> None:
 
 
 def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
-    """Left, upper, right and lower edge."""
+    """Return left, upper, right and lower edge."""
     side = min(width, height)
     left, top = (width - side) // 2, (height - side) // 2
     return left, top, left + side, top + side
 
 
 def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
-    """Bytes as an image, floats as they are, of an array with the channel last, or of a tensor with it first."""
+    """Convert an array (channel last) or tensor (channel first): bytes to an image, floats to a float32 array."""
     channel = 0 if isinstance(picture, Tensor) else -1
     if picture.ndim != 3 or picture.shape[channel] != 3:
         raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
@@ -187,17 +187,17 @@ def _resized(pixels: Float[np.ndarray, "height width 3"], size: int) -> Float[Te
 
 def _check_file(path: Path) -> None:
     try:
-        found = path.is_file()
-    except OSError as error:  # a name that is too long, say
+        exists = path.is_file()
+    except OSError as error:  # such as a name that is too long
         raise ImageError(str(error.strerror)) from error
-    if not found:
+    if not exists:
         raise ImageError("no such file")
     if path.stat().st_size == 0:
         raise ImageError("the file is empty")
 
 
 def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
-    """Pixels as sRGB in [0, 1]; `source` is the opened file, which alone knows its TIFF tags."""
+    """Convert pixels to sRGB in [0, 1]; `source` is the opened file, because only it has TIFF tags."""
     if square.mode in DEEP_GREY_MODES:
         grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
         resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
@@ -209,12 +209,12 @@ def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: 
 
 
 def _to_srgb(square: Image.Image, background: float) -> Image.Image:
-    """An RGB image, transparency laid over the background, converted from its own colour profile where it has one."""
+    """Composite an image over the background, and convert it from its embedded colour profile, if any, to RGB."""
     profile = square.info.get("icc_profile")
     if square.has_transparency_data:
         square = over_grey(square, background)
     if profile:
-        # A damaged profile, or one of another colour model than the pixels, is ignored, as viewers do.
+        # Like image viewers, ignore a damaged profile, or one whose colour model differs from the pixels'.
         with suppress(ImageCms.PyCMSError, OSError):
             embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
             native = square if square.mode in ("L", "RGB", "CMYK") else square.convert("RGB")
@@ -224,21 +224,21 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
 
 
 def without_background(picture: Image.Image) -> Image.Image:
-    """An RGB picture as RGBA, transparent where a network sees background: U2-Net (Qin et al. 2020), by rembg.
+    """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg.
 
     Raises:
-        CompleteSplatError: rembg is not installed, or fails: it downloads the network (176 MB) on first use.
-        ImageError: nothing is left of the picture.
+        CompleteSplatError: rembg is not installed, or fails; on first use it downloads the network (176 MB).
+        ImageError: the whole image is background.
     """
     try:
         import rembg
-    except (ImportError, SystemExit) as error:  # it exits where it has no onnxruntime
+    except (ImportError, SystemExit) as error:  # rembg exits if onnxruntime is missing
         advice = 'pip install "completesplat[background]"'
         raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
-    pixels = Image.fromarray(np.array(picture))  # without EXIF, by which rembg would turn it a second time
+    pixels = Image.fromarray(np.array(picture))  # without EXIF, because rembg would turn the image again
     try:
         cut: Image.Image = rembg.remove(pixels, session=_session())
-    except Exception as error:  # of its HTTP library, of onnxruntime and of the file system
+    except Exception as error:  # from the HTTP library, onnxruntime or the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
     if not cut.getchannel("A").getbbox():
@@ -254,9 +254,9 @@ def _session() -> Any:
 
 
 def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
-    """What tells pictures of one kind from others: mean and deviation of red, green and blue, and how fine they are.
+    """Return mean and standard deviation of red, green and blue, and two measures of detail; all lie in [0, 1].
 
-    The last two are the mean differences between neighbours in a row, and in a column. All lie in [0, 1].
+    The measures of detail are the mean absolute differences between neighbours in a row, and in a column.
     """
     means, deviations = images.mean((-2, -1)), images.std((-2, -1), correction=0)
     steps = [images.diff(dim=axis).abs().mean((-3, -2, -1))[..., None] for axis in (-1, -2)]
@@ -264,13 +264,13 @@ def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Te
 
 
 def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
-    """1 where a photograph's square is visible, 0 where a box hides it; see `visible`.
+    """Return 1 where the square of a photo is visible, 0 where a box hides it; see `visible`.
 
     Args:
-        box: left, upper, right and lower edge, in shares (0 to 1) of the photograph's central square.
+        box: left, upper, right and lower edge, as fractions (0 to 1) of the photo's central square.
 
     Raises:
-        CompleteSplatError: not four numbers, or no box of positive size within the square.
+        CompleteSplatError: the box is not four numbers, or not of positive size within the square.
     """
     if len(box) != 4:
         raise CompleteSplatError(f"box={list(box)}: give [x0,y0,x1,y1]")
@@ -284,10 +284,7 @@ def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[T
 
 
 def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
-    """The same for a mask, a picture that is white where the photograph is hidden, cropped as it is.
-
-    `ImageError` if it is not a readable picture, `CompleteSplatError` if it is white nowhere.
-    """
+    """Return the same for a mask image, which is white where the photo is hidden, and is cropped like the photo."""
     hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
     if not hidden.any():
         raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")
@@ -295,15 +292,15 @@ def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1
 
 
 def square_side(photograph: Path) -> int:
-    """Side in pixels of the largest square of a readable picture."""
+    """Return the side in pixels of the largest square of a readable image."""
     with Image.open(photograph) as picture:
         return min(picture.size)
 
 
 def visible(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "1 size size"]:
-    """1 in those of size x size pixels to which no hidden pixel contributes when the picture is resized, else 0.
+    """Return 1 for those of size x size pixels to which no hidden pixel contributes in resizing, else 0.
 
-    Resizing blurs: what is hidden grows by three pixels of the result, so that nothing of it is left at its border.
+    Resizing blurs by three pixels of the result, so the hidden region grows by as much, and leaves no traces outside.
     """
     for _ in range(2):
         hidden = _touched(hidden, size).T
@@ -312,7 +309,7 @@ def visible(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "
 
 def _touched(hidden: Bool[np.ndarray, "side _"], size: int) -> Bool[np.ndarray, "size _"]:
     side = len(hidden)
-    if side == size:  # the picture is not resized
+    if side == size:  # the image is not resized
         return hidden
     scale = side / size
     centers = (np.arange(size) + 0.5) * scale

@@ -1,1 +1,1 @@
-"""RealEstate10K (Zhou et al., SIGGRAPH 2018), as texts with frames and in pixelSplat's chunks."""
+"""RealEstate10K (Zhou et al., SIGGRAPH 2018), as text files with frames or as pixelSplat's chunks."""

@@ -1,7 +1,7 @@
-"""RealEstate10K in pixelSplat's chunks: `<split>/NNNNNN.torch` and `<split>/index.json` with each clip's file.
+"""RealEstate10K in pixelSplat's chunks: `<split>/NNNNNN.torch`, and `<split>/index.json` with each clip's file.
 
-A chunk is a list of clips as dictionaries: key, url, timestamps int64 [view], cameras float32 [view 18], images (a list
-of JPEG files as uint8 tensors) (`real_estate_10k_tools`, `src/convert.py`). Chunks are read without running code.
+A chunk is a list of clips as dictionaries with key, url, timestamps int64 [view], cameras float32 [view 18] and images,
+a list of JPEG files as uint8 tensors (`real_estate_10k_tools`, `src/convert.py`). Reading a chunk runs no code from it.
 """
 
 import hashlib
@@ -29,12 +29,12 @@ Chunk = dict[str, dict[str, Any]]
 
 
 class ChunkedClips:
-    """The clips of one folder whose chunk is there; at most two chunks (of about 100 MB) are in memory.
+    """Clips of one folder whose chunks exist; at most two chunks (about 100 MB each) are in memory.
 
     Attributes:
         keys: names of the clips, in the order of their files.
-        missing: the clips of chunks that are not there.
-        refused: entries of the index that lead elsewhere.
+        missing: names of the clips whose chunk is missing.
+        refused: errors of index entries that lead outside of the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,23 +47,23 @@ class ChunkedClips:
         for key, name in index.items():
             with refused_to(self.refused.append), at(path, key):
                 paths[key] = inside(folder, name)
-        # `Path.is_file` raises where a name is too long.
-        there = {path for path in set(paths.values()) if isfile(path)}
+        # `Path.is_file` raises if a name is too long.
+        existing = {path for path in set(paths.values()) if isfile(path)}
         self.folder = folder
-        self._files = {key: path for key, path in paths.items() if path in there}
+        self._files = {key: path for key, path in paths.items() if path in existing}
         self.keys = sorted(self._files, key=lambda key: (self._files[key], key))
         self.missing = sorted(paths.keys() - self._files.keys())
         self._loaded: dict[Path, Chunk] = {}
 
     def chunks(self, keys: Sequence[str]) -> list[list[int]]:
-        """Numbers of the clips that lie in one file, for all files."""
+        """Group the indices of `keys` by chunk."""
         members: dict[Path, list[int]] = {}
         for number, key in enumerate(keys):
             members.setdefault(self._files[key], []).append(number)
         return list(members.values())
 
     def clip(self, key: str) -> Clip:
-        """A clip, from the chunk in memory or on disk; `DataError` where that is unreadable or the clip malformed."""
+        """Return a clip from its chunk, which is read unless it is in memory; refuse an unreadable chunk or clip."""
         path = self._files[key]
         with at(path, key):
             chunk = self._chunk(path)
@@ -72,26 +72,26 @@ class ChunkedClips:
             return _clip_from_entry(path, key, chunk[key])
 
     def fingerprint(self) -> str:
-        """SHA-256 of the index and of the chunks' sizes."""
+        """Return the SHA-256 of the index and of the chunks' sizes."""
         sizes = sorted((path.name, path.stat().st_size) for path in set(self._files.values()))
         index = {key: path.name for key, path in sorted(self._files.items())}
         return hashlib.sha256(json.dumps([index, sizes]).encode()).hexdigest()
 
     def _chunk(self, path: Path) -> Chunk:
         if path not in self._loaded and len(self._loaded) >= CHUNKS_IN_MEMORY:
-            # The least recently used one goes before the next one comes, so that there are never three.
+            # Delete the least recently used chunk before reading the next one, so that there are never three.
             del self._loaded[next(iter(self._loaded))]
         self._loaded[path] = self._loaded.pop(path) if path in self._loaded else read_chunk(path)
         return self._loaded[path]
 
 
 def read_chunk(path: Path) -> Chunk:
-    """The clips of a file by key, as they are stored.
+    """Read the clips of a chunk by key, as they are stored.
 
     Raises:
-        MissingFile: no such file.
-        UnreadableFile: no chunk, one that is damaged or would run code, or one that is larger than its file.
-        BadAnnotation: not a list of clips, or clips with the same key.
+        MissingFile: the file does not exist.
+        UnreadableFile: the file is no chunk, is damaged, would run code, or unpacks to more than its own size.
+        BadAnnotation: the content is not a list of clips, or clips have the same key.
     """
     require_file(path)
     try:
@@ -127,7 +127,7 @@ def _is_bytes(image: Any) -> bool:
 
 
 def _is_plain(value: Any) -> TypeGuard[Tensor]:
-    """A tensor with numbers in memory, which is not part of a graph."""
+    """Return whether a value is a dense CPU tensor that is not part of an autograd graph."""
     strided = isinstance(value, Tensor) and value.layout == torch.strided
     return strided and value.device.type == "cpu" and not value.requires_grad
 

@@ -1,4 +1,4 @@
-"""One clip of RealEstate10K, whichever form it is stored in; clips as texts beside frames."""
+"""Clips of RealEstate10K in any form, and clips stored as text files beside folders of frames."""
 
 import hashlib
 import json
@@ -30,18 +30,18 @@ from completesplat.geometry.cameras import Cameras
 CAMERA_NUMBERS = 18
 FORMATS = ("JPEG", "PNG")
 PICTURES = (".png", ".jpg")
-MOST_BYTES = 2**26  # a frame needs some 300
+MOST_BYTES = 2**26  # a frame needs about 300
 
 
 @dataclass(frozen=True)
 class Clip:
-    """The frames of a clip, in order.
+    """Frames of a clip, in order.
 
     Attributes:
         source: the file that holds the cameras.
         timestamps: microseconds of the video.
-        cameras: [view], float64, in pixels of the stored pictures and in the clip's own units of length.
-        read: (frame, square, size) -> the square part of that frame's picture, resized to `size`.
+        cameras: [view], float64, in pixels of the stored images and in the clip's own units of length.
+        read: (frame, square, size) -> the square part of that frame's image, resized to `size`.
     """
 
     key: str
@@ -52,12 +52,12 @@ class Clip:
 
 
 def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], image_size: tuple[int, int]) -> Cameras:
-    """Cameras [view] (float64) for pictures of (height, width), from rows as they are stored.
+    """Convert stored rows to cameras [view] (float64) for images of (height, width).
 
     Raises:
-        TooFewFrames: fewer than two.
-        BadAnnotation: timestamps that repeat, or numbers that are not finite.
-        BadCamera: no positive focal length, lens distortion, or a pose that is no rotation and translation.
+        TooFewFrames: there are fewer than two frames.
+        BadAnnotation: timestamps repeat, or numbers are not finite.
+        BadCamera: a focal length is not positive, the lens has distortion, or a pose is not rigid.
     """
     if len(rows) < 2:
         raise TooFewFrames(f"{len(rows)} frames, at least two are needed")
@@ -83,7 +83,7 @@ def clip_cameras(rows: Float[Tensor, "view 18"], timestamps: Sequence[int], imag
 
 
 class TextClips:
-    """The clips of one folder whose frames are there, and the names of those (`missing`) without a folder of frames."""
+    """Clips of one folder that have a folder of frames; `missing` names the clips without one."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -95,11 +95,11 @@ class TextClips:
         self.refused: list[DataError] = []
 
     def chunks(self, keys: Sequence[str]) -> list[list[int]]:
-        """Numbers of the clips that are best read together: clips are files of their own, so any will do."""
+        """Group all clips together, because each has its own files and any reading order is fast."""
         return [list(range(len(keys)))]
 
     def clip(self, key: str) -> Clip:
-        """Read a clip's text and list its frames; `DataError` where it is malformed, or a frame is missing."""
+        """Read a clip's text file and list its frames; refuse a malformed text file or a missing frame."""
         path = self.folder / f"{key}.txt"
         with at(path, key):
             timestamps, rows = _read_text(path)
@@ -114,7 +114,7 @@ class TextClips:
             return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
 
     def fingerprint(self) -> str:
-        """SHA-256 of the texts' names and sizes (there are tens of thousands)."""
+        """Return the SHA-256 of the text files' names and sizes (reading tens of thousands would be slow)."""
         texts = [(key, self.folder / f"{key}.txt") for key in self.keys]
         sizes = [(key, text.stat().st_size if text.is_file() else None) for key, text in texts]
         return hashlib.sha256(json.dumps(sizes).encode()).hexdigest()
@@ -128,7 +128,7 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 
 def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
-    """Timestamps and camera rows."""
+    """Return timestamps and camera rows."""
     timestamps, rows = [], []
     lines = read_text(path, MOST_BYTES).splitlines()[1:]
     for frame, columns in enumerate(line.split() for line in lines if line.strip()):
@@ -144,7 +144,7 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
 
 
 def _pictures(folder: Path) -> dict[int, Path]:
-    """Files by timestamp, JPEG before PNG."""
+    """Return image files by timestamp; JPEG is preferred to PNG."""
     with os.scandir(folder) as entries:
         paths = [Path(entry.path) for entry in entries]
     ordered = sorted((path for path in paths if path.suffix in PICTURES), key=lambda path: PICTURES.index(path.suffix))

@@ -1,4 +1,4 @@
-"""Which clips of RealEstate10K are tested, and on which views: the lists that published works come with."""
+"""Test clips and test views of RealEstate10K, from the lists that were published with other works."""
 
 import logging
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class EvaluationIndex:
-    """A list of test views in the format of a work: reference and targets of each test of a clip, as places in it."""
+    """List of test views in the format of a published work: for each clip its tests as frame indices."""
 
     form: str
     views: dict[str, list[Choice]]
 
 
 class ChosenSource(SequenceSource):
-    """Clips under the names of their tests: the clip's, or `KEY#1`, `KEY#2` ... where one has several.
+    """Clips by the name of their test, which is the clip's key, or `KEY#1`, `KEY#2` ... for several tests of a clip.
 
-    `views` are reference and targets by name, where an index gives them; see `SequenceSource` for the rest.
+    `views` has reference and targets by name if there is an index; see `SequenceSource` for the other attributes.
     """
 
     def __init__(self, source: SequenceSource, clips: dict[str, str], views: dict[str, Choice], listed: int) -> None:
@@ -51,18 +51,18 @@ class ChosenSource(SequenceSource):
 
 
 def read_index(path: Path) -> EvaluationIndex:
-    """A list of test views in one of four formats; the first context frame is the reference.
+    """Read a list of test views in one of four formats. A target that is listed twice is scored twice.
 
-    JSON by clip, all clips in the same format (null: no test):
+    Three formats are JSON tables by clip (null: no test), where the first context frame is the reference:
     `{"context": [i, j], "target": [...]}` (dcharatan/pixelsplat, `assets/evaluation_index_re10k.json`);
-    the same with "target_quantify", the targets that are scored, where "target" are the frames of a video
+    the same with the scored targets in "target_quantify", while "target" has the frames of a video
     (donydchen/mvsplat360, `assets/re10k_evaluation/re10k_inter_14_target_views_match.json`);
-    a list of such pairs, which may be empty (Chrixtar/latentsplat, `assets/evaluation_index/re10k_extra.json`).
-    Lines of a key and four frames, the reference first (eldar/flash3d, `splits/re10k_mine_filtered/test_files.txt` and
-    `datasets/re10k.py`). A target that is listed twice is scored twice.
+    a list, possibly empty, of pixelSplat's entries (Chrixtar/latentsplat, `assets/evaluation_index/re10k_extra.json`).
+    The fourth has lines of a key and four frames, the reference first (eldar/flash3d, `datasets/re10k.py` and
+    `splits/re10k_mine_filtered/test_files.txt`).
 
     Raises:
-        DataError: missing, unreadable, or with anything else in it.
+        DataError: the file is missing, unreadable or in another format.
     """
     text = read_text(path)
     with at(file=path):
@@ -70,7 +70,7 @@ def read_index(path: Path) -> EvaluationIndex:
 
 
 def read_keys(path: Path) -> list[str]:
-    """A list of clips, one key a line; `DataError` if missing, unreadable, or with several columns."""
+    """Read a list of clips from a text file with one key a line, and refuse one with several columns."""
     keys = []
     for number, line in enumerate(read_text(path).splitlines(), 1):
         columns = line.split()
@@ -82,18 +82,18 @@ def read_keys(path: Path) -> list[str]:
 
 
 def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: list[str] | None) -> ChosenSource:
-    """Of the clips that are there, those which both lists name (all, without lists).
+    """Select the clips that both lists name; a list that is None names all.
 
-    How many tests there are and which clips are left out is logged: as a warning if some are not in the data.
+    Log the number of tests and the clips that are left out, as a warning if some of them are missing in the data.
     """
-    keys, there, left_out = source.names, set(source.names), dict[str, list[str]]()
+    keys, known, left_out = source.names, set(source.names), dict[str, list[str]]()
     if index is not None:
         left_out["null in the index"] = [key for key, tests in index.views.items() if not tests]
-        left_out["in the index, not in the data"] = [k for k, tests in index.views.items() if tests and k not in there]
+        left_out["in the index, not in the data"] = [k for k, tests in index.views.items() if tests and k not in known]
         left_out["not in the index"] = [key for key in keys if key not in index.views]
         keys = [key for key in keys if index.views.get(key)]
     if listed is not None:
-        left_out["in the list, not in the data"] = [key for key in dict.fromkeys(listed) if key not in there]
+        left_out["in the list, not in the data"] = [key for key in dict.fromkeys(listed) if key not in known]
         left_out["not in the list"] = [key for key in keys if key not in set(listed)]
         keys = [key for key in keys if key in set(listed)]
     clips, views = {key: key for key in keys} if index is None else {}, dict[str, Choice]()
@@ -117,10 +117,10 @@ def _from_table(content: Any) -> EvaluationIndex:
     for key, value in content.items():
         with at(sequence=key):
             entries = [] if value is None else value if isinstance(value, list) else [value]
-            found = form if value is None else _form(value)
-            if form is not None and found != form:
-                raise BadAnnotation(f"in the format of {found}, clips before it in that of {form}")
-            form, views[key] = found, [_choice(entry) for entry in entries]
+            entry_form = form if value is None else _form(value)
+            if form is not None and entry_form != form:
+                raise BadAnnotation(f"in the format of {entry_form}, clips before it in that of {form}")
+            form, views[key] = entry_form, [_choice(entry) for entry in entries]
     if form is None or not any(views.values()):
         raise BadAnnotation("no clip with views")
     return EvaluationIndex(form, views)

@@ -1,4 +1,4 @@
-"""RealEstate10K clips as posed sequences, and their data module."""
+"""Data module of RealEstate10K, whose clips become posed sequences."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ Clips = TextClips | ChunkedClips
 
 @dataclass(frozen=True)
 class ClipFraming:
-    """How pictures and cameras are made from files; see `RE10KDataModule`."""
+    """Settings of images and cameras; see `RE10KDataModule`."""
 
     image_size: int
     crop: str
@@ -41,7 +41,7 @@ class ClipFraming:
 
 
 def open_clips(folder: Path) -> Clips:
-    """The clips of a split's folder: in chunks where it has an `index.json`, else in texts; `DataError` if neither."""
+    """Open the clips of a split's folder, as chunks if it has an `index.json`, else as text files."""
     if (folder / "index.json").is_file():
         return ChunkedClips(folder)
     if folder.is_dir() and any(folder.glob("*.txt")):
@@ -50,7 +50,7 @@ def open_clips(folder: Path) -> Clips:
 
 
 class RE10KSource(SequenceSource):
-    """Some clips of one folder; see `SequenceSource`. The clips may be shared by several sources."""
+    """Some clips of one folder; see `SequenceSource`. Several sources may share `clips`."""
 
     def __init__(self, clips: Clips, names: list[str], framing: ClipFraming) -> None:
         self.names = names
@@ -61,15 +61,15 @@ class RE10KSource(SequenceSource):
         self._clips = clips
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """The clips of one chunk each."""
+        """Group the clips by chunk."""
         return self._clips.chunks(names)
 
     def fingerprint(self) -> str:
-        """SHA-256 of what lists the clips; pictures are not looked at."""
+        """Return the SHA-256 of the files that list the clips, not of the images."""
         return self._clips.fingerprint()
 
     def read(self, name: str) -> PosedSequence:
-        """One clip: its cameras now, its pictures when `PosedSequence.read` is called."""
+        """Read one clip's cameras; its images are read by `PosedSequence.read`."""
         clip, framing = self._clips.clip(name), self.framing
         count = len(clip.timestamps)
         squares = [_square(clip, framing.crop, frame) for frame in range(count)]
@@ -98,22 +98,22 @@ def _read(clip: Clip, squares: list[Square], size: int, index: int) -> Picture:
 class RE10KDataModule(SceneDataModule):
     """Scenes of room tours.
 
-    `root` has the folders `train` and `test`, either with texts and frames as published (`realestate10k_text`) or with
-    pixelSplat's chunks (`realestate10k_chunks`), or is prepared. Training draws a random reference and random targets
-    near it. Clips are checked when they are read. Each loading process has at most two chunks in memory.
+    `root` is prepared, or has folders `train` and `test` with text files and frames as published (`realestate10k_text`)
+    or with pixelSplat's chunks (`realestate10k_chunks`). Training draws a random reference and random targets near it.
+    Clips are checked when they are read. Each loading process has at most two chunks in memory.
 
     Args:
-        min_gap, max_gap: fewest and most frames between the reference and a training target, either way; the most may
-            grow from epoch to epoch (`GrowingGap`).
+        min_gap, max_gap: smallest and largest distance in frames, in both directions, from the reference to a training
+            target; `max_gap` may grow from epoch to epoch (`GrowingGap`).
         evaluation_targets, evaluation_gap: validation and test take a clip's first frame as the reference and
-            `evaluation_targets` evenly spaced targets, the last one `evaluation_gap` frames away (None: `max_gap` in
-            the end), or the clip's last.
-        evaluation_index: a file of test views, instead of that rule: in the format of pixelSplat, MVSplat360,
+            `evaluation_targets` evenly spaced targets. The last target is `evaluation_gap` frames away (None: the final
+            `max_gap`), or it is the clip's last frame.
+        evaluation_index: file of test views that replaces this rule, in the format of pixelSplat, MVSplat360,
             latentSplat or Flash3D (`read_index`).
-        scene_list: a file with the keys of the clips to test, one a line.
-        crop: "center": the largest central square (DFM); "principal": the largest one around the principal point.
+        scene_list: file with the keys of the clips to test, one a line.
+        crop: "center": the largest central square (DFM); "principal": the largest square around the principal point.
         near, far: depth range in the clips' units (DFM, `data_io/realestate10k.py:55-56`; not stated by the paper).
-        scale: all lengths, near and far included, are multiplied by this.
+        scale: factor of all lengths, including near and far.
         val_fraction: share of `train` that is held out for validation, at least one clip, chosen by key and `val_seed`.
         **settings: of `SceneDataModule`.
     """
@@ -152,11 +152,11 @@ class RE10KDataModule(SceneDataModule):
 
     @cached_property
     def index(self) -> EvaluationIndex | None:
-        """The content of `evaluation_index`."""
+        """Content of the file `evaluation_index`."""
         return None if self.evaluation_index is None else read_index(self.evaluation_index)
 
     def describe(self) -> dict[str, str]:
-        """See `SceneDataModule`; a file is named by its checksum, an index also by the work whose format it has."""
+        """Return facts for results; a file is named by its checksum, an index also by its format."""
         views = "reference: first frame; {} targets, the last {} frames away".format(*self.evaluation)
         if self.index is not None:
             views = f"index in {self.index.form}'s format, SHA-256 {_checksum(self.evaluation_index)}"
@@ -171,17 +171,17 @@ class RE10KDataModule(SceneDataModule):
         return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
 
     def open(self, split: str) -> Mapping[str, RE10KSource]:
-        """The test clips; or the clips of the folder `train`, which training and validation share."""
+        """Open the test clips, or the clips of the folder `train` for both training and validation."""
         if split == "test":
             clips = open_clips(self.root / "test")
             return {"test": RE10KSource(clips, clips.keys, self.framing)}
         clips = open_clips(self.root / "train")
         train, val = split_by_hash(clips.keys, self.val_fraction, self.val_seed)
-        # Both read through the same two chunks.
+        # Both sources share the two chunks in memory.
         return {"train": RE10KSource(clips, train, self.framing), "val": RE10KSource(clips, val, self.framing)}
 
     def evaluated(self, split: str, source: SequenceSource) -> SequenceSource:
-        """Of the test clips those that the evaluation index and the list of scenes name."""
+        """Select the test clips that are in the evaluation index and in the scene list."""
         if split != "test":
             return source
         listed = None if self.scene_list is None else read_keys(self.scene_list)
@@ -190,7 +190,7 @@ class RE10KDataModule(SceneDataModule):
         return chosen
 
     def stackable(self, scenes: EvaluationScenes) -> bool:
-        """Known from the evaluation index; reading all clips for it would take hours."""
+        """Decide by the evaluation index, because reading all clips would take hours."""
         views = self._test_views
         return len({len(views[name][1]) for name in scenes.store.names if name in views}) <= 1
 
@@ -199,7 +199,7 @@ class RE10KDataModule(SceneDataModule):
         return nearby_views(frames, self.targets, self.min_gap, self.max_gap.at(epoch), rng)
 
     def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
-        """Return the views of the evaluation index; without one, the first frame and some that follow it."""
+        """Return the views of the evaluation index; without an index, the first frame and frames after it."""
         if sequence.name not in self._test_views:
             return evaluation_views_within(len(sequence.frames), *self.evaluation)
         reference, targets = self._test_views[sequence.name]

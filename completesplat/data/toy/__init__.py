@@ -20,10 +20,10 @@ KINDS: dict[str, Callable[..., Path]] = {
 def write(
     kind: str, out: Path, scenes: int, frames: int, size: Side, seed: Natural, workers: Positive | None = None
 ) -> Path:
-    """Write scenes of a kind (a key of `KINDS`); returns their folder.
+    """Write scenes of a kind (a key of `KINDS`) and return their folder.
 
     Raises:
-        DataError: there is no such kind, or the folder holds something else.
+        DataError: the kind is unknown, or the folder holds something else.
     """
     if kind not in KINDS:
         raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")

@@ -1,4 +1,4 @@
-"""How toy data get onto the disk: a folder is there as a whole or not at all, and scenes are made in parallel."""
+"""Writer of toy data: folders are written atomically, and scenes are rendered in parallel."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ Result = TypeVar("Result")
 
 
 def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewest: int, **numbers: int) -> Path:
-    """Make `folder` and let `fill` write into it; `toy.json` in it, written last, holds the numbers.
+    """Make `folder`, let `fill` write into it, and finally write the numbers to `toy.json`.
 
-    The bytes depend on nothing but `scenes` (at least `fewest`), `frames`, `size` and `seed`. A folder that was made
-    with the same numbers is kept as it is.
+    The bytes depend only on `scenes` (at least `fewest`), `frames`, `size` and `seed`. A folder that was made with the
+    same numbers remains unchanged.
 
     Raises:
-        DataError: a number out of its range, or the folder holds something else.
+        DataError: a number is out of its range, or the folder holds something else.
         DiskError: the disk is full.
     """
     for name, rule in {"scenes": Range(fewest), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
@@ -35,10 +35,10 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
     parameters = {"format": FORMAT_VERSION, **numbers}
     if folder.exists():
         try:
-            found = json.loads((folder / "toy.json").read_text())
+            existing = json.loads((folder / "toy.json").read_text())
         except (OSError, ValueError):
-            found = None
-        if found != parameters:
+            existing = None
+        if existing != parameters:
             raise DataError(f"{folder} already holds something else: remove it or choose another folder")
         if progress:
             Console().print(f"{folder} already holds these scenes")
@@ -52,6 +52,6 @@ def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewes
 def write_scenes(
     write: Callable[[tuple[int, str]], Result], splits: Sequence[str], workers: int | None, name: str, progress: bool
 ) -> list[Result]:
-    """`write` of (index, split) for every scene, in order, by `workers` processes (by default one a core)."""
+    """Call `write` with (index, split) of every scene in `workers` processes (None: one for each core), in order."""
     written = map_in_processes(write, list(enumerate(splits)), workers)
     return list(track(written, f"Rendering {name}", len(splits), disable=not progress))

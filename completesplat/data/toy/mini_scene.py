@@ -1,8 +1,8 @@
-"""Minis: an ellipsoid with a nose on plain grey, the smallest scenes of which it is known what their back could be.
+"""Minis: an ellipsoid with a nose on plain grey, the smallest scenes with known alternatives for their back.
 
-The patch lies opposite the nose, so that a picture of the nose tells where it is and not which of four colours it has.
-On marked minis the nose is light or dark, which decides how probable each colour is: a model that learns how often the
-colours occur, and not when, is found out.
+The patch lies opposite the nose, so an image of the nose shows where the patch is, but not which of four colours it
+has. On marked minis the nose is light or dark, which determines the probability of each colour. They expose a model
+that learns only the overall frequency of the colours.
 """
 
 import numpy as np
@@ -22,17 +22,17 @@ from completesplat.data.toy.raytracing import Patch, Surroundings
 EVEN = np.full(len(PATCH_COLORS), 0.25)
 LIGHT, DARK = np.full(3, 0.97), np.full(3, 0.05)
 CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
-"""Of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
+"""Probabilities of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
 
 FROM_THE_FRONT = 0.35
-"""The first camera sees the nose from an azimuth that differs by at most this (radians): it never sees the patch."""
+"""Largest azimuth (radians) between the first camera and the nose, so that this camera never sees the patch."""
 
 PATCH_EDGE, PATCH_TILT = 0.5, 0.2
-"""The patch is where the normal lies within 60 degrees of the nose's opposite, tilted down by 0.2 radians."""
+"""The patch covers normals within 60 degrees of the direction opposite to the nose, tilted down by 0.2 radians."""
 
 
 def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
-    """A random mini seen by `frames` cameras, one full turn that starts in front of the nose."""
+    """Draw a random mini and `frames` cameras on a full turn that starts in front of the nose."""
     mark = str(rng.choice(list(CHANCES))) if marked else "light"
     chances = CHANCES[mark] if marked else EVEN
     half_sizes = rng.uniform(0.36, 0.55, size=3)
@@ -49,7 +49,7 @@ def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> To
 
 
 def _grey(rng: np.random.Generator) -> Surroundings:
-    """No ground, a plain dome, a light from above."""
+    """Draw surroundings with a plain dome and a light from above, without ground."""
     azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 0.9)
     level = np.sqrt(1 - height**2)
     light = np.array([level * np.sin(azimuth), height, level * np.cos(azimuth)])

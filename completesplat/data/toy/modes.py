@@ -1,4 +1,4 @@
-"""The toy objects' hidden modes: every colour that the patch could have had, and what a frame shows of it."""
+"""Hidden modes of toy objects: all possible colours of the patch, and the frames that show it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,12 +24,12 @@ from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
 from completesplat.tensors import stack
 
-# Of the distance: what is seen at this much less is something else, in front.
+# A hit that is closer than the point by more than this share of the distance belongs to another surface in front.
 CLOSER = 1e-3
 
 
 def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tensor, "size size"]:
-    """The pixels of `frame` whose middle shows a point that is hidden in the picture of `reference`, or outside it."""
+    """Mark the pixels of `frame` whose centre shows a point that is occluded in, or outside, the reference image."""
     camera, other = (frame_camera(scene, index, size) for index in (frame, reference))
     depth = torch.from_numpy(render_frame(scene, frame, size)[2]).flatten()
     points = unproject(camera, pixel_centers(size, size, dtype=torch.float64).flatten(0, 1), depth)
@@ -40,23 +40,23 @@ def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tenso
     rays = (offsets / distances[:, None]) @ other.world_to_camera[:3, :3].mT
     pose = scene.camera_to_world[reference]
     met = trace(scene.geometry, scene.surroundings, scene.patch, pose, np.ascontiguousarray(rays.numpy()[:, None]))[2]
-    shown: Tensor = within & (torch.from_numpy(met) > (1 - CLOSER) * distances)
-    return ~shown.view(size, size)
+    seen: Tensor = within & (torch.from_numpy(met) > (1 - CLOSER) * distances)
+    return ~seen.view(size, size)
 
 
 def frame_camera(scene: ToyScene, frame: int, size: int) -> Cameras:
-    """The camera of a frame, float64, in the scene's own lengths."""
+    """Return the camera of a frame, float64, in the scene's own units."""
     pose = torch.from_numpy(scene.camera_to_world[frame])
     return Cameras(invert_rigid(pose), pinhole(scene.fov_degrees, size).double(), (size, size))
 
 
-# A channel of two modes must differ by more than this for a pixel to be of the patch; less is its blurred edge.
+# A pixel belongs to the patch if a channel differs between two modes by more than this; blurred edges differ less.
 DIFFERENCE = 0.1
-# Modes must not differ in the reference picture by more than rounding to bytes can.
+# Modes may differ in the reference image only by the effect of rounding to bytes.
 LEAK = 1.5 / 255
-# Share of a picture that the patch must cover.
+# Smallest share of an image that the patch must cover.
 SMALLEST_PATCH = 0.005
-# Root mean square difference of a picture from its render: JPEG stays below, another colour of the patch above.
+# Limit of the RMS difference between an image and its render: JPEG stays below, another patch colour above.
 SAME_PICTURE = 0.025
 
 Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
@@ -64,10 +64,10 @@ Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "
 
 @dataclass
 class ToyHiddenModes:
-    """The scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
+    """Scenes of a store with all their modes; see `KnowsHiddenModes.hidden_modes`.
 
-    `folder` is that of their category, one of `DRAW`; `DataError` if it holds no complete set of this version. Of what
-    `choose` gives for a sequence the reference counts.
+    `folder` is that of their category, a key of `DRAW`, and must hold a complete set of this version. Only the
+    reference that `choose` returns is used.
     """
 
     folder: Path
@@ -103,7 +103,7 @@ class ToyHiddenModes:
         targets = sorted({*behind, *spread})
         scene = stack([self.store.scene(sequence, reference, targets)])
         true_mode, views = list(PATCH_COLORS).index(toy.patch_color), tuple(map(targets.index, behind))
-        # The drawn scene must be the one on the disk.
+        # The scene that was drawn again must equal the one on the disk.
         drawn = torch.cat([self._render(toy, frames[reference])[None], truths[true_mode]])
         stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
         if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
@@ -125,18 +125,18 @@ class ToyHiddenModes:
         return CompleteSplatError(f"{self.folder}: {name} {reason}")
 
     def _truths(self, scene: ToyScene, frame: int) -> Float[Tensor, "mode 3 size size"]:
-        """The picture of a frame in every mode, in the pixels of the set's own pictures."""
+        """Render a frame in every mode, with the same pixels as the data set's own images."""
         modes = [scene.patch._replace(color=np.array(color)) for color in PATCH_COLORS.values()]
         return torch.stack([self._render(replace(scene, patch=mode), frame) for mode in modes])
 
     def _render(self, scene: ToyScene, frame: int) -> Float[Tensor, "3 size size"]:
-        """As written to disk (but for JPEG) and read again."""
+        """Render a frame as if it was written to disk (without JPEG) and read again."""
         picture = Image.fromarray(np.round(255 * render_frame(scene, frame, self.size)[0].clip(0, 1)).astype(np.uint8))
         square = principal_square((self.size / 2, self.size / 2), (self.size, self.size))
         return cut_square(picture, square, self.image_size).float() / 255
 
     def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
-        """The views that show enough of the patch, the most direct ones first, with their truths and its pixels."""
+        """Select views that show enough of the patch, most frontal ones first, with their truths and patch pixels."""
         toward = scene.camera_to_world[:, :3, 3] * np.array([1, 0, 1])
         facing = toward @ scene.patch.facing / np.linalg.norm(toward, axis=-1)
         chosen: list[int] = []

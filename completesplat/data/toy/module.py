@@ -1,4 +1,4 @@
-"""Toy objects and rooms as data modules that make their own data."""
+"""Data modules of toy objects and rooms, which write their own data."""
 
 from functools import partial
 from pathlib import Path
@@ -14,30 +14,29 @@ from completesplat.data.validation import MissingFile
 from completesplat.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
-"""Below it toy data are made without being asked for: `data.root` of `conf/data/toy_*.yaml` lies there."""
+"""Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""
 
 
 def _must_make(root: Path, folder: Path, make: bool) -> bool:
-    """Whether data are to be written: none are there yet (their description is written last), nor prepared ones.
+    """Return whether data must be written: there are no complete data (with `toy.json`) and no prepared ones.
 
-    `MissingFile`: they are not, and nobody asked for them: another place than the usual one may be a typing error.
+    Without `make`, refuse folders outside of `OWN_PLACE`, because their name may be a typing error.
     """
     if is_packed(root) or (folder / "toy.json").is_file():
         return False
     if not make and not root.is_relative_to(OWN_PLACE):
-        said = "no toy data: data.make=true makes them there, and so does completesplat data toy"
-        raise MissingFile(said, str(root))
+        message = "no toy data: data.make=true makes them there, and so does completesplat data toy"
+        raise MissingFile(message, str(root))
     return True
 
 
 class ToyObjectsDataModule(CO3DDataModule):
-    """`CO3DDataModule` on toy objects, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
+    """`CO3DDataModule` of toy objects, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Scenes that are already there are taken as they are, however many they are.
-
-    `category` is a key of `DRAW`; `scenes`, `frames` and `data_seed` are of what to make; the others are settings of
-    `CO3DDataModule`. `depth_before` is closer than there, as in `conf/data/toy_objects.yaml`: a model knows the depth
-    range that it was trained with.
+    Existing scenes are used as they are, whatever their number is. `category` is a key of `DRAW`; `scenes`, `frames`
+    and `data_seed` determine the data to write; the others are settings of `CO3DDataModule`. The default of
+    `depth_before` is smaller than there and equals that in `conf/data/toy_objects.yaml`, because a model knows the
+    depth range that it was trained with.
     """
 
     def __init__(
@@ -59,24 +58,23 @@ class ToyObjectsDataModule(CO3DDataModule):
         return super().describe() | {"data_set": self.category}
 
     def prepare_data(self) -> None:
-        """Write the scenes where there are none; `MissingFile` as `_must_make`."""
+        """Write the scenes if there are none."""
         if _must_make(self.root, self.root / self.category, self.make):
             write_objects(self.root, *self.making, category=self.category)
 
     def hidden_modes(self, views: int, spread_views: int) -> ToyHiddenModes:
-        """The test scenes with every colour that the patch on the back could have had; see `ToyHiddenModes`."""
+        """Return the test scenes with all possible colours of the patch on the back; see `ToyHiddenModes`."""
         store = self.store("test")
         choose = partial(self.evaluation_views, split="test")
         return ToyHiddenModes(self.root / self.category, store, choose, self.image_size, views, spread_views)
 
 
 class ToyRoomsDataModule(RE10KDataModule):
-    """`RE10KDataModule` on toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
+    """`RE10KDataModule` of toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Clips that are already there are taken as they are, however many they are.
-
-    `form` is "text" or "chunks", of RealEstate10K's two forms: both hold the same. `scenes`, `frames`, `height` and
-    `data_seed` are of what to make; the others are settings of `RE10KDataModule`.
+    Existing clips are used as they are, whatever their number is. `form` selects one of RealEstate10K's two forms,
+    "text" or "chunks", which have the same content. `scenes`, `frames`, `height` and `data_seed` determine the data to
+    write; the others are settings of `RE10KDataModule`.
     """
 
     def __init__(
@@ -99,6 +97,6 @@ class ToyRoomsDataModule(RE10KDataModule):
         return super().describe() | {"data_set": ROOMS}
 
     def prepare_data(self) -> None:
-        """Write the rooms where there are none; `MissingFile` as `_must_make`."""
+        """Write the rooms if there are none."""
         if _must_make(self.home, self.home / ROOMS, self.make):
             write_rooms(self.home, **self.making)

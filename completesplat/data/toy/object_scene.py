@@ -1,4 +1,4 @@
-"""Draws one toy scene: an object of one of two families, its surroundings, a hidden patch, an orbit."""
+"""Random toy scenes: an object of one of two families, its surroundings, a hidden patch, and an orbit of cameras."""
 
 import colorsys
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ DARK = np.full(3, 0.07)
 
 @dataclass(frozen=True)
 class Part:
-    """One ellipsoid or frustum: its centre, half sizes along its own axes, their directions (columns), its look."""
+    """Ellipsoid or frustum: centre, half sizes along its own axes, directions of the axes (columns), and texture."""
 
     kind: int
     center: Array
@@ -43,24 +43,24 @@ class Part:
     texture: Array
 
     def to_local(self) -> Array:
-        """[3 4] map from the object's frame to the unit shape's."""
+        """Return the map [3 4] from the object's frame to the unit shape's frame."""
         linear = self.axes.T / self.half_sizes[:, None]
         return np.concatenate([linear, -linear @ self.center[:, None]], axis=1)
 
     def reach(self) -> float:
-        """No point of the part is further from the origin than this."""
+        """Return an upper bound of the distance from the origin to any point of the part."""
         unit = 1.0 if self.kind == ELLIPSOID else float(np.hypot(1 + abs(self.taper), 1.0))
         return float(np.linalg.norm(self.center) + unit * self.half_sizes.max())
 
     def moved(self: P, rotation: Array, shift: Array, scale: float = 1.0) -> P:
-        """After rotation, then shift, then scaling of the object."""
+        """Return the part after rotation, then shift, then scaling of the object."""
         center = scale * (rotation @ self.center + shift)
         return replace(self, center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
 
 
 @dataclass(frozen=True)
 class Blueprint:
-    """The parts of an object, the one that carries the hidden patch, and the local heights the patch may cover."""
+    """Parts of an object, the part that carries the hidden patch, and the local heights that the patch may cover."""
 
     family: str
     parts: tuple[Part, ...]
@@ -69,7 +69,7 @@ class Blueprint:
 
 
 def geometry(parts: tuple[Part, ...]) -> Geometry:
-    """The parts as arrays for the ray tracer."""
+    """Convert parts to arrays for the ray tracer."""
     return Geometry(
         kinds=np.array([part.kind for part in parts]),
         to_local=np.stack([part.to_local() for part in parts]),
@@ -81,7 +81,7 @@ def geometry(parts: tuple[Part, ...]) -> Geometry:
 
 
 def rotation_about(axis: str, radians: float) -> Array:
-    """Rotation matrix about a coordinate axis; about y it turns +z towards +x."""
+    """Return the rotation matrix about a coordinate axis; about y it turns +z towards +x."""
     cos, sin = np.cos(radians), np.sin(radians)
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)
@@ -91,12 +91,12 @@ def rotation_about(axis: str, radians: float) -> Array:
 
 
 def color(hue: float, saturation: float, value: float) -> Array:
-    """sRGB of a hue (in turns, wrapped), saturation and value."""
+    """Return the sRGB colour of a hue (in turns, wrapped), saturation and value."""
     return np.array(colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
 class _Painter:
-    """Draws colours and patterns: one base hue for an object, other hues for its accents."""
+    """Random colours and patterns of an object: one base hue, and other hues for accents."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -104,7 +104,7 @@ class _Painter:
         self.accent = self.hue + rng.uniform(0.25, 0.75)
 
     def body(self) -> Look:
-        """Colours and texture of a large part."""
+        """Draw colours and texture of a large part."""
         first = color(self.hue, self.rng.uniform(0.5, 0.85), self.rng.uniform(0.7, 0.95))
         second = color(self.hue + self.rng.uniform(-0.1, 0.1), self.rng.uniform(0.35, 0.7), self.rng.uniform(0.4, 0.65))
         pattern = self.rng.choice([PLAIN, STRIPES, CHECKS, RIPPLES])
@@ -112,13 +112,13 @@ class _Painter:
         return np.stack([first, second]), np.array([pattern, frequency, phase])
 
     def detail(self) -> Look:
-        """Colours and texture of a small part, each its own shade of the accent."""
+        """Draw colours and texture of a small part; every call draws another shade of the accent."""
         shade = color(self.accent + self.rng.uniform(-0.08, 0.08), self.rng.uniform(0.5, 0.9), self.rng.uniform(0.6, 1))
         return plain(shade)
 
 
 def plain(shade: Array) -> Look:
-    """One colour, no pattern."""
+    """Return the look of one colour without a pattern."""
     return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
 
 
@@ -135,7 +135,7 @@ def _frustum(center: Point, radius: float, half_height: float, look: Look, taper
 
 
 def bear(rng: np.random.Generator) -> Blueprint:
-    """A sitting bear: body, belly, head with a face, ears, arms, legs; the patch is on its back."""
+    """Draw a sitting bear: body, belly, head with a face, ears, arms, legs; the patch is on its back."""
     paint = _Painter(rng)
     fur = paint.body()
     light = plain(color(paint.hue + 0.04, 0.25, 0.95))
@@ -161,7 +161,7 @@ def bear(rng: np.random.Generator) -> Blueprint:
 
 
 def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _Painter) -> Part:
-    """An arm from the shoulder, raised and swung forward by random angles."""
+    """Draw an arm from the shoulder, raised and swung forward by random angles."""
     axes = rotation_about("z", side * rng.uniform(0.3, 2.2)) @ rotation_about("x", -rng.uniform(0.1, 0.9))
     length = rng.uniform(0.2, 0.27)
     shoulder = np.array([side * 0.88 * wide, 0.42 * tall, 0.05])
@@ -170,7 +170,7 @@ def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _
 
 
 def hydrant(rng: np.random.Generator) -> Blueprint:
-    """A fire hydrant: base, body, dome, a large outlet in front and two at the sides; the patch is on its back."""
+    """Draw a fire hydrant: base, body, dome, a large outlet in front, two at the sides; the patch is on its back."""
     paint = _Painter(rng)
     radius, half = rng.uniform(0.22, 0.29), rng.uniform(0.4, 0.5)
     reach = rng.uniform(0.1, 0.16)
@@ -211,9 +211,9 @@ UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 @dataclass(frozen=True)
 class ToyScene:
-    """A scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world.
+    """Scene and its cameras (OpenCV axes, [frame 4 4]); `unit` and `origin` place it in an arbitrary world.
 
-    `chances` are the probabilities of `PATCH_COLORS`, given all but the patch.
+    `chances` are the probabilities of `PATCH_COLORS`, given everything except the patch.
     """
 
     family: str
@@ -231,7 +231,7 @@ class ToyScene:
 
 
 def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
-    """A random scene seen by `frames` cameras, one full turn; the patch faces away from the first of them."""
+    """Draw a random scene and `frames` cameras on one full turn; the patch faces away from the first camera."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
     yaw = rng.uniform(0, 2 * np.pi)
     cameras = orbit(rng, frames, start=yaw + rng.uniform(-0.35, 0.35))
@@ -253,7 +253,7 @@ def placed(
     patch_color: str,
     chances: Array,
 ) -> ToyScene:
-    """The scene of an object that is turned by `yaw`, centred, and scaled to `OBJECT_HALF_SIZE`."""
+    """Return the scene of an object that is turned by `yaw`, centred, and scaled to `OBJECT_HALF_SIZE`."""
     parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3)) for part in blueprint.parts)
     points, point_colors = _surface(rng, parts, surroundings, patch)
     center = points.mean(axis=0)
@@ -277,9 +277,9 @@ def placed(
 
 
 def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, Array]:
-    """Picture [size size 3], object coverage and depth [size size] of one frame.
+    """Render the image [size size 3], object coverage and depth [size size] of one frame.
 
-    Pixels average SAMPLES^2 rays. Depth is the middle ray's, along the optical axis, in the scene's own lengths.
+    Pixels average SAMPLES^2 rays. Depth is the middle ray's, along the optical axis, in the scene's own units.
     """
     rays = _camera_rays(scene.fov_degrees, size)
     pose = scene.camera_to_world[frame]
@@ -290,7 +290,7 @@ def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, 
 
 @lru_cache(maxsize=1)
 def _camera_rays(fov_degrees: float, size: int) -> Array:
-    """Unit rays in the camera's frame, [pixel sample 3], rows of pixels from the top."""
+    """Return unit rays [pixel sample 3] in the camera's frame, in rows of pixels from the top."""
     centers = (np.arange(size * SAMPLES) + 0.5) / SAMPLES - size / 2
     v, u = (axis.reshape(size, SAMPLES, size, SAMPLES).swapaxes(1, 2) for axis in np.meshgrid(centers, centers)[::-1])
     rays = np.stack([u, v, np.full_like(u, 0.5 * size / np.tan(np.radians(fov_degrees) / 2))], axis=-1)
@@ -299,7 +299,7 @@ def _camera_rays(fov_degrees: float, size: int) -> Array:
 
 
 def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
-    """`camera_to_world` of evenly spaced, jittered cameras that look about at the object's centre."""
+    """Draw `camera_to_world` of evenly spaced, jittered cameras that look near the object's centre."""
     azimuth = start + 2 * np.pi * (np.arange(frames) + rng.uniform(-0.25, 0.25, frames)) / frames
     azimuth[0] = start
     elevation = np.radians(np.clip(rng.uniform(14, 31) + rng.normal(0, 2, frames), 10, 35))
@@ -312,7 +312,7 @@ def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
 
 
 def _surroundings(rng: np.random.Generator) -> Surroundings:
-    """A dome of one palette, a ground in two related colours, a light from above; the ground's height comes later."""
+    """Draw a dome of one palette, a ground of two related colours and a light from above; `placed` sets the height."""
     hue = rng.uniform()
     floor = hue + rng.uniform(0.3, 0.7)
     azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 1.0)
@@ -333,7 +333,7 @@ def _surroundings(rng: np.random.Generator) -> Surroundings:
 def _surface(
     rng: np.random.Generator, parts: tuple[Part, ...], surroundings: Surroundings, patch: Patch
 ) -> tuple[Array, Array]:
-    """Points on the object that can be seen from above, with their colours: hits of random, nearly parallel rays."""
+    """Sample points on the object that are visible from above, and their colours, by random, nearly parallel rays."""
     shape = geometry(parts)
     points, colors = [], []
     for _ in range(SURFACE_DIRECTIONS):

@@ -1,4 +1,4 @@
-"""Writes toy objects as a category in CO3D v2's layout, with every file that its reader expects."""
+"""Writer of toy objects as a category in CO3D v2's layout, with every file that its reader expects."""
 
 import json
 from collections.abc import Callable
@@ -22,7 +22,7 @@ DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
     "toy_minis": draw_mini,
     "toy_marked_minis": partial(draw_mini, marked=True),
 }
-"""Categories, and what draws their scenes: (random generator, number of frames) -> scene."""
+"""Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
 SUBSET = "fewview_train"
 
 Annotations = tuple[str, list[dict[str, Any]], dict[str, Any]]
@@ -42,7 +42,7 @@ def _write_frame(
     picture, mask = _to_bytes(image), _to_bytes(coverage)
     save_picture(Image.fromarray(picture), folder / files["image"], quality=95, subsampling=0)
     save_picture(Image.fromarray(mask), folder / files["mask"])
-    # A 16-bit picture whose bits are float16, in units of `scale_adjustment`: this is how CO3D stores depth.
+    # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
     save_picture(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
     save_picture(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
     paths = {key: f"{category}/{path}" for key, path in files.items()}
@@ -63,7 +63,7 @@ def _to_bytes(values: Array) -> Any:
 
 
 def _viewpoint(scene: ToyScene, frame: int) -> dict[str, Any]:
-    """In a world of the scene's own unit and origin."""
+    """Return a frame's viewpoint in a world with the scene's own unit and origin."""
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
     rotation = world_to_camera[:3, :3]
     translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
@@ -81,11 +81,11 @@ def write_objects(
     progress: bool = True,
     category: str = "toy_objects",
 ) -> Path:
-    """Write `scenes` sequences of `frames` square pictures with masks, depth, point clouds and annotations.
+    """Write `scenes` sequences of `frames` square images with masks, depth, point clouds and annotations.
 
     The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
-    family and the colour of the patch on the back. See `write_once`, which takes the numbers; `workers` are processes
-    (by default one a core). Returns the folder of the category (a key of `DRAW`).
+    family and the colour of the patch on the back. See `write_once` for the numbers; `workers` are processes (None: one
+    for each core). Return the folder of the category (a key of `DRAW`).
     """
 
     def fill(folder: Path) -> None:
@@ -96,14 +96,14 @@ def write_objects(
 
 
 def _splits(scenes: int) -> list[str]:
-    """The split of every sequence, in order: at least one each from three scenes on."""
+    """Return the split of every sequence in order; with at least three scenes, each split has one or more."""
     test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
     val = max(1, round(0.05 * scenes)) if scenes > 2 else 0
     return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
 
 
 def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, place: tuple[int, str]) -> Annotations:
-    """One sequence, from a random generator of its own; returns its split and annotations."""
+    """Write one sequence, drawn from a separate random generator, and return its split and annotations."""
     index, split = place
     scene = DRAW[category](np.random.default_rng([seed, index]), frames)
     name = f"{index:05d}_{scene.family}"

@@ -1,4 +1,4 @@
-"""A small analytic ray tracer: ellipsoids and cone frusta on a patterned ground inside a coloured sky."""
+"""Analytic ray tracer for ellipsoids and cone frusta on a patterned ground inside a coloured dome."""
 
 import inspect
 import math
@@ -10,17 +10,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 ELLIPSOID, FRUSTUM, BOX = 0, 1, 2
-# What the first number of a texture says; the others are its frequency (radians per unit of length) and phase.
+# Patterns: the first number of a texture. The others are its frequency (radians per unit of length) and phase.
 PLAIN, STRIPES, CHECKS, RIPPLES = 0, 1, 2, 3
 
 Array = NDArray[np.float64]
 
 
 class Geometry(NamedTuple):
-    """What a ray can hit.
+    """Parts of an object as arrays.
 
-    An ellipsoid is the unit ball and a frustum is x^2 + z^2 <= (1 + taper y)^2, |y| <= 1, each in its local frame;
-    `to_local` [part 3 4] maps world points there. `textures` [part 3]: pattern, frequency, phase.
+    In its local frame, an ellipsoid is the unit ball and a frustum is x^2 + z^2 <= (1 + taper y)^2, |y| <= 1.
+    `to_local` [part 3 4] maps world points to the local frames. `textures` [part 3]: pattern, frequency, phase.
     """
 
     kinds: NDArray[np.int64]
@@ -34,8 +34,8 @@ class Geometry(NamedTuple):
 class Surroundings(NamedTuple):
     """Ground plane at height `ground` (two colours, pattern), dome (palette) and light.
 
-    The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase: a law shared by all scenes,
-    so that what lies behind a camera can partly be inferred from what lies in front of it. A `plain` dome is grey.
+    The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase. This law is the same in all
+    scenes, so that the dome behind a camera can partly be inferred from the one in front. A `plain` dome is grey.
     """
 
     ground: float
@@ -50,10 +50,10 @@ class Surroundings(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """A disc on the side of `part` that faces the direction `facing`, where the normal's cosine with it exceeds `edge`.
+    """Disc on `part` where the cosine between the normal and the direction `facing` exceeds `edge`.
 
-    `heights`: the local range of y that it may cover. `rim`: the cosine below which, as near these heights, it is
-    white; with `edge` itself it has no rim.
+    `heights` is the local range of y that it may cover. It is white near the ends of this range, and where the cosine
+    is below `rim`; if `rim` equals `edge`, it has no white rim.
     """
 
     part: int
@@ -71,18 +71,18 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compiled on the first call and kept on disk; a run-time type checker's wrapper is taken off first."""
+    """Compile a function at its first call and cache it on disk, without a run-time type checker's wrapper."""
     return njit(cache=True, **OPTIONS)(inspect.unwrap(function))
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Part of a kernel: passing a tuple of arrays to a numba function costs as much as meeting a sphere."""
+    """Inline a function into kernels, because passing a tuple of arrays costs as much as hitting a sphere."""
     return njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
 
 
 @inlined
 def turned(m, x, y, z):
-    """A direction after the linear part of a map [3 4]."""
+    """Apply the linear part of a map [3 4] to a direction."""
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
@@ -92,14 +92,14 @@ def turned(m, x, y, z):
 
 @inlined
 def moved(m, x, y, z):
-    """A point after a map [3 4]."""
+    """Apply a map [3 4] to a point."""
     x, y, z = turned(m, x, y, z)
     return x + m[0, 3], y + m[1, 3], z + m[2, 3]
 
 
 @inlined
 def world_normal(m, x, y, z):
-    """The unit normal of a surface whose normal in the local frame, into which `m` maps, is given."""
+    """Return the unit world normal for a normal in the local frame, into which `m` maps."""
     # Normals transform by the transpose of the map into the local frame.
     x, y, z = turned(m[:, :3].T, x, y, z)
     norm = math.sqrt(x * x + y * y + z * z)
@@ -108,19 +108,19 @@ def world_normal(m, x, y, z):
 
 @inlined
 def soft_sign(x):
-    """-1 to 1, with the slope 1 at 0."""
+    """Return a smooth sign from -1 to 1, with slope 1 at 0."""
     return x / math.sqrt(1 + x * x)
 
 
 @inlined
 def mixed(a, b, w):
-    """A colour between two."""
+    """Interpolate between two colours."""
     return a[0] + w * (b[0] - a[0]), a[1] + w * (b[1] - a[1]), a[2] + w * (b[2] - a[2])
 
 
 @inlined
 def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
-    """Nearest hit (distance, local normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
+    """Return the nearest hit (distance, local normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
     nearest, nx, ny, nz = np.inf, 0.0, 0.0, 0.0
     a = dx * dx + dz * dz - taper * taper * dy * dy
     b = ox * dx + oz * dz - taper * dy * (1 + taper * oy)
@@ -143,7 +143,7 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
 
 @inlined
 def hit_ball(ox, oy, oz, dx, dy, dz):
-    """Nearest hit (distance, normal) of the unit ball, from outside."""
+    """Return the nearest hit (distance, normal) of the unit ball from outside."""
     a = dx * dx + dy * dy + dz * dz
     b = ox * dx + oy * dy + oz * dz
     square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
@@ -155,7 +155,7 @@ def hit_ball(ox, oy, oz, dx, dy, dz):
 
 @inlined
 def hit_object(geometry, ox, oy, oz, dx, dy, dz):
-    """Nearest part along a ray of unit direction: distance, part (or -1), world normal."""
+    """Return the nearest part along a ray of unit direction: distance, part (or -1), world normal."""
     nearest, part, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
     along = ox * dx + oy * dy + oz * dz
     if ox * ox + oy * oy + oz * oz - along * along > geometry.bounding_radius**2:
@@ -177,7 +177,7 @@ def hit_object(geometry, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _pattern(kind, frequency, phase, x, y, z):
-    """Mixing weight of the second colour, 0 to 1, at a local point."""
+    """Return the weight of the second colour, 0 to 1, at a local point."""
     if kind == STRIPES:
         return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * y + phase))
     if kind == CHECKS:
@@ -226,14 +226,14 @@ def _dome_color(around, x, y, z):
     rise = max(0.0, min(1.0, (y - around.ground) / around.dome_radius))
     value = 0.68 + 0.1 * soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
     cos_hue, sin_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue), 0.2 * (1 - 0.5 * rise) * math.sin(hue)
-    # A third of a turn apart: red, green, blue.
+    # Red, green and blue are a third of a turn apart.
     half_root_3 = 0.8660254037844386
     return value + cos_hue, value - 0.5 * cos_hue + half_root_3 * sin_hue, value - 0.5 * cos_hue - half_root_3 * sin_hue
 
 
 @inlined
 def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
-    """Colour, distance and what is seen (a part, GROUND or DOME) along a ray of unit direction inside the dome."""
+    """Return colour, distance and the surface (a part, GROUND or DOME) along a ray of unit direction in the dome."""
     t, seen, nx, ny, nz = hit_object(geometry, ox, oy, oz, dx, dy, dz)
     b = ox * dx + oy * dy + oz * dz
     dome = -b + math.sqrt(max(0.0, b * b - (ox * ox + oy * oy + oz * oz) + around.dome_radius**2))
@@ -255,17 +255,17 @@ def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
         shift = 1e-4
         shadow = hit_object(geometry, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
         direct *= 0.35 if shadow[1] >= 0 else 1.0
-    # Light from the sky above keeps the unlit side from going flat.
+    # Light from the sky above gives the unlit side some shading.
     level = around.ambient * (0.75 + 0.25 * ny) + (1 - around.ambient) * direct
     return red * level, green * level, blue * level, t, seen
 
 
 @kernel
 def trace(geometry, around, patch, pose, rays):
-    """Colours [pixel 3], object coverage [pixel] and distances [pixel] seen by a camera of pose `camera_to_world`.
+    """Render colours [pixel 3], object coverage [pixel] and distances [pixel] for the pose `camera_to_world`.
 
-    Colours and coverage are means over each pixel's `rays` [pixel sample 3] (of unit length, in the camera's frame);
-    the distance is the middle ray's.
+    Colours and coverage are means over each pixel's `rays` [pixel sample 3], which have unit length and are in the
+    camera's frame. The distance is the middle ray's.
     """
     pixels, samples, _ = rays.shape
     colors, coverage, distances = np.zeros((pixels, 3)), np.zeros(pixels), np.zeros(pixels)

@@ -1,4 +1,4 @@
-"""Ray tracer for toy rooms: a box seen from inside, rectangles on its faces, boxes and ellipsoids."""
+"""Analytic ray tracer for toy rooms: the inside of a box, rectangles on its faces, boxes and ellipsoids."""
 
 import math
 from typing import NamedTuple
@@ -29,13 +29,13 @@ SHADOW = 0.45
 
 
 class Room(NamedTuple):
-    """Everything that a ray in the room can hit, and the light.
+    """Surfaces of a room and its light, as arrays.
 
-    `size`: along x, y and z. `colors` [face 2 3] and `textures` [face 3]: looks of the room's faces. `decals` [decal 6]
-    are rectangles on faces: face, range of the first coordinate, range of the second, width of the rim; the coordinates
-    are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3]: rim and two inner colours.
-    Solids are the cube [-1, 1]^3 or the unit ball in their local frames; `to_local` [solid 3 4] maps room points there.
-    `bounding_balls` [solid 4]: centre and squared radius of a ball that holds each.
+    `size` is along x, y and z. `colors` [face 2 3] and `textures` [face 3] are of the room's faces. `decals` [decal 6]
+    are rectangles on faces: face, range of the first coordinate, range of the second, width of the rim. The coordinates
+    are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3] are the rim and two inner
+    colours. In its local frame, a solid is the cube [-1, 1]^3 or the unit ball; `to_local` [solid 3 4] maps room points
+    there. `bounding_balls` [solid 4] are the centre and squared radius of a ball around each solid.
     """
 
     size: Array
@@ -56,7 +56,7 @@ class Room(NamedTuple):
 
 @inlined
 def _hit_cube(ox, oy, oz, dx, dy, dz):
-    """Nearest hit (distance, axis of the face) of the cube [-1, 1]^3, from outside."""
+    """Return the nearest hit (distance, axis of the face) of the cube [-1, 1]^3 from outside."""
     enter, leave, axis = -np.inf, np.inf, 0
     for i in range(3):
         o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
@@ -73,7 +73,7 @@ def _hit_cube(ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _hit_solid(room, ox, oy, oz, dx, dy, dz):
-    """Nearest solid along a ray: distance, solid (or -1), axis of the face of a box."""
+    """Return the nearest solid along a ray: distance, solid (or -1), axis of the face of a box."""
     nearest, solid, face = np.inf, -1, 0
     balls = room.bounding_balls
     square = dx * dx + dy * dy + dz * dz
@@ -96,7 +96,7 @@ def _hit_solid(room, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _hit_room(room, ox, oy, oz, dx, dy, dz):
-    """Where a ray from inside leaves the room: distance and face."""
+    """Return distance and face where a ray from inside leaves the room."""
     nearest, face = np.inf, 0
     for i in range(3):
         o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
@@ -110,7 +110,7 @@ def _hit_room(room, ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _textured(colors, first, texture, u, v):
-    """Colours `first` and `first` + 1 mixed by a texture's pattern."""
+    """Mix the colours `first` and `first` + 1 by a texture's pattern."""
     kind, frequency, phase = texture[0], texture[1], texture[2]
     w = 0.0
     if kind == STRIPES:
@@ -124,7 +124,7 @@ def _textured(colors, first, texture, u, v):
 
 @inlined
 def _face_color(room, face, x, y, z):
-    """Colour of a point on a face of the room; later decals lie on earlier ones."""
+    """Return the colour of a point on a face of the room; later decals cover earlier ones."""
     u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
     for i in range(len(room.decals) - 1, -1, -1):
         decal = room.decals[i]
@@ -138,7 +138,7 @@ def _face_color(room, face, x, y, z):
 
 @inlined
 def _solid_look(room, solid, face, x, y, z):
-    """Colour and normal of a point on a solid."""
+    """Return colour and normal of a point on a solid."""
     m, half = room.to_local[solid], room.solid_half_sizes[solid]
     lx, ly, lz = moved(m, x, y, z)
     u, v = lx * half[0], ly * half[1]
@@ -156,7 +156,7 @@ def _solid_look(room, solid, face, x, y, z):
 
 @inlined
 def _shade(room, ox, oy, oz, dx, dy, dz):
-    """Colour and distance (in lengths of the direction) along a ray from inside the room."""
+    """Return colour and distance (in lengths of the direction) along a ray from inside the room."""
     t, solid, axis = _hit_solid(room, ox, oy, oz, dx, dy, dz)
     wall, face = _hit_room(room, ox, oy, oz, dx, dy, dz)
     if solid < 0:
@@ -174,17 +174,17 @@ def _shade(room, ox, oy, oz, dx, dy, dz):
         shift = 1e-4
         shadow = _hit_solid(room, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
         direct *= SHADOW if shadow[0] < 1 else 1.0
-    # Light from above keeps the unlit sides from going flat.
+    # Light from above gives the unlit sides some shading.
     level = room.ambient * (0.85 + 0.15 * ny) + (1 - room.ambient) * direct
     return red * level, green * level, blue * level, t
 
 
 @kernel
 def trace_room(room, pose, intrinsics, height, width, samples):
-    """Colours [height width 3] and depth [height width] seen by a camera of pose `camera_to_world`.
+    """Render colours [height width 3] and depth [height width] for the pose `camera_to_world`.
 
-    `intrinsics`: fx, fy, cx, cy in pixels. Colours are means over `samples` x `samples` (odd) rays a pixel;
-    the depth is the middle ray's, along the optical axis.
+    `intrinsics` are fx, fy, cx, cy in pixels. Colours are means over `samples` x `samples` rays for each pixel, where
+    `samples` is odd. The depth is the middle ray's, along the optical axis.
     """
     colors, depth = np.zeros((height, width, 3)), np.zeros((height, width))
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]

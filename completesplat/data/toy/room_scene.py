@@ -1,4 +1,4 @@
-"""Draws one toy room: size, looks, furniture, and how a camera moves through it."""
+"""Random toy rooms: size, colours, furniture, and the path of the camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,20 +17,20 @@ ATTEMPTS = 100
 
 @dataclass(frozen=True)
 class Solid(Part):
-    """One box or ellipsoid that is turned about the vertical."""
+    """Box or ellipsoid that is turned about the vertical."""
 
     def bounding_ball(self) -> Array:
-        """Centre and squared radius [4]."""
+        """Return centre and squared radius [4]."""
         return np.append(self.center, (self.half_sizes**2).sum())
 
     def distances(self, points: Array) -> Array:
-        """How far the points [n 3] are from the (bounding) box; 0 inside."""
+        """Return the distances of points [n 3] to the (bounding) box; 0 inside."""
         outside = np.abs((points - self.center) @ self.axes) - self.half_sizes
         distances: Array = np.linalg.norm(outside.clip(0), axis=-1)
         return distances
 
     def ground_extent(self) -> tuple[Array, Array]:
-        """Lower and upper corner (x, z) of the rectangle that its shadow at noon lies in."""
+        """Return lower and upper corner (x, z) of the bounding rectangle of its projection on the ground."""
         reach = np.abs(self.axes) @ self.half_sizes
         return (self.center - reach)[[0, 2]], (self.center + reach)[[0, 2]]
 
@@ -51,13 +51,13 @@ def _solid(kind: int, center: Point, half: Point, look: Look) -> Solid:
 
 
 def cabinet(rng: np.random.Generator) -> Piece:
-    """One box, from a chest to a wardrobe."""
+    """Draw one box, from a chest to a wardrobe."""
     half = (rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.0), rng.uniform(0.18, 0.3))
     return [_solid(BOX, (0, half[1], 0), half, _look(rng))]
 
 
 def table(rng: np.random.Generator) -> Piece:
-    """A slab on four legs."""
+    """Draw a slab on four legs."""
     wide, deep, top = rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.45), rng.uniform(0.45, 0.75)
     look, leg = _look(rng), _look(rng)
     legs = [
@@ -69,7 +69,7 @@ def table(rng: np.random.Generator) -> Piece:
 
 
 def sofa(rng: np.random.Generator) -> Piece:
-    """A seat, a back and two arms."""
+    """Draw a seat, a back and two arms."""
     wide, deep, seat = rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.45), rng.uniform(0.18, 0.23)
     look, back = _look(rng), rng.uniform(0.35, 0.45)
     arms = [_solid(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
@@ -78,13 +78,13 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def pouf(rng: np.random.Generator) -> Piece:
-    """An ellipsoid."""
+    """Draw an ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
     return [_solid(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 
 
 def lamp(rng: np.random.Generator) -> Piece:
-    """A foot, a pole and an ellipsoid on top."""
+    """Draw a foot, a pole and an ellipsoid on top."""
     top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
     look = _look(rng)
     foot = [
@@ -98,7 +98,7 @@ PIECES = (cabinet, table, sofa, pouf, lamp)
 
 
 def furnish(rng: np.random.Generator, size: Array) -> list[Piece]:
-    """3 to 6 pieces that do not overlap, most of them along the walls."""
+    """Draw 3 to 6 pieces (fewer if there is no space) that do not overlap, most of them along the walls."""
     count = int(rng.integers(3, 7))
     taken: list[tuple[Array, Array]] = []
     pieces: list[Piece] = []
@@ -120,7 +120,7 @@ def _ground_extent(piece: Piece) -> tuple[Array, Array]:
 
 
 def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
-    """With the back to a wall in four cases of five, anywhere and turned freely otherwise; it may overlap others."""
+    """Place a piece with its back to a wall (in four of five cases) or anywhere, without regard to other pieces."""
     along_wall = rng.uniform() < 0.8
     yaw = float(rng.integers(4) * np.pi / 2) if along_wall else float(rng.uniform(0, 2 * np.pi))
     rotation = rotation_about("y", yaw)
@@ -137,7 +137,7 @@ def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
 
 MARGIN = 0.3
 LOWEST, HIGHEST = 1.0, 1.7
-# A video of 30 frames a second, taken at a slow walk.
+# Range of the camera's step from frame to frame, as in a video with 30 frames a second, taken at a slow walk.
 STEPS = (0.012, 0.032)
 LARGEST_TURN = np.radians(3.0)
 WAYPOINTS = 4
@@ -149,10 +149,10 @@ ASPECT = 16 / 9
 
 @dataclass(frozen=True)
 class CameraMove:
-    """Poses in the room ([frame 4 4], OpenCV axes), the lens, and the world that the files speak of.
+    """Poses in the room ([frame 4 4], OpenCV axes), the lens, and the transform to the world of the files.
 
-    `focal`: in widths of the picture. `principal_point`: (x, y) in widths and heights. A point of the room lies in the
-    world at `unit` * `rotation` @ point + `origin`; as in RealEstate10K, the world's +y points down.
+    `focal` is in image widths, `principal_point` (x, y) in image widths and heights. A point of the room has the world
+    coordinates `unit` * `rotation` @ point + `origin`; as in RealEstate10K, the world's +y points down.
     """
 
     camera_to_room: Array
@@ -163,23 +163,23 @@ class CameraMove:
     origin: Array
 
     def intrinsics(self, height: int, width: int) -> Array:
-        """fx, fy, cx, cy in shares of width, height, width, height, for square pixels."""
+        """Return fx, fy, cx, cy as fractions of width, height, width, height, for square pixels."""
         return np.array([self.focal, self.focal * width / height, *self.principal_point])
 
     def world_to_camera(self) -> Array:
-        """[frame 3 4], in the world and its unit."""
+        """Return poses [frame 3 4] in the world and its unit."""
         rotation = np.swapaxes(self.camera_to_room[:, :3, :3], 1, 2) @ self.rotation.T
         centers = self.unit * self.camera_to_room[:, :3, 3] @ self.rotation.T + self.origin
         return np.concatenate([rotation, -rotation @ centers[:, :, None]], axis=2)
 
 
 def image_width(height: int) -> int:
-    """The even number next to 16 / 9 of the height."""
+    """Return the even number nearest to 16 / 9 of the height."""
     return 2 * round(height * ASPECT / 2)
 
 
 def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> CameraMove:
-    """A walk through the free space of a room, MARGIN away from everything."""
+    """Draw a walk through the free space of a room, MARGIN away from everything."""
     centers, tangents = _path(rng, frames, size, furniture)
     yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2])) + rng.normal(0, 0.2)
     swing = 2 * np.pi * (np.linspace(0, rng.uniform(0.2, 1.0), frames) + rng.uniform())
@@ -197,9 +197,9 @@ def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Seq
 
 
 def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> tuple[Array, Array]:
-    """Places [frame 3] at equal steps along a cubic through random waypoints, and tangents [frame 3].
+    """Draw positions [frame 3] at equal steps along a cubic through random waypoints, and their tangents [frame 3].
 
-    Paths that come too near to something or turn too fast are drawn anew, shorter and shorter, so that one is found.
+    A path that comes too near to something or turns too fast is drawn again and shorter, until one is free.
     """
     stride, step = 1.2, rng.uniform(*STEPS)
     while True:
@@ -220,7 +220,7 @@ def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequenc
 
 
 def _waypoints(rng: np.random.Generator, size: Array, stride: float) -> Array:
-    """[waypoint 3]: about `stride` apart, first towards the middle, then bending by at most 60 degrees each time."""
+    """Draw waypoints [waypoint 3] about `stride` apart, first towards the middle, then with turns up to 60 degrees."""
     start = rng.uniform(-0.5, 0.5, 2) * (size[[0, 2]] - 2 * MARGIN)
     first = np.arctan2(-start[0], -start[1]) + rng.uniform(-np.pi / 4, np.pi / 4)
     heading = np.cumsum(np.append(first, rng.uniform(-np.pi / 3, np.pi / 3, WAYPOINTS - 2)))
@@ -239,7 +239,7 @@ def _is_free(centers: Array, size: Array, furniture: Sequence[Solid]) -> bool:
 
 @dataclass(frozen=True)
 class RoomScene:
-    """A room and the camera that moves through it."""
+    """Room and the camera that moves through it."""
 
     room: Room
     furniture: tuple[Solid, ...]
@@ -247,14 +247,14 @@ class RoomScene:
 
 
 def draw_room_scene(rng: np.random.Generator, frames: int) -> RoomScene:
-    """A random room seen from `frames` places along a path."""
+    """Draw a random room and a path with `frames` camera positions."""
     size = np.array([rng.uniform(3.5, 4.6), rng.uniform(2.4, 2.9), rng.uniform(4.3, 5.6)])
     furniture = tuple(solid for piece in furnish(rng, size) for solid in piece)
     return RoomScene(_room(rng, size, furniture), furniture, draw_move(rng, frames, size, furniture))
 
 
 def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> tuple[Array, Array]:
-    """Picture [height width 3] and depth [height width], along the optical axis in room lengths, of one frame."""
+    """Render the image [height width 3] and the depth [height width], along the optical axis in the room's units."""
     intrinsics = scene.move.intrinsics(height, width) * np.array([width, height, width, height])
     picture, depth = trace_room(scene.room, scene.move.camera_to_room[frame], intrinsics, height, width, SAMPLES)
     return picture, depth
@@ -262,7 +262,7 @@ def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> 
 
 def _room(rng: np.random.Generator, size: Array, furniture: tuple[Solid, ...]) -> Room:
     colors, textures = _faces(rng)
-    # One thing on each wall: always a window, a door and a picture, and one more picture or window.
+    # Each wall has one decal: there is a window, a door, a picture, and one more picture or window.
     kinds = rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))])
     decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, kinds, strict=True)]
     places, decal_colors, decal_textures = (np.stack(parts) for parts in zip(*decals, strict=True))
@@ -285,22 +285,22 @@ def _room(rng: np.random.Generator, size: Array, furniture: tuple[Solid, ...]) -
 
 
 def _faces(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Colours [face 2 3] and textures [face 3]: related walls, a darker floor, a bright ceiling."""
+    """Draw colours [face 2 3] and textures [face 3]: walls of related hues, a darker floor, a bright ceiling."""
     hue = rng.uniform()
     colors, textures = np.zeros((6, 2, 3)), np.zeros((6, 3))
     for face in range(6):
-        own = hue + rng.uniform(-0.15, 0.15)
+        face_hue = hue + rng.uniform(-0.15, 0.15)
         value = {FLOOR: 0.7, CEILING: 1.0}.get(face, 0.92)
         saturation = {FLOOR: 0.5, CEILING: 0.06}.get(face, 0.25) * rng.uniform(0.6, 1.4)
         darker = 0.93 if face == CEILING else rng.uniform(0.6, 0.8)
-        colors[face] = color(own, saturation, value), color(own + 0.05, 1.3 * saturation, darker * value)
+        colors[face] = color(face_hue, saturation, value), color(face_hue + 0.05, 1.3 * saturation, darker * value)
         pattern = rng.choice([STRIPES, CHECKS] if face in (FLOOR, CEILING) else [STRIPES, CHECKS, RIPPLES])
         textures[face] = pattern, rng.uniform(6, 13), rng.uniform(0, 2 * np.pi)
     return colors, textures
 
 
 def _decal(rng: np.random.Generator, wall: int, kind: str, size: Array) -> tuple[Array, Array, Array]:
-    """Place [6], colours [3 3] and texture [3] of a rectangle on a wall."""
+    """Draw place [6], colours [3 3] and texture [3] of a rectangle on a wall."""
     half_width, low, high = {
         "window": (rng.uniform(0.4, 0.8), rng.uniform(0.8, 1.0), rng.uniform(1.8, 2.2)),
         "door": (rng.uniform(0.4, 0.5), 0.0, rng.uniform(1.9, 2.1)),

@@ -1,4 +1,4 @@
-"""Writes toy rooms with smooth camera moves in both of RealEstate10K's forms."""
+"""Writer of toy rooms with smooth camera moves, in both of RealEstate10K's forms."""
 
 import json
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ JPEG_QUALITY = 95
 
 @dataclass(frozen=True)
 class ClipFiles:
-    """A clip in the text form: `folder`/`key`.txt and `folder`/`key`/`timestamp`.jpg.
+    """Clip in the text form: `folder`/`key`.txt and `folder`/`key`/`timestamp`.jpg.
 
-    `cameras` [frame 18] are what the text says: fx fy cx cy in shares of width or height, two zeros, and
+    `cameras` [frame 18] are the numbers in the text: fx fy cx cy as fractions of width or height, two zeros, and
     `world_to_camera` by rows.
     """
 
@@ -38,16 +38,16 @@ class ClipFiles:
     cameras: NDArray[np.float32]
 
     @property
-    def url(self) -> str:  # nobody's video
+    def url(self) -> str:  # no real video
         return f"https://example.com/toy/{self.key}"
 
     def picture(self, frame: int) -> Path:
-        """Where a frame is."""
+        """Return the path of a frame's image."""
         return self.folder / self.key / f"{self.timestamps[frame]}.jpg"
 
 
 def clip_files(folder: Path, key: str, start: int, intrinsics: Array, world_to_camera: Array) -> ClipFiles:
-    """A clip whose first frame is `start` frames into its video; poses are [frame 3 4]."""
+    """Return a clip whose first frame is `start` frames into its video; poses are [frame 3 4]."""
     frames = len(world_to_camera)
     timestamps = [round((start + frame) * MICROSECONDS / FRAMES_PER_SECOND) for frame in range(frames)]
     rows = [np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), world_to_camera.reshape(frames, 12)]
@@ -55,17 +55,17 @@ def clip_files(folder: Path, key: str, start: int, intrinsics: Array, world_to_c
 
 
 def write_text(clip: ClipFiles) -> None:
-    """Write the text: the address, then a line of timestamp and camera for each frame; make the frames' folder."""
+    """Write the text (the address, then timestamp and camera of each frame in a line) and make the frames' folder."""
     (clip.folder / clip.key).mkdir(parents=True)
     lines = [clip.url]
     for time, row in zip(clip.timestamps, clip.cameras, strict=True):
-        # Nine digits tell float32 numbers apart, so the text says exactly what the chunks hold.
+        # Nine digits identify a float32 exactly, so text and chunks hold the same numbers.
         lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
     (clip.folder / f"{clip.key}.txt").write_text("\n".join(lines) + "\n")
 
 
 def write_picture(path: Path, image: Array) -> None:
-    """Colours in [0, 1], [height width 3], as a JPEG."""
+    """Write colours in [0, 1], [height width 3], as a JPEG."""
     pixels = np.round(255 * image.clip(0, 1)).astype(np.uint8)
     save_picture(Image.fromarray(pixels), path, quality=JPEG_QUALITY, subsampling=0)
 
@@ -93,11 +93,11 @@ def _chunk_entry(clip: ClipFiles) -> dict[str, Any]:
 def write_rooms(
     out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
 ) -> Path:
-    """Write `scenes` clips of `frames` pictures, `size` high and 16 / 9 as wide, with poses and intrinsics.
+    """Write `scenes` clips of `frames` images, `size` high and 16 / 9 as wide, with poses and intrinsics.
 
-    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg, `chunks`/<split>/ the same clips in NNNNNN.torch with
-    index.json. Every tenth clip, from the first, is in the split `test`, the others in `train`. See `write_once`, which
-    takes the numbers; `workers` are processes (by default one a core). Returns the folder, `out`/toy_rooms.
+    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg; `chunks`/<split>/ has the same clips in NNNNNN.torch and
+    index.json. The first and every tenth clip after it are in the split `test`, the others in `train`. See `write_once`
+    for the numbers; `workers` are processes (None: one for each core). Return the folder, `out`/toy_rooms.
     """
     splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
 
@@ -111,7 +111,7 @@ def write_rooms(
 
 
 def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> ClipFiles:
-    """The text form of one clip, from a random generator of its own."""
+    """Write the text form of one clip, drawn from a separate random generator."""
     index, split = place
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
