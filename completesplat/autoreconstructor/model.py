@@ -84,7 +84,7 @@ class VariationalAutoReconstructor(nn.Module):
 
         Args:
             images: the reference images, sRGB in [0, 1].
-            views: all views that the posterior may see, the reference first and its frame as the world. Without other views,
+            views: all views that the posterior may see, the reference first and its frame as the world. Without others,
                 or without a `view_encoder`, the result is the paper's posterior.
         """
         base, features = self.encoder(images)

@@ -130,7 +130,7 @@ def _download(hub_id: str, weights_file: str) -> Path:
     wanted = [f"{subfolder}/{name}".lstrip("/") for subfolder in SUBFOLDERS for name in (CONFIG_FILE, weights_file)]
     try:
         return Path(snapshot_download(hub_id, allow_patterns=wanted))
-    except Exception as error:  # of the hub, of its HTTP library and of the file system
+    except Exception as error:  # from the hub, its HTTP library or the file system
         reason = _first_line(error).split(". ")[0]
         raise WeightsError(
             f"{hub_id}: no folder here, and not to be had from the hub ({reason}); {_fetch_hint(hub_id)}"
