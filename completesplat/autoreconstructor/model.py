@@ -34,8 +34,8 @@ class VariationalAutoReconstructor(nn.Module):
     Args:
         variational: draw latents in training; False uses the posterior's mode there too (ablation "no variational
             sampling", which also drops the KL from the loss).
-        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
-            more forward pass.
+        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
+            memory and costs one more forward pass.
         pretrained: folder or hub id of a VAE in diffusers' layout to start from (`load_pretrained`); random if None.
         view_encoder: maps (views, depth range) to what the other views of the scene add to the posterior's moments
             (`view_encoders`); None: the paper's posterior, which sees the reference image alone.

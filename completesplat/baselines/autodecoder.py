@@ -1,7 +1,4 @@
-"""Reconstructor without an encoder: each image has a latent code that is optimised (Park et al. 2019, "DeepSDF").
-
-This is the supplement's "Reconstructor-only without the Encoder", which the paper reports as failed.
-"""
+"""Supplement's failed "Reconstructor-only without the Encoder": optimised latents (Park et al. 2019, "DeepSDF")."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -60,11 +57,7 @@ class AutoDecoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
-        """Return the codes of images, which are given by sequence and place in it.
-
-        Raises:
-            CompleteSplatError: the table has no row left for a new image.
-        """
+        """Return the codes of images, given by sequence and place; raise CompleteSplatError if the table is full."""
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
     def new_codes(self, count: int, seed: int) -> Codes:

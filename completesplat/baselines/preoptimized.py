@@ -35,10 +35,9 @@ def project_to_splatter_image(
 ) -> Projection:
     """Return the Splatter Image of a set of Gaussians, as far as its pixels have room for them.
 
-    Each pixel takes its most opaque Gaussians, the most opaque one in the first layer. Gaussians behind the camera or
-    outside its image are dropped, and so are those that are never drawn because their opacity is below 1/255. The
-    offset represents what ray and depth range cannot. Scales are clamped to the parameterisation's range, and opacities
-    to 1e-6 below 1.
+    Each pixel takes its most opaque Gaussians, the most opaque one in the first layer. Gaussians behind the camera,
+    outside its image, or with an opacity below 1/255 (never drawn) are dropped. The offset represents what ray and
+    depth range cannot. Scales are clamped to the parameterisation's range, opacities to 1e-6 below 1.
 
     Args:
         gaussians: [batch], in the reference cameras' frames.

@@ -65,10 +65,7 @@ class SparseVAE(nn.Module):
 
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:
-        """Set the normalisation to the mean and standard deviation over the occupied places of these images.
-
-        A channel that does not vary is only centred; a layer without Gaussians is not normalised.
-        """
+        """Set the normalisation to the mean and standard deviation over the occupied places of these images."""
         count, total, squares = (torch.zeros_like(self.mean, dtype=torch.float64) for _ in range(3))
         for image in images:
             mask = occupied(image)[:, :, None]
@@ -79,6 +76,7 @@ class SparseVAE(nn.Module):
         mean = total / count.clamp(min=1)
         variance = squares / count.clamp(min=1) - mean.square()
         self.mean.copy_(mean)
+        # A channel that does not vary is only centred; a layer without Gaussians is not normalised.
         self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
 
     def errors(self, found: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:

@@ -58,7 +58,7 @@ class StableDiffusionConditioning(nn.Module):
     This is not the autoreconstructor's encoder, whose weights training has changed.
 
     Args:
-        pretrained: folder or hub id of the VAE in diffusers' layout; None where a checkpoint supplies the weights.
+        pretrained: folder or hub id of the VAE in diffusers' layout; None if a checkpoint supplies the weights.
         out_channels: channels of phi_ref, which are the VAE's latent channels.
         channels, layers_per_block, norm_groups: the VAE's sizes, see `Encoder`.
 

@@ -103,8 +103,8 @@ class TextlessStableDiffusion(ConditionalUNet):
         attention_levels: levels with self- and cross-attention.
         layers_per_block: residual blocks per level.
         norm_groups: groups of the group normalisation.
-        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
-            more forward pass.
+        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
+            memory and costs one more forward pass.
     """
 
     context: Tensor

@@ -34,11 +34,7 @@ def signal_and_noise(
 
 
 def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
-    """Return the true prediction for a latent and the noise that was added to it.
-
-    Raises:
-        CompleteSplatError: the scheduler's prediction type is unknown.
-    """
+    """Return the true prediction for a latent and the noise added to it; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
         signal, share = signal_and_noise(scheduler, timestep, latent)
@@ -47,7 +43,7 @@ def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor
 
 
 def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
-    """Return the clean latent h that a prediction implies; raise like `target`."""
+    """Return the clean latent h that a prediction implies; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
     if kind == "epsilon":

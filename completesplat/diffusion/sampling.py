@@ -31,7 +31,7 @@ class Sampler:
     """Reverse diffusion with one of diffusers' deterministic schedulers.
 
     Args:
-        scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
+        scheduler: e.g. `diffusers.DDIMScheduler`; its options also define the forward process in training.
         steps: denoising steps unless a call overrides them (50 in the paper).
         ancestral: renew noise in each step (`renewed`), which forgets earlier errors; for flow matching only.
 
@@ -102,11 +102,9 @@ class Sampler:
         return scheduler
 
     def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
-        """Draw timesteps for training: uniform for diffusion, the logistic of a standard normal for flow matching.
-
-        The logistic favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
-        """
+        """Draw timesteps for training: uniform for diffusion, the logistic of a standard normal for flow matching."""
         if is_flow(self.scheduler):
+            # This favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
             middle: Tensor = torch.randn(count, device=device).sigmoid()
             return (middle * self.training_timesteps).ceil().long()
         return torch.randint(self.training_timesteps, (count,), device=device)

@@ -97,11 +97,8 @@ class PerceptualDistance(nn.Module):
     def forward(
         self, first: Float[Tensor, "image 3 height width"], second: Float[Tensor, "image 3 height width"]
     ) -> Float[Tensor, " image"]:
-        """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels.
-
-        The weights move to the images' device.
-        """
-        # Weights moved in inference mode (in a validation before the first step) could not be used in training.
+        """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
+        # Weights moved to a device in inference mode (validation before the first step) could not be used in training.
         with torch.inference_mode(False):
             self.to(first.device)
         layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)

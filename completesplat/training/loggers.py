@@ -43,7 +43,7 @@ class ContinuedCSVLogger(CSVLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> "MetricsFile":
-        """Return the file; Lightning calls what a logger writes to an experiment."""
+        """Return the metrics file, which Lightning calls the experiment."""
         if self._experiment is None:
             self._experiment = MetricsFile(self.log_dir)
         return self._experiment  # type: ignore[return-value]
@@ -96,7 +96,7 @@ class MetricsFile(ExperimentWriter):
 
 
 class WandbRun(WandbLogger):
-    """Logger to a directory's only W&B run, which a resumed run continues: its id is in `save_dir/wandb_id`.
+    """Logger of a directory's only W&B run. Its id is in `save_dir/wandb_id`, so a resumed run continues it.
 
     `mode=online` becomes `offline`, with a warning, if the server does not answer or refuses; `wandb sync` uploads the
     log later. If W&B's own process dies, training goes on without it.

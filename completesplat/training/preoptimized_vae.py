@@ -78,7 +78,7 @@ class FittedScenes:
             save_file({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}, temporary)
 
     def _path(self, name: str) -> Path:
-        """Return the file of a sequence; names of sequences may have slashes, so it is named by a hash."""
+        """Return the file of a sequence, named by a hash because names of sequences may have slashes."""
         key = hashlib.sha256(f"{name}\n{self.settings}".encode()).hexdigest()[:24]
         return self.folder / f"{key}.safetensors"
 

@@ -194,10 +194,7 @@ def shards_of(path: Path) -> dict[str, Any]:
 
 
 def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
-    """Put the divided tensors of a checkpoint back into its contents, as if one process had written it.
-
-    The files of these tensors are safetensors, so reading them runs no code.
-    """
+    """Put the divided tensors of a checkpoint back into its contents, as if one process had written it."""
     if (shards := contents.pop(SHARDS, None)) is None:
         return contents
     from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # slow to import
@@ -210,7 +207,7 @@ def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
     if needed > sum(file.stat().st_size for file in folder.iterdir()):
         raise WeightsError(f"{path}: not a readable checkpoint (its tensors are larger than the files in {folder})")
     tensors = {name: torch.empty(entry.size, dtype=entry.properties.dtype) for name, entry in entries.items()}
-    load(tensors, storage_reader=reader, no_dist=True)
+    load(tensors, storage_reader=reader, no_dist=True)  # safetensors, so this runs no code of the files
 
     def filled(value: Any) -> Any:
         if isinstance(value, str) and value.startswith(DIVIDED):
