@@ -80,7 +80,7 @@ class Encoder(nn.Module):
     def encode(
         self, values: Float[Tensor, "batch channel height width"]
     ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
-        """Encode values around zero without rescaling them; the result is that of `forward`."""
+        """Encode values around zero without rescaling them; `forward` describes the result."""
         network: Any = self.network
         features = self._features(values, len(network.down_blocks))
         hidden = self._run(network.mid_block, features[-1])

@@ -28,7 +28,7 @@ class PlaneSweep(nn.Module):
 
     Args:
         planes: depths along each ray, from near to far.
-        channels, layers_per_block, latent_channels, norm_groups: see `Encoder`; with as many levels as there.
+        channels, layers_per_block, latent_channels, norm_groups: see `Encoder`; as many levels as it has.
     """
 
     def __init__(

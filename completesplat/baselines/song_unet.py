@@ -26,7 +26,7 @@ def _norm(channels: int) -> nn.GroupNorm:
 class ScaledConvolution(nn.Conv2d):
     """Convolution after doubling ("up"), halving ("down") or keeping ("") the image's size.
 
-    Both resampling filters are a box of two pixels. Published weights contain it, so it is a buffer.
+    Both resampling filters are a box of two pixels. Published weights contain the filter, so it is a buffer.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, scale: str = "") -> None:

@@ -69,7 +69,7 @@ class Checkpoints(Checkpoint):
     with `Interrupted`.
 
     Args:
-        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between checkpoints; None: no limit.
+        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between checkpoints; None: ignored.
         keep_every: optimizer steps between milestones (at least 1); None: no milestones.
     """
 

@@ -160,7 +160,7 @@ def encode_training_set(
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished store of the same encodings is not changed. An interrupted run leaves no store that opens. Several
+    A finished store of the same encodings is not changed. An interrupted run leaves no readable store. Several
     processes share the batches, and the first one writes the same store as a single process would.
 
     Args:

@@ -23,7 +23,7 @@ def muon(
     """Build Muon (Jordan 2024; library pytorch_optimizer) for matrices and kernels, with Adam for biases and norms.
 
     A convolution's kernel is treated as the matrix [out in*height*width]. An update has about the same length in all
-    directions, which needs fewer steps than Adam but, on a CPU, a third more time for each.
+    directions, so Muon needs fewer steps than Adam but, on a CPU, a third more time for each.
 
     Args:
         lr: learning rate of matrices and kernels; the size of their gradients makes no difference.
@@ -44,7 +44,7 @@ def muon(
 
 
 def _orthogonal_in_float32(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Tensor]:
-    """Do as the library in float32, because CPUs without bfloat16 take a hundred times as long in that type."""
+    """Orthogonalise in float32, because the library's bfloat16 takes a hundred times as long on CPUs without it."""
     from pytorch_optimizer.optimizer.utils.matrix import zero_power_via_newton_schulz_5
 
     settings = {"num_steps": group["ns_steps"], "weights": group["ns_coeffs"], "dtype": torch.float32}

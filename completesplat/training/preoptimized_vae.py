@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 class FittedScenes:
-    """Store of Gaussians that are fitted to all images of a sequence, when a sequence is first asked for.
+    """Store of Gaussians that are fitted to all images of a sequence when it is first asked for.
 
     One sequence at a time is in memory: its images and masks (16 bytes a pixel) and its Gaussians. A file takes 56
     bytes for each Gaussian, so 1,000 sequences with 4,000 Gaussians each take 224 MB.

@@ -41,7 +41,7 @@ class ReconstructorOnly(ReconstructionModule):
             self.model.make_room(sum(_frames(source, name) for name in source.names))
 
     def on_fit_start(self) -> None:
-        """Raise CompleteSplatError for several processes, because each would give the codes to other images."""
+        """Raise CompleteSplatError for several processes, because each would assign the codes to other images."""
         super().on_fit_start()
         if self.trainer.world_size > 1:
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")

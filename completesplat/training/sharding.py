@@ -28,7 +28,7 @@ from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUF
 
 
 class FullyShardedStrategy(DDPStrategy):
-    """DDP strategy whose processes also share the trained networks: each keeps a part, and trains on a part of a batch.
+    """DDP strategy that also divides the trained networks: each process keeps a share and trains on a share of a batch.
 
     Networks are whole while they compute. Each of `SceneModule.networks` is one unit of torch's `fully_shard`, and so
     is its average. Outside of training everything is as with DDP, because processes that test have different numbers

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def stopped_together() -> Iterator[None]:
-    """Leave signals to `completesplat.signals`, and end processes that trainers or `Fabric` start with this one.
+    """Leave signals to `completesplat.signals`, and let processes that trainers or `Fabric` start end with this one.
 
     Lightning's own handlers wait for other processes in the middle of a step, for ever if these are gone. They end
     `fit` and `test` with exit status 0, and its observer kills the first process if another one has got a signal.

@@ -21,8 +21,8 @@ class Throughput(Callback):
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
     for data, cover the steps since the last row; for memory see `memory`. All are means over the processes. The clock
-    stops during validation, while checkpoints are written, and from a row to the next batch. So it excludes the drawing
-    of images if their interval is a multiple of the trainer's, and this callback comes before theirs.
+    stops during validation, while checkpoints are written, and from a row to the next batch. The latter excludes the
+    drawing of images if its interval is a multiple of the trainer's, and this callback comes first.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:

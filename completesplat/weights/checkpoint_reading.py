@@ -32,7 +32,7 @@ DIVIDED = "divided:"
 """Prefix of the name that replaces a divided tensor."""
 ZIP = b"PK\3\4"
 MOST_REPEATED = 2**22
-"""Largest size of a tensor that has more numbers than its file, because it repeats them."""
+"""Largest number of elements of a tensor that has more of them than its file, because it repeats them."""
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
     r"|collections (OrderedDict|Counter)|_codecs encode"

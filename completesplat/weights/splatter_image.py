@@ -68,7 +68,7 @@ class Published(NamedTuple):
 
 
 def is_published(weights: Path | str) -> bool:
-    """Return whether `weights` are read here: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
+    """Return whether `weights` are Splatter Image's: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
     path = Path(str(weights)).expanduser()
     return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (os.path.isdir(path) and bool(_models_in(path)))
 
