@@ -1,4 +1,4 @@
-"""From one image to complete scenes. No Lightning here: this is the part that other programs use.
+"""Models from one image to complete scenes, without Lightning, for use in other programs.
 
 model = CompleteSplat.from_pretrained("toy_objects")
 scenes = model("photo.jpg", samples=4, seed=0)
@@ -41,16 +41,16 @@ from completesplat.weights.splatter_image import is_published
 class CompleteSplat(SceneModel):
     """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
 
-    The four parts are given as configurations (`_target_` and arguments, as in `conf/`), so that they can be written
-    beside the weights and built again by `from_pretrained`.
+    The four parts are given as configs (`_target_` and arguments, as in `conf/`), which are written beside the weights,
+    so that `from_pretrained` can build the parts again.
 
     Args:
-        autoreconstructor, conditioning, denoiser, sampler: configurations of the parts.
+        autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
         image_size: side of the square images, in pixels.
-        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
+        training: facts about the training images (`completesplat.parts.TrainingPictures`).
 
     Raises:
-        WeightsError: a part or a setting that weights may not name (`parts`).
+        WeightsError: a config has a part or an option that weights may not name (`parts`).
     """
 
     latent_mean: Tensor
@@ -73,19 +73,19 @@ class CompleteSplat(SceneModel):
         architecture = {**saved, "sampler": dict(sampler), "image_size": image_size, **facts}
         check_architecture(architecture)
         super().__init__(architecture)
-        # Its weights are a trained stage's: Stable Diffusion's are not needed at all.
+        # Its weights come from a trained stage, so Stable Diffusion's are not needed.
         self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
         self.sampler = build(sampler)
-        # Measured on the training set by the training stage.
+        # The training stage measures these on the training set.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
         self.register_buffer("latent_std", torch.ones(channels, 1, 1))
 
     @property
     def reconstructing(self) -> Any:
-        """The autoreconstructor."""
+        """Return the autoreconstructor."""
         return self.autoreconstructor
 
     def train(self, mode: bool = True) -> "CompleteSplat":
@@ -101,20 +101,19 @@ class CompleteSplat(SceneModel):
         views: Views | None = None,
         depth_range: Float[Tensor, "batch 2"] | None = None,
     ) -> Float[Tensor, "batch channel _ _"]:
-        """Draw each scene's latent from the frozen posterior ("we also sample latent codes", supplement), standardised.
+        """Draw each scene's standardised latent from the frozen posterior ("we also sample latent codes", supplement).
 
-        Args:
-            images, views, depth_range: see `VariationalAutoReconstructor.posterior`.
+        The arguments are those of `VariationalAutoReconstructor.posterior`.
         """
         return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
 
     def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
-        """Mean and deviation of each of the latent's channels on the training set."""
+        """Set the mean and standard deviation of each latent channel on the training set."""
         self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
         self.latent_std.copy_(torch.tensor(std)[:, None, None])
 
     def standardised(self, latent: Float[Tensor, "batch channel _ _"]) -> Float[Tensor, "batch channel _ _"]:
-        """Latents as the denoiser knows them: of mean 0 and deviation 1 in each channel of the training set."""
+        """Scale latents for the denoiser: mean 0 and standard deviation 1 in each channel over the training set."""
         return (latent - self.latent_mean) / self.latent_std
 
     @torch.no_grad()
@@ -134,22 +133,22 @@ class CompleteSplat(SceneModel):
     ) -> Gaussians:
         """Draw `samples` scenes for each image.
 
-        Noise is drawn first: how many samples are computed at a time changes no more than the rounding of float32.
+        All noise is drawn first, so `batch` changes nothing but the rounding of float32.
 
         Args:
-            skip_weight: 1, the default, is most faithful (supplement, "Diverse Sampling"); 0 if something is hidden.
+            skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
             guidance_weight: share of the unconditional prediction; more gives more diverse samples.
-            steps: denoising steps; the sampler's own number by default.
-            seed: of all noise, or one for each image: what is drawn for it then depends on no other image.
-            visible: 0 where an image is hidden: what is there has no influence.
+            steps: denoising steps; by default the sampler's number.
+            seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
+            visible: 0 where an image is hidden; hidden pixels have no influence.
             batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
-            on_step: called after each denoiser call of each batch: its number, the timestep, the estimated scenes.
+            on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
 
         Returns:
             Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
 
         Raises:
-            CompleteSplatError: weights outside of [0, 1], skips with something hidden, impossible steps.
+            CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.
         """
         weight = allowed_skip_weight(skip_weight, visible)
         images = images if visible is None else images * visible
@@ -162,10 +161,10 @@ class CompleteSplat(SceneModel):
         decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
         def draw(part: slice) -> Any:
-            shown = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
-            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, shown)
+            watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
+            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
 
-        # One after the other: where a GPU's memory does not suffice to decode a part, its latents are kept.
+        # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
         latents = torch.cat(in_parts(draw, len(noise), batch))
         return concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
 
@@ -179,15 +178,15 @@ class CompleteSplat(SceneModel):
         latent: Tensor,
         part: slice,
     ) -> Gaussians:
-        """Scenes of the latents of a part of all samples, whose images' numbers `image_of` has."""
-        own = image_of[part]
-        skips = [feature[own] for feature in features], skip_weight
+        """Decode the latents of a part of all samples; `image_of` maps each sample to the index of its image."""
+        indices = image_of[part]
+        skips = [feature[indices] for feature in features], skip_weight
         splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)
-        gaussians: Gaussians = splatter_image.gaussians(cameras[own], depth_range[own])
+        gaussians: Gaussians = splatter_image.gaussians(cameras[indices], depth_range[indices])
         return gaussians
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
-        """Draw with another sampler from now on; noise schedule and prediction type stay those of training."""
+        """Use another sampler from now on, with the noise schedule and prediction type of training."""
         config = with_forward_process(sampler, self.architecture["sampler"])
         check_architecture({**self.architecture, "sampler": config})
         self.sampler = build(config)
@@ -195,16 +194,16 @@ class CompleteSplat(SceneModel):
 
     @staticmethod
     def from_pretrained(path: Path | str) -> "SceneModel":
-        """Build what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
+        """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
 
         Args:
-            path: a folder of weights, a run's, a checkpoint of a run, a name of the weights in the package, or an id of
-                the Hugging Face hub (`weights_folder`); or `splatter_image:NAME`, or a file or folder of these weights,
-                which are a `PublishedGenerator`.
+            path: a folder of weights or of a run, a checkpoint of a run, a name of weights in the package, or an id on
+                the Hugging Face hub (`weights_folder`). `splatter_image:NAME`, or a file or folder of these weights,
+                gives a `PublishedGenerator`.
 
         Raises:
-            WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name what
-                `parts` does not; or the run is of a model that makes no scene of a photograph.
+            WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
+                `parts` does not allow; or the run's model makes no scene from a photo.
         """
         try:
             if is_published(path):
@@ -225,15 +224,15 @@ class CompleteSplat(SceneModel):
 
 
 class OneAnswer(SceneModel):
-    """One pass from a photograph to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
+    """Model of one pass from a photo to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
 
     Args:
-        network: configuration of the network, as in `conf/`.
+        network: config of the network, as in `conf/`.
         image_size: side of the square images, in pixels.
-        training: what is known of the training pictures (`completesplat.parts.TrainingPictures`).
+        training: facts about the training images (`completesplat.parts.TrainingPictures`).
 
     Raises:
-        WeightsError: a part or a setting that weights may not name (`parts`).
+        WeightsError: the config has a part or an option that weights may not name (`parts`).
     """
 
     def __init__(self, network: Mapping[str, Any], image_size: int, training: Mapping[str, Any] | None = None) -> None:
@@ -245,7 +244,7 @@ class OneAnswer(SceneModel):
 
     @property
     def reconstructing(self) -> Any:
-        """The network."""
+        """Return the network."""
         return self.network
 
     @torch.no_grad()
@@ -258,14 +257,14 @@ class OneAnswer(SceneModel):
         visible: Float[Tensor, "batch 1 height width"] | None = None,
         **settings: Any,
     ) -> Gaussians:
-        """The scene of each image, in its camera's frame.
+        """Reconstruct the scene of each image, in its camera's frame.
 
         Args:
-            visible: 0 where an image is hidden: what is there has no influence.
-            **settings: those of `CompleteSplat.generate` that are about drawing; they have no effect.
+            visible: 0 where an image is hidden; hidden pixels have no influence.
+            **settings: sampling options of `CompleteSplat.generate`; they have no effect.
 
         Raises:
-            CompleteSplatError: several samples.
+            CompleteSplatError: several samples are asked for.
         """
         require_one(samples)
         splatter_image = self.eval().network(images if visible is None else images * visible).splatter_image
@@ -276,11 +275,12 @@ class OneAnswer(SceneModel):
     def with_trained(
         architecture: Mapping[str, Any], network: Mapping[str, Tensor], camera: Mapping[str, Any]
     ) -> "OneAnswer":
-        """The model with a trained network's weights, and with its training set's typical camera.
+        """Return a model with a trained network's weights, and with its training set's typical camera.
 
-        `WeightsError`: the camera has other values than `fov_degrees`, `depth_range` and `up`, or they are no numbers.
+        Raises:
+            WeightsError: the camera lacks `fov_degrees`, `depth_range` or `up`, or they are no numbers.
         """
-        with torch.random.fork_rng(devices=[]):  # the first weights are random; what a run draws later does not change
+        with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
             model = OneAnswer(**architecture)
         names = ("fov_degrees", "depth_range", "up")
         try:
@@ -300,7 +300,7 @@ def _read_folder(folder: Path) -> SceneModel:
 
 
 def _read_checkpoint(checkpoint: Path) -> SceneModel:
-    """Averaged weights, if the run averages them."""
+    """Return the model of a run's checkpoint, with averaged weights if the run averages them."""
     architecture, prefix = architecture_of_run(checkpoint)
     contents = read_checkpoint(checkpoint)
     state = {k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}

@@ -1,4 +1,4 @@
-"""What all models have in common that make scenes of photographs: pictures and cameras in, Gaussians out, files."""
+"""Base class of all models that make scenes from photos: its inputs, cameras, units and files."""
 
 import json
 from abc import abstractmethod
@@ -22,10 +22,10 @@ from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
 
 class SceneModel(nn.Module):
-    """What makes scenes of photographs: `CompleteSplat`, which draws them, `OneAnswer` and `PublishedGenerator`.
+    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedGenerator`.
 
     Args:
-        architecture: the configuration, as it is written beside the weights; it has `image_size`.
+        architecture: the config that is written beside the weights; it has `image_size`.
     """
 
     fov_degrees: Tensor
@@ -33,13 +33,13 @@ class SceneModel(nn.Module):
     up: Tensor
 
     draws_samples = False
-    """Whether it has several answers for one photograph."""
+    """Whether it has several answers for one photo."""
 
     def __init__(self, architecture: dict[str, Any]) -> None:
         super().__init__()
         self.architecture = architecture
         self.image_size: int = architecture["image_size"]
-        # Measured on the training set; they serve photographs of unknown cameras.
+        # These are measured on the training set and serve photos of unknown cameras.
         self.register_buffer("fov_degrees", torch.tensor(50.0))
         self.register_buffer("depth_range", torch.tensor([0.5, 5.0]))
         self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
@@ -47,30 +47,30 @@ class SceneModel(nn.Module):
     @property
     @abstractmethod
     def reconstructing(self) -> Any:
-        """The network that makes a Splatter Image of a picture, or of several views, without drawing."""
+        """Return the network that makes a Splatter Image from one image, or from several views, without sampling."""
 
     @abstractmethod
     def generate(self, *inputs: Any, **settings: Any) -> Gaussians:
-        """See `CompleteSplat.generate`."""
+        """Generate scenes, see `CompleteSplat.generate`."""
 
     @property
     def parameterization(self) -> Parameterization:
-        """How the raw values of its Splatter Images are read."""
-        found: Parameterization = self.reconstructing.parameterization
-        return found
+        """Return the parameterization of its Splatter Images."""
+        parameterization: Parameterization = self.reconstructing.parameterization
+        return parameterization
 
     def forward(
         self, image: Photograph | Picture, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
     ) -> list[Gaussians]:
-        """Complete scenes from one photograph, in its camera's frame (+x right, +y down, +z forward).
+        """Generate complete scenes from one photo, in its camera's frame (+x right, +y down, +z forward).
 
         Args:
-            image: a file, a PIL image, an array, a tensor (`read`), or a photograph that was read.
-            visible: 0 where it is hidden; see `completesplat.data.pictures.photograph`.
+            image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
+            visible: 0 where the image is hidden; see `completesplat.data.pictures.photograph`.
             **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
 
         Raises:
-            CompleteSplatError: not a readable image, or what `generate` refuses.
+            CompleteSplatError: the image is not readable, or `generate` refuses an option.
         """
         check_settings(self.generate, settings)
         photograph = image if isinstance(image, Photograph) else self.read(image)
@@ -85,21 +85,21 @@ class SceneModel(nn.Module):
         return [scenes[i] for i in range(len(scenes.means))]
 
     def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
-        """Near and far of what a photograph shows: those of the training set."""
+        """Return near and far of the scene in a photo: those of the training set."""
         return self.depth_range
 
     @torch.no_grad()
     def reconstruct(self, views: Views) -> Gaussians:
-        """The scene that several views show, at the posterior's mean: nothing is drawn.
+        """Reconstruct the scene of several views at the posterior's mean, without sampling.
 
         Args:
-            views: [view ...], the first the reference and its frame the world, in the model's units (`in_own_units`).
+            views: [view ...], in the model's units (`in_own_units`); the first is the reference, its frame the world.
 
         Returns:
             Gaussians in the frame of the first camera.
 
         Raises:
-            WeightsError: the posterior of these weights sees one picture.
+            WeightsError: the posterior of these weights sees one image alone.
         """
         if not getattr(self.reconstructing, "sees_views", False):
             raise WeightsError("these weights reconstruct from one picture: they were trained with posterior=image")
@@ -109,13 +109,13 @@ class SceneModel(nn.Module):
         return scene
 
     def in_own_units(self, cameras: Cameras) -> Cameras:
-        """Cameras of any units, in a world that is scaled to what the model knows.
+        """Scale the world of cameras in any units to the model's units.
 
-        The point nearest to all optical axes comes to the depth at which untrained Gaussians start
-        (`Parameterization.first_depth`), which a data set's objects are meant to lie at.
+        The point nearest to all optical axes gets the depth at which untrained Gaussians start
+        (`Parameterization.first_depth`), because a data set's objects should lie there.
 
         Raises:
-            CompleteSplatError: axes that are parallel, or meet behind the first camera.
+            CompleteSplatError: the axes are parallel, or meet behind the first camera.
         """
         center = nearest_to_axes(cameras)
         depth = 0.0 if center is None else transform_points(cameras[0].world_to_camera, center[None])[0, 2].item()
@@ -126,35 +126,36 @@ class SceneModel(nn.Module):
         return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
 
     def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
-        """A picture at the model's size (`read_photograph`); an unknown field of view is the training set's."""
+        """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's."""
         return read_photograph(picture, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
 
     @property
     def knows_hidden(self) -> bool:
-        """Whether parts of the pictures were hidden in training; weights that do not say it count as not."""
+        """Whether parts of the images were hidden in training; False if the weights do not record it."""
         return bool(self.architecture.get("training", {}).get("box_masks", 0) > 0)
 
     def distance(self, photograph: Photograph) -> float | None:
-        """How far a photograph lies from the training pictures, in their deviations; None: the weights do not say.
+        """Return a photo's distance from the training images in their standard deviations; None if it is unknown.
 
-        The root mean square over the `picture_features`: about 1 for a picture of the same kind.
+        It is the root mean square over the `picture_features`: about 1 for an image of the same kind.
         """
         training = self.architecture.get("training", {})
         if not {"picture_mean", "picture_std"} <= training.keys():
             return None
-        mean, deviation = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
-        return ((picture_features(photograph.image) - mean) / deviation).square().mean().sqrt().item()
+        mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
+        return ((picture_features(photograph.image) - mean) / std).square().mean().sqrt().item()
 
     def camera(self, photograph: Photograph) -> Cameras:
-        """The camera that took a photograph, at the origin of the world."""
+        """Return the camera that took a photo, at the origin of the world."""
         device = self.up.device
         intrinsics = pinhole(photograph.fov_degrees, self.image_size).to(device)
         return Cameras(torch.eye(4, device=device), intrinsics, (self.image_size, self.image_size))
 
     def save_pretrained(self, path: Path | str) -> None:
-        """Write `config.json`, `model.safetensors` and their checksums into a folder; fit for the Hugging Face hub.
+        """Write `config.json`, `model.safetensors` and their checksums into a folder, ready for the Hugging Face hub.
 
-        Raises: those of `make_folder`.
+        Raises:
+            CompleteSplatError, DiskError: see `make_folder`.
         """
         folder = Path(path)
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -167,6 +168,6 @@ class SceneModel(nn.Module):
 
 
 def require_one(samples: int) -> None:
-    """`CompleteSplatError` where several samples are asked of a model that draws none."""
+    """Raise CompleteSplatError if several samples are asked of a model that gives one answer."""
     if samples != 1:
         raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")

@@ -1,1 +1,1 @@
-"""The Variational AutoReconstructor: one image to a latent, a latent to a Splatter Image (paper, Section 3.2)."""
+"""Variational AutoReconstructor: from an image to a latent, from a latent to a Splatter Image (paper, Section 3.2)."""

@@ -1,4 +1,4 @@
-"""Stable Diffusion's VAE encoder, unchanged, which also hands out its features before each downsampling."""
+"""Stable Diffusion's VAE encoder, unchanged except that it also returns the features before each downsampling."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -14,7 +14,7 @@ from completesplat.schema import Few, Range, Width, Widths
 
 
 def recompute(block: nn.Module, *inputs: Any) -> Any:
-    """A block's output, in training without its activations: the backward pass computes them a second time."""
+    """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
     if block.training and torch.is_grad_enabled():
         return checkpoint(block, *inputs, use_reentrant=False)
     return block(*inputs)
@@ -23,7 +23,7 @@ def recompute(block: nn.Module, *inputs: Any) -> Any:
 def vae_encoder(
     inputs: int, outputs: int, channels: Sequence[int], layers_per_block: int, norm_groups: int
 ) -> vae.Encoder:
-    """The network of Stable Diffusion's VAE encoder; its resolution halves between the levels."""
+    """Build the network of Stable Diffusion's VAE encoder; the resolution halves between levels."""
     return vae.Encoder(
         in_channels=inputs,
         out_channels=outputs,
@@ -36,19 +36,19 @@ def vae_encoder(
 
 
 class Encoder(nn.Module):
-    """Image -> posterior over latents at 1 / 2^(levels - 1) of the resolution, and one feature map per level.
+    """Encoder from an image to a posterior over latents at 1 / 2^(levels - 1) of its resolution.
 
-    The defaults are Stable Diffusion's (`AutoencoderKL`, 34.2 M parameters). With `gradient_checkpointing` set, blocks
-    `recompute` their activations.
+    It also returns one feature map per level. The defaults are Stable Diffusion's (`AutoencoderKL`, 34.2 M parameters).
+    If `gradient_checkpointing` is set, `recompute` applies the blocks.
 
     Args:
         channels: width of each level, from full resolution down.
         layers_per_block: residual blocks per level.
         latent_channels: channels of the latent.
         norm_groups: groups of the group normalisation.
-        in_channels: of what is encoded; 3 for images.
-        first_log_variance: about what the posterior's is at the start, where nothing pretrained is loaded. At 0 noise
-            of deviation 1 covers what the latents say at first.
+        in_channels: channels of the input; 3 for images.
+        first_log_variance: approximate log-variance of the posterior at the start, without pretrained weights. At 0,
+            noise of standard deviation 1 hides what the latents encode at first.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Encoder(nn.Module):
     def encode(
         self, values: Float[Tensor, "batch channel height width"]
     ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
-        """Encode values as they are, which should lie around zero; returns what `forward` does."""
+        """Encode values around zero without rescaling them; `forward` describes the result."""
         network: Any = self.network
         features = self._features(values, len(network.down_blocks))
         hidden = self._run(network.mid_block, features[-1])
@@ -90,7 +90,7 @@ class Encoder(nn.Module):
     def features(
         self, images: Float[Tensor, "batch 3 height width"], levels: int
     ) -> list[Float[Tensor, "batch _ _ _"]]:
-        """The features of the first levels, as `forward` returns them, without the work for what follows these."""
+        """Return the features of the first levels as `forward` does, without computing anything after them."""
         return self._features(images * 2 - 1, levels)
 
     def _features(self, values: Tensor, levels: int) -> list[Tensor]:

@@ -1,4 +1,4 @@
-"""The Variational AutoReconstructor as one module."""
+"""Variational AutoReconstructor as one module."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Reconstruction(TensorDataclass):
-    """What a reconstruction model predicts from one image; regression baselines have no posterior."""
+    """Prediction of a reconstruction model from one image; regression baselines have no posterior."""
 
     splatter_image: SplatterImage
     posterior: Posterior | None
@@ -27,18 +27,18 @@ class Reconstruction(TensorDataclass):
 class VariationalAutoReconstructor(nn.Module):
     """Encoder and reconstructor (paper, Section 3.2 and Figure 3).
 
-    In training a latent is drawn from the posterior, and the skip features of a sample are zeroed, all of them at
-    once, with probability `skip_dropout` (supplement, "Skip connection"; the probability is not stated in the
-    paper). In evaluation the posterior's mode is used, with full skips.
+    In training a latent is drawn from the posterior, and all skip features of a sample are zeroed together with
+    probability `skip_dropout` (supplement, "Skip connection"; the paper does not state the probability). Evaluation
+    uses the posterior's mode, with full skips.
 
     Args:
         variational: draw latents in training; False uses the posterior's mode there too (ablation "no variational
             sampling", which also drops the KL from the loss).
-        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
-            more forward pass.
+        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
+            memory and costs one more forward pass.
         pretrained: folder or hub id of a VAE in diffusers' layout to start from (`load_pretrained`); random if None.
-        view_encoder: (views, depth range) -> what other views of the scene add to the posterior's moments
-            (`view_encoders`); None: the paper's posterior, of the picture alone.
+        view_encoder: maps (views, depth range) to what the other views of the scene add to the posterior's moments
+            (`view_encoders`); None: the paper's posterior, which sees the reference image alone.
 
     Raises:
         WeightsError: the pretrained weights are missing, damaged or of another size.
@@ -66,12 +66,12 @@ class VariationalAutoReconstructor(nn.Module):
 
     @property
     def sees_views(self) -> bool:
-        """Whether the posterior takes in other views than the reference."""
+        """Whether the posterior depends on views other than the reference."""
         return self.view_encoder is not None
 
     @property
     def parameterization(self) -> Parameterization:
-        """How the raw values of its Splatter Images are read."""
+        """Return the parameterization of the predicted Splatter Images."""
         return self.reconstructor.parameterization
 
     def posterior(
@@ -80,19 +80,19 @@ class VariationalAutoReconstructor(nn.Module):
         views: Views | None = None,
         depth_range: Float[Tensor, "batch 2"] | None = None,
     ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
-        """The posterior of latents, and the reference's features for the skips.
+        """Return the posterior of latents, and the reference's features for the skips.
 
         Args:
-            images: the reference pictures, sRGB in [0, 1].
-            views: all views that the posterior may see, the reference first and its frame as the world; without others
-                than the reference, and without an encoder of views, it is the paper's.
+            images: the reference images, sRGB in [0, 1].
+            views: all views that the posterior may see, the reference first and its frame as the world. Without others,
+                or without a `view_encoder`, the result is the paper's posterior.
         """
-        own, features = self.encoder(images)
+        base, features = self.encoder(images)
         if self.view_encoder is None or views is None or views.images.shape[1] < 2:
-            return own, features
+            return base, features
         assert depth_range is not None
         mean, log_variance = self.view_encoder(views, depth_range).chunk(2, 1)
-        return from_moments(torch.cat([own.mean + mean, own.log_variance + log_variance], 1)), features
+        return from_moments(torch.cat([base.mean + mean, base.log_variance + log_variance], 1)), features
 
     def forward(
         self,
@@ -100,10 +100,10 @@ class VariationalAutoReconstructor(nn.Module):
         views: Views | None = None,
         depth_range: Float[Tensor, "batch 2"] | None = None,
     ) -> Reconstruction:
-        """Reconstruct from sRGB images in [0, 1]; in training also from `views` (see `posterior`)."""
+        """Reconstruct from sRGB images in [0, 1], and from `views` if the posterior sees them."""
         posterior, features = self.posterior(images, views, depth_range)
         if not self.training:
             return Reconstruction(self.reconstructor(posterior.mode(), features), posterior)
-        kept = (torch.rand(len(images), device=images.device) >= self.skip_dropout).float()
+        skip_mask = (torch.rand(len(images), device=images.device) >= self.skip_dropout).float()
         latent = posterior.sample() if self.variational else posterior.mode()
-        return Reconstruction(self.reconstructor(latent, features, kept), posterior)
+        return Reconstruction(self.reconstructor(latent, features, skip_mask), posterior)

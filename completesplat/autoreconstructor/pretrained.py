@@ -1,4 +1,4 @@
-"""Starting from Stable Diffusion's VAE: a checkpoint in diffusers' layout, from a folder or the Hugging Face hub."""
+"""Pretrained weights of Stable Diffusion's VAE in diffusers' layout, from a folder or the Hugging Face hub."""
 
 import json
 import re
@@ -22,7 +22,7 @@ ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 # The names of older diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
 OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
-# Keys of config.json and our settings of the same meaning.
+# Keys of config.json, and our options with the same meaning.
 SETTINGS = {
     "block_out_channels": "channels",
     "layers_per_block": "layers_per_block",
@@ -32,13 +32,13 @@ SETTINGS = {
 
 
 def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str) -> None:
-    """Load a VAE into both halves, except for the last convolution, whose channels are a Splatter Image's.
+    """Load a VAE, except for the last convolution, whose outputs are a Splatter Image here.
 
-    The reconstructor's skips have no counterpart in the checkpoint and stay as they are.
+    The reconstructor's skips have no counterpart in the checkpoint and keep their values.
 
     Args:
-        source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), one with these in a
-            subfolder `vae`, or a hub id of either.
+        source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), a folder with these
+            in a subfolder `vae`, or a hub id of either.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
@@ -49,7 +49,7 @@ def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str)
 
 
 def load_pretrained_encoder(encoder: Encoder, source: str) -> None:
-    """Load the encoder of a VAE, see `load_pretrained`; its decoder may be missing.
+    """Load the encoder of a VAE like `load_pretrained`; the checkpoint may lack a decoder.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
@@ -75,7 +75,7 @@ def _load(folder: Path, encoder: Encoder, decoder: Mapping[str, nn.Module], weig
 
 
 def _mismatch(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], groups: int, own_groups: int) -> str | None:
-    """The first thing about a checkpoint that does not fit, if any."""
+    """Describe the first mismatch between a checkpoint and the network, if there is one."""
     own = {name: value for name, value in own.items() if name not in HEAD}
     for name, value in own.items():
         if name in weights and weights[name].shape != value.shape:
@@ -86,22 +86,22 @@ def _mismatch(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], groups: 
     for name in weights:
         if name not in own and name not in HEAD:
             return f"{name} has no place here"
-    if groups != own_groups:  # no tensor's shape tells
+    if groups != own_groups:  # no tensor's shape shows it
         return f"its group normalisation has {groups} groups and {own_groups} here"
     return None
 
 
 def _needed_settings(config: Mapping[str, Any]) -> str:
-    given = [
+    overrides = [
         f"autoreconstructor.encoder.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
         for theirs, ours in SETTINGS.items()
         if theirs in config
     ]
-    return f"its config.json asks for {' '.join(given)}" if given else "its config.json gives no sizes"
+    return f"its config.json asks for {' '.join(overrides)}" if overrides else "its config.json gives no sizes"
 
 
 def _vae_folder(source: str) -> Path:
-    """The folder of the VAE's files, fetched from the hub if `source` is no folder."""
+    """Return the folder of the VAE's files; download it from the hub if `source` is not a folder."""
     local = Path(source).expanduser()
     if local.exists():
         hint = "give a folder from `hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`"
@@ -130,7 +130,7 @@ def _download(hub_id: str, weights_file: str) -> Path:
     wanted = [f"{subfolder}/{name}".lstrip("/") for subfolder in SUBFOLDERS for name in (CONFIG_FILE, weights_file)]
     try:
         return Path(snapshot_download(hub_id, allow_patterns=wanted))
-    except Exception as error:  # of the hub, of its HTTP library and of the file system
+    except Exception as error:  # from the hub, its HTTP library or the file system
         reason = _first_line(error).split(". ")[0]
         raise WeightsError(
             f"{hub_id}: no folder here, and not to be had from the hub ({reason}); {_fetch_hint(hub_id)}"
@@ -164,7 +164,7 @@ def _read_weights(folder: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             return load_file(path)
         weights = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch and safetensors have many for a damaged file
+    except Exception as error:  # torch and safetensors raise many kinds for a damaged file
         raise WeightsError(f"{path}: damaged or no weights ({_first_line(error)}); fetch it again") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise WeightsError(f"{path}: not a mapping of names to tensors; give diffusers' own file")

@@ -13,12 +13,12 @@ from completesplat.splatter_image import Parameterization, SplatterImage, from_c
 
 
 class Reconstructor(nn.Module):
-    """Latent -> Splatter Image. The last convolution has M * 15 channels instead of 3.
+    """Decoder from a latent to a Splatter Image; its last convolution has M * 15 channels instead of 3.
 
-    A skip takes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
-    convolution and adds them to the input of the up block of the same resolution. The merge operator is not stated
-    in the paper; zero initialisation leaves pretrained decoder weights intact at step 0. With `gradient_checkpointing`
-    set, blocks `recompute` their activations.
+    A skip passes the encoder's features of one level, before its downsampling, through a zero-initialised 1x1
+    convolution and adds them to the input of the up block of the same resolution. The paper does not state the merge
+    operator; zero initialisation leaves pretrained decoder weights intact at step 0. If `gradient_checkpointing` is
+    set, `recompute` applies the blocks.
 
     Args:
         parameterization: layers and activations of the Splatter Image.
@@ -50,14 +50,14 @@ class Reconstructor(nn.Module):
             norm_num_groups=norm_groups,
         )
         initialize_head(self.network.conv_out, parameterization)
-        # The up block that works at level l's resolution takes in the channels of the next coarser level.
+        # The input of the up block at level l's resolution has the channels of the next coarser level.
         inputs = {level: channels[min(level + 1, len(channels) - 1)] for level in skip_levels}
         self.skips = nn.ModuleDict({str(level): _zero_conv(channels[level], inputs[level]) for level in skip_levels})
         self.gradient_checkpointing = False
 
     @property
     def feature_levels(self) -> int:
-        """Levels of the encoder that the skips take features from, and those before them."""
+        """Return the number of encoder levels, counted from the first, that the skips need."""
         return max((int(level) + 1 for level in self.skips), default=0)
 
     def forward(
@@ -66,10 +66,10 @@ class Reconstructor(nn.Module):
         features: Sequence[Float[Tensor, "batch _ _ _"]],
         skip_weight: Float[Tensor, " batch"] | float = 1.0,
     ) -> SplatterImage:
-        """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one, or one per sample).
+        """Reconstruct, with the encoder's features weighted by `skip_weight` in [0, 1] (one weight, or one per sample).
 
         Args:
-            features: of `feature_levels` levels or more, or none at all: no skips, as with a weight of 0.
+            features: features of at least `feature_levels` levels. If empty, there are no skips, as with a weight of 0.
         """
         network = self.network
         run = recompute if self.gradient_checkpointing else nn.Module.__call__

@@ -1,9 +1,9 @@
-"""What the other views of a scene add to the posterior of its reference picture: q(h | reference, other views).
+"""Encoders of a scene's other views, which extend the posterior of its reference image to q(h | reference, views).
 
-The paper's posterior sees the reference picture alone, so that a latent cannot say what the picture hides. An encoder
-of views moves its moments by what the other views show; its last layer starts at zero, so that training starts from the
-paper's posterior. Skips always come from the reference picture. Other works that encode more than what they generate
-from: LN3Diff and GaussianAnything (6 and 8 views with Pluecker rays), TRELLIS (features of many renders).
+The paper's posterior sees the reference image alone, so a latent cannot encode what that image hides. A view encoder
+adds to the posterior's moments what the other views show. Its last layer starts at zero, so training starts from the
+paper's posterior. Skips always come from the reference image. Related work that encodes more than it generates from:
+LN3Diff and GaussianAnything (6 and 8 views with Pluecker rays), TRELLIS (features of many renders).
 """
 
 from typing import Annotated
@@ -19,16 +19,16 @@ from completesplat.schema import Few, Range, Width, Widths
 
 
 class PlaneSweep(nn.Module):
-    """Colours that the other views show along each of the reference's rays, at depths even in disparity.
+    """Plane-sweep encoder of the colours that other views see along the reference's rays.
 
-    At each depth there are two: of views that look along the ray, as the reference does, and of views that look against
-    it, which see the backs of things. Both are means over the views, weighted by how much they do so: the views' order
-    and number do not matter. With the reference's own colours they go through Stable Diffusion's encoder. All this
-    starts at its second level, at half the picture's resolution, which the latent's is not above.
+    Depths are evenly spaced in disparity. Each depth has two colours: one of views that look along the ray, as the
+    reference does, and one of views that look against it and see the backs of objects. Both are means over all views,
+    weighted by direction, so the order and number of views do not matter. These colours and the reference's go through
+    Stable Diffusion's encoder, from its second level on: at half the image's resolution, which suffices for the latent.
 
     Args:
         planes: depths along each ray, from near to far.
-        channels, layers_per_block, latent_channels, norm_groups: of the encoder; levels as the autoreconstructor's.
+        channels, layers_per_block, latent_channels, norm_groups: see `Encoder`; as many levels as it has.
     """
 
     def __init__(
@@ -48,26 +48,26 @@ class PlaneSweep(nn.Module):
     def forward(
         self, views: Views, depth_range: Float[Tensor, "batch 2"]
     ) -> Float[Tensor, "batch moment latent_height latent_width"]:
-        """Views, the reference first and its frame as the world -> what to add to the moments."""
+        """Return what to add to the moments; the reference is the first view, and its frame is the world."""
         with torch.autocast(views.images.device.type, enabled=False):
-            found = sweep(views, depth_range, self.planes)
-        own = nn.functional.avg_pool2d(views.images[:, 0], 2)
-        moments: Tensor = self.network(torch.cat([own * 2 - 1, found.flatten(1, 3)], 1))
+            swept = sweep(views, depth_range, self.planes)
+        reference = nn.functional.avg_pool2d(views.images[:, 0], 2)
+        moments: Tensor = self.network(torch.cat([reference * 2 - 1, swept.flatten(1, 3)], 1))
         return moments.float()
 
 
 SHARPNESS = 4.0
-"""Of the weights: a view at a right angle to the ray counts exp(-4) of one along it."""
+"""Sharpness of the weights: a view at a right angle to the ray has exp(-4) of the weight of one along it."""
 
 
 def sweep(
     views: Views, depth_range: Float[Tensor, "batch 2"], planes: int
 ) -> Float[Tensor, "batch plane side value height width"]:
-    """What the other views show at points along the rays between each four pixels of the reference.
+    """Sample the other views along the rays through the centres of 2 x 2 blocks of the reference's pixels.
 
     Returns:
-        Of views that look along the ray and of those that look against it: colour (-1 to 1; 0 where no view sees the
-        point), and the mean cosine between its ray and theirs.
+        For views that look along the ray, and for views that look against it: the mean colour (-1 to 1; 0 where no view
+        sees the point), and the mean cosine between the reference's ray and theirs.
     """
     reference, others = views[:, 0], views[:, 1:]
     near, far = depth_range[:, :1], depth_range[:, 1:]
@@ -87,8 +87,8 @@ def sweep(
     hidden = torch.finfo(torch.float32).min * (~seen).float()
     values = torch.cat([colors, cosine], -1)
     sides = [(values * (sign * SHARPNESS * cosine + hidden).softmax(1)).sum(1) for sign in (1, -1)]
-    found = torch.stack(sides, -2) * seen.any(1)[..., None]
-    return found.view(batch, planes, height // 2, width // 2, 2, 4).permute(0, 1, 4, 5, 2, 3)
+    features = torch.stack(sides, -2) * seen.any(1)[..., None]
+    return features.view(batch, planes, height // 2, width // 2, 2, 4).permute(0, 1, 4, 5, 2, 3)
 
 
 @torch.no_grad()

@@ -1,1 +1,1 @@
-"""What the paper's model is compared with."""
+"""Baselines of the paper's model."""

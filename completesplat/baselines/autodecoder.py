@@ -1,7 +1,4 @@
-"""A reconstructor without an encoder: every picture has a latent code that is optimised (Park et al. 2019, "DeepSDF").
-
-The supplement's "Reconstructor-only without the Encoder", which the paper reports as failed.
-"""
+"""Supplement's failed "Reconstructor-only without the Encoder": optimised latents (Park et al. 2019, "DeepSDF")."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,20 +13,20 @@ from completesplat.splatter_image import SplatterImage
 
 Codes = Float[Tensor, "batch channel latent_height latent_width"]
 INITIAL_STD = 0.01
-"""Of new codes, as in DeepSDF (Section 4.3)."""
+"""Standard deviation of new codes, as in DeepSDF (Section 4.3)."""
 
 
 class AutoDecoder(nn.Module):
-    """Latent codes of the training pictures, and the reconstructor that they share.
+    """Table of the training images' latent codes, and the reconstructor that they share.
 
-    There is no prior on the codes. A code stands for one picture with its camera, so colour augmentation and mirroring
-    should be off. The table takes `rows * latent_channels * (image_size / 8)^2` numbers, thrice with Adam's moments.
+    There is no prior on the codes. A code stands for one image with its camera, so colour augmentation and mirroring
+    should be off. The table has `rows * latent_channels * (image_size / 8)^2` numbers, thrice that with Adam's moments.
 
     Args:
-        rows: pictures that the table has room for; weights that are loaded bring as many as they have.
+        rows: images that the table has room for; loading weights resizes the table to theirs.
 
     Raises:
-        CompleteSplatError: a reconstructor with skips, or an image size that its levels do not divide.
+        CompleteSplatError: the reconstructor has skips, or its levels do not divide the image size.
     """
 
     def __init__(self, reconstructor: Reconstructor, image_size: int, rows: int = 0) -> None:
@@ -49,7 +46,7 @@ class AutoDecoder(nn.Module):
         return image
 
     def make_room(self, rows: int) -> None:
-        """A new table for this number of pictures, all rows of it free."""
+        """Replace the table by a new one for this number of images, with all rows free."""
         device = self.reconstructor.post_quant_conv.weight.device
         self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape).to(device))
         self._rows: dict[tuple[str, int], int] = {}
@@ -60,11 +57,11 @@ class AutoDecoder(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *others)
 
     def codes_of(self, names: Sequence[str], frames: Int64[Tensor, " batch"]) -> Codes:
-        """The codes of pictures, given by sequence and place therein; `CompleteSplatError` where the table is full."""
+        """Return the codes of images, given by sequence and place; raise CompleteSplatError if the table is full."""
         return self.codes[[self._row(*key) for key in zip(names, frames.tolist(), strict=True)]]
 
     def new_codes(self, count: int, seed: int) -> Codes:
-        """Random codes, of no picture yet."""
+        """Draw random codes that belong to no image yet."""
         generator = torch.Generator().manual_seed(seed)
         return INITIAL_STD * torch.randn(count, *self.shape, generator=generator).to(self.codes.device)
 
@@ -74,18 +71,18 @@ class AutoDecoder(nn.Module):
         return self._rows.setdefault((name, frame), len(self._rows))
 
     def get_extra_state(self) -> list[list[str | int]]:
-        """Sequence and frame of each row that is taken, in order: plain containers for checkpoints."""
+        """Return the sequence and frame of each taken row, in order, in plain containers for checkpoints."""
         return [[name, frame] for name, frame in self._rows]
 
     def set_extra_state(self, state: Any) -> None:
-        """Take over the rows of a checkpoint."""
+        """Restore the rows of a checkpoint."""
         self._rows = {(name, frame): row for row, (name, frame) in enumerate(state)}
 
 
 def optimize_codes(codes: Codes, loss: Callable[[Tensor], Float[Tensor, ""]], steps: int, rate: float) -> Codes:
-    """Minimise a loss of the codes alone by Adam, whose rate falls to a tenth halfway (DeepSDF's `reconstruct.py`).
+    """Minimise a loss over the codes with Adam, whose rate falls to a tenth halfway (DeepSDF's `reconstruct.py`).
 
-    Works also where autograd is off, as in `torch.inference_mode()`. No other gradients are computed or left behind.
+    This also works where autograd is off, as in `torch.inference_mode()`. Only the codes get gradients.
     """
     with torch.inference_mode(False), torch.enable_grad():
         codes = codes.clone().requires_grad_()

@@ -1,7 +1,7 @@
-"""3D Gaussians optimised for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
+"""Optimisation of 3D Gaussians for single scenes from posed views (Kerbl et al. 2023, "3D Gaussian Splatting").
 
-There is no densification and no pruning: the number of Gaussians stays what it was at the start. The start is not a
-structure-from-motion cloud either, which a data set need not have, but random pixels at random depths.
+There is no densification and no pruning, so the number of Gaussians stays constant. They start from random pixels at
+random depths instead of a structure-from-motion cloud, because a data set may lack one.
 """
 
 from collections.abc import Callable
@@ -19,22 +19,23 @@ from completesplat.schema import Positive, Share
 from completesplat.splatter_image import SH_C0
 
 Render = Callable[[Gaussians, Cameras], Tensor]
-"""Gaussians [batch] and cameras [batch view] to images [batch view 3 height width]."""
+"""Renderer from Gaussians [batch] and cameras [batch view] to images [batch view 3 height width]."""
 
 POSITION_RATE, POSITION_DECAY = 1.6e-4, 0.01
 RATES = {"log_scales": 5e-3, "quaternions": 1e-3, "logits": 5e-2, "harmonics": 2.5e-3}
-"""3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): that of the positions
-is relative to the scene's extent and decays exponentially to its hundredth."""
+"""3DGS's rates for 30,000 steps (graphdeco-inria/gaussian-splatting, `arguments/__init__.py`): the rate of the
+positions is relative to the scene's extent and decays exponentially to a hundredth."""
 
 
 @dataclass(frozen=True)
 class FittingSettings:
-    """How many Gaussians are fitted to a scene, and how.
+    """Settings of per-scene fitting.
 
     Attributes:
-        steps: of Adam; the positions' rate decays over as many.
-        views: random views of a step, the same for all scenes of a batch.
-        opacity: of all Gaussians at the start (0.1 in 3DGS).
+        count: number of Gaussians of a scene.
+        steps: Adam steps, over which the positions' rate decays.
+        views: random views in each step, the same for all scenes of a batch.
+        opacity: initial opacity of all Gaussians (0.1 in 3DGS).
         position_rate, other_rates: factors on 3DGS's learning rates, which are meant for 30,000 steps.
     """
 
@@ -48,7 +49,7 @@ class FittingSettings:
 
 @dataclass(frozen=True)
 class RawGaussians:
-    """What is optimised: Gaussians before their activations; colours as coefficients of the zeroth harmonic."""
+    """Optimised parameters: Gaussians before activation, with colours as coefficients of the zeroth harmonic."""
 
     means: Float[Tensor, "batch gaussian 3"]
     log_scales: Float[Tensor, "batch gaussian 3"]
@@ -57,7 +58,7 @@ class RawGaussians:
     harmonics: Float[Tensor, "batch gaussian 3"]
 
     def gaussians(self) -> Gaussians:
-        """Activated as in 3DGS; the quaternions may have any length."""
+        """Apply 3DGS's activations; the quaternions may have any length."""
         colors = (0.5 + SH_C0 * self.harmonics).clamp(min=0)
         return Gaussians(self.means, self.quaternions, self.log_scales.exp(), self.logits.sigmoid(), colors)
 
@@ -65,9 +66,9 @@ class RawGaussians:
 def initial_gaussians(
     views: Views, depth_range: Float[Tensor, "batch 2"], count: int, opacity: float, generator: torch.Generator
 ) -> RawGaussians:
-    """Round Gaussians on the rays of random pixels of all views, with the pixels' colours and the size of one there.
+    """Return round Gaussians on the rays of random pixels, with a pixel's colour and its size at that depth.
 
-    Depths along each view's optical axis are uniform in the depth range, in scene units; the generator is on the CPU.
+    Depths along each view's optical axis are uniform in the depth range, in scene units. The generator is on the CPU.
     """
     batch, number = views.images.shape[:2]
     height, width = views.cameras.image_size
@@ -77,7 +78,7 @@ def initial_gaussians(
     pixel = torch.randint(height * width, (batch, count), generator=generator).to(device)
     share = torch.rand(batch, count, generator=generator).to(device)
     depth = depth_range[:, :1] + (depth_range[:, 1:] - depth_range[:, :1]) * share
-    cameras = views.cameras[scene, view]  # one for each Gaussian
+    cameras = views.cameras[scene, view]  # one camera for each Gaussian
     centers = pixel_centers(height, width, device).flatten(0, 1)[pixel]
     footprint = depth / cameras.intrinsics[..., 0, 0]
     return RawGaussians(
@@ -97,10 +98,10 @@ def fit_gaussians(
     settings: FittingSettings,
     generator: torch.Generator,
 ) -> Gaussians:
-    """Optimise a set of Gaussians for each scene of a batch, all at once, until its renderings look like the views.
+    """Optimise Gaussians for all scenes of a batch at once, so that their renderings match the views.
 
-    Works also where autograd is off, as in `torch.inference_mode()`. The Gaussians are in the world of the views; the
-    generator, on the CPU, decides the start and the views of each step.
+    This also works where autograd is off, as in `torch.inference_mode()`. The Gaussians are in the views' world frame.
+    The generator, on the CPU, determines the initial Gaussians and the views of each step.
     """
     with torch.inference_mode(False), torch.enable_grad():
         raw = initial_gaussians(views, depth_range, settings.count, settings.opacity, generator)
@@ -109,7 +110,7 @@ def fit_gaussians(
         decay = POSITION_DECAY ** (1 / max(settings.steps, 1))
         for step in range(settings.steps):
             chosen = torch.randperm(views.images.shape[1], generator=generator)[: settings.views]
-            # Also where the views were made in inference mode, autograd may use what is picked of them: it is a copy.
+            # Indexing copies the views, so autograd can use them even if they were made in inference mode.
             truth, gaussians = views[:, chosen.to(views.images.device)], raw.gaussians()
             total, _ = loss(Prediction(render(gaussians, truth.cameras), gaussians, None), truth, step)
             optimizer.zero_grad()
@@ -120,8 +121,8 @@ def fit_gaussians(
 
 
 def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor) -> torch.optim.Adam:
-    """Adam with 3DGS's epsilon (`gaussian_model.py`), beside which the gradients of single Gaussians are not small."""
-    # Half of the mean depth range, the spread of the initial Gaussians (3DGS: that of the cameras).
+    """Return Adam with 3DGS's epsilon (`gaussian_model.py`), which is small beside the gradients of a Gaussian."""
+    # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
     rates = {name: settings.other_rates * rate for name, rate in RATES.items()}
     rates = {"means": settings.position_rate * POSITION_RATE * extent, **rates}

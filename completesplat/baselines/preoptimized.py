@@ -1,4 +1,4 @@
-"""Any 3D Gaussians as a Splatter Image: each is put into the pixel that its centre falls in.
+"""Projection of any 3D Gaussians into a Splatter Image: each goes to the pixel that its centre falls into.
 
 The supplement ("Pre-optimizing 3D Gaussian splats and projecting into Splatter Images") reports that this leaves 80 %
 of the pixels empty.
@@ -20,11 +20,11 @@ from completesplat.splatter_image import LAYER_DEPTHS, SH_C0, Parameterization, 
 EMPTY_LOGIT = -30.0
 """Raw opacity of a place without a Gaussian: its opacity is 1e-13."""
 CERTAINTY = 1e-6
-"""Shares and opacities are kept this far from 0 and 1, where their logits are infinite."""
+"""Smallest distance of shares and opacities from 0 and 1, where their logits are infinite."""
 
 
 class Projection(NamedTuple):
-    """A Splatter Image, and which of its pixels have no Gaussian in any layer."""
+    """Splatter Image, and a mask of its pixels without a Gaussian in any layer."""
 
     splatter_image: SplatterImage
     empty: Bool[Tensor, "batch height width"]
@@ -33,11 +33,11 @@ class Projection(NamedTuple):
 def project_to_splatter_image(
     gaussians: Gaussians, cameras: Cameras, depth_range: Float[Tensor, "batch 2"], parameterization: Parameterization
 ) -> Projection:
-    """The Splatter Image whose Gaussians are those of a set, as far as its pixels have place for them.
+    """Return the Splatter Image of a set of Gaussians, as far as its pixels have room for them.
 
-    In every pixel the most opaque Gaussians stay, the most opaque in the first layer. What lies behind the camera or
-    outside its image, or is never drawn because its opacity is below 1/255, fills no pixel. The offset takes up what
-    ray and depth range cannot. Scales are clamped to the parameterisation's range, opacities to 1e-6 below 1.
+    Each pixel takes its most opaque Gaussians, the most opaque one in the first layer. Gaussians behind the camera,
+    outside its image, or with an opacity below 1/255 (never drawn) are dropped. The offset represents what ray and
+    depth range cannot. Scales are clamped to the parameterisation's range, opacities to 1e-6 below 1.
 
     Args:
         gaussians: [batch], in the reference cameras' frames.
@@ -49,7 +49,7 @@ def project_to_splatter_image(
     source, place = _places(gaussians, cameras, parameterization.layers)
 
     def placed(values: Float[Tensor, "batch gaussian channel"], elsewhere: float) -> Tensor:
-        """[batch layer channel height width]"""
+        """Arrange values as [batch layer channel height width]."""
         flat = values.new_full((math.prod(grid), values.shape[-1]), elsewhere)
         flat[place] = values.flatten(0, 1)[source]
         return flat.view(*grid, -1).movedim(-1, 2)
@@ -73,16 +73,16 @@ def project_to_splatter_image(
 
 
 def occupied(image: SplatterImage) -> Bool[Tensor, "batch layer height width"]:
-    """Which places of a projection's Splatter Image have a Gaussian."""
+    """Return which places of a projection's Splatter Image hold a Gaussian."""
     return image.split()["opacity"].squeeze(2) > EMPTY_LOGIT
 
 
 def _places(
     gaussians: Gaussians, cameras: Cameras, layers: int
 ) -> tuple[Int64[Tensor, " kept"], Int64[Tensor, " kept"]]:
-    """Which Gaussians are kept, and where: indices into [batch gaussian] and [batch layer height width]."""
+    """Return the selected Gaussians and their places: indices into [batch gaussian] and [batch layer height width]."""
     height, width = cameras.image_size
-    # Their frame is the camera's, whatever its place in the world.
+    # The Gaussians are in the camera's frame, so its pose in the world does not matter.
     identity = torch.eye(4).to(cameras.world_to_camera).expand_as(cameras.world_to_camera)
     pixels, depths = project(Cameras(identity, cameras.intrinsics, cameras.image_size), gaussians.means)
     column, row = pixels.floor().unbind(-1)
@@ -93,17 +93,17 @@ def _places(
     pixel = row.flatten()[source].long() * width + column.flatten()[source].long()
     key, order = (scene * height * width + pixel).sort(stable=True)
     source, scene, pixel = source[order], scene[order], pixel[order]
-    # How many come before it in its own pixel.
+    # Number of earlier Gaussians in the same pixel.
     layer = torch.arange(len(key), device=key.device) - torch.searchsorted(key, key)
-    kept = layer < layers
+    selected = layer < layers
     place = (scene * layers + layer) * height * width + pixel
-    return source[kept], place[kept]
+    return source[selected], place[selected]
 
 
 def _raw_depths(
     depths: Float[Tensor, "batch layer height width"], near: Tensor, far: Tensor, layer_depths: str
 ) -> Float[Tensor, "batch layer height width"]:
-    """Raw values whose activation is nearest to the depths, or close: the offset takes the rest."""
+    """Return raw values that activate close to these depths; the offset represents the rest."""
     shares = ((depths - near) / (far - near)).logit(CERTAINTY)
     if layer_depths == "independent":
         return shares

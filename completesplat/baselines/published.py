@@ -1,6 +1,6 @@
-"""Splatter Image with the weights that its authors published (Szymanowicz et al., CVPR 2024): one pass, one answer.
+"""Splatter Image with its authors' published weights (Szymanowicz et al., CVPR 2024): one pass, one answer.
 
-Read at commit 78a6ad0 of szymanowiczs/splatter-image (`scene/gaussian_predictor.py`) and written anew.
+This is a new implementation after commit 78a6ad0 of szymanowiczs/splatter-image (`scene/gaussian_predictor.py`).
 """
 
 from dataclasses import dataclass
@@ -20,44 +20,44 @@ from completesplat.splatter_image import CHANNELS, SH_C0, Parameterization, Spla
 from completesplat.weights.splatter_image import find, read_tensors
 
 SH_C1 = 0.4886025119029199
-"""The spherical harmonics of degree 1 are this, sqrt(3 / (4 pi)), times -y, z and -x of the unit direction."""
+"""Spherical harmonics of degree 1 are this factor, sqrt(3 / (4 pi)), times -y, z and -x of the unit direction."""
 HARMONICS = 9
 OBJECT_SIZE = 2 * 0.57
-"""Of the captures' objects along their largest axis, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""
+"""Largest extent of the captured objects, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""
 TOLERANCE = 1e-4
 # Neither scales nor depths are clamped.
 PARAMETERIZATION = Parameterization(layers=1, smallest_scale=1e-9, largest_scale=1e9)
-ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # of a vector's components; its transpose goes back
+ORDER_OF_HARMONICS = [[[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]]]  # of a vector's components; the transpose inverts it
 
 
 class Depths(NamedTuple):
-    """Where along the optical axis Gaussians lie: between these two, or that far from an object's distance."""
+    """Depth range of the Gaussians along the optical axis: absolute, or relative to an object's distance."""
 
     near: float
     far: float
     around_object: bool
 
     def range(self, given: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
-        """Near and far of scenes whose data say this; of these, the far end tells the object's distance.
+        """Return near and far for scenes with this depth range in their data.
 
-        Their near end is kept in front of the camera, which Splatter Image's is not.
+        Its far end gives an object's distance, because its near end is clamped to lie in front of the camera.
         """
-        own = given.new_tensor([self.near, self.far])
-        return given[..., 1:] + own - self.far if self.around_object else own.expand_as(given)
+        limits = given.new_tensor([self.near, self.far])
+        return given[..., 1:] + limits - self.far if self.around_object else limits.expand_as(given)
 
 
 @dataclass(frozen=True)
 class DirectionalSplatterImage(SplatterImage):
-    """A Splatter Image of one layer with spherical harmonics of degree 1, and with depths of its own.
+    """Splatter Image of one layer, with spherical harmonics of degree 1 and its own depth range.
 
-    `harmonics` are three coefficients of red, green, blue each, in the reference camera's frame.
+    `harmonics` holds red, green and blue of three coefficients, in the reference camera's frame.
     """
 
     harmonics: Float[Tensor, "*batch 9 height width"]
     depths: Depths
 
     def gaussians(self, cameras: Cameras, depth_range: Float[Tensor, "*batch 2"]) -> DirectionalGaussians:
-        """As `SplatterImage.gaussians`; the colours are those that the reference camera sees."""
+        """Return Gaussians like `SplatterImage.gaussians`, with the colours that the reference camera sees."""
         plain = super().gaussians(cameras, self.depths.range(depth_range))
         mean = 0.5 + SH_C0 * rearrange(self.split()["color"], "... 1 rgb height width -> ... (height width) rgb")
         minus_y, z, minus_x = SH_C1 * rearrange(
@@ -70,7 +70,7 @@ class DirectionalSplatterImage(SplatterImage):
 
 
 class _Predictor(nn.Module):
-    """The U-Net, with a 1x1 convolution behind it."""
+    """U-Net followed by a 1x1 convolution."""
 
     def __init__(self, **sizes: object) -> None:
         super().__init__()
@@ -84,20 +84,20 @@ class _Predictor(nn.Module):
 
 
 class PublishedSplatterImage(nn.Module):
-    """Image -> Splatter Image by published weights.
+    """Network from an image to a Splatter Image, with published weights.
 
     Attributes:
         image_size: side of the square images, in pixels.
-        background: grey value behind the objects of all pictures that it has seen, 0 or 1.
-        fov_degrees: field of view of all these pictures; None: each has its own.
-        depths: where its Gaussians lie.
+        background: grey value behind the objects in all its training images, 0 or 1.
+        fov_degrees: field of view of all training images; None: each has its own.
+        depths: depth range of its Gaussians.
 
     Args:
-        weights: `splatter_image:NAME` of the hub, a `.pth` file with its `config_NAME.yaml` beside it, or a folder of
+        weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or a folder with
             both; see `weights/splatter_image.py`.
 
     Raises:
-        WeightsError: the files are missing, unreadable, or not those of this network, to the last name and size.
+        WeightsError: the files are missing, unreadable, or have other tensors (name, size, type) than this network.
     """
 
     ray_dirs: Tensor
@@ -112,7 +112,7 @@ class PublishedSplatterImage(nn.Module):
         self.depths = Depths(data["znear"], data["zfar"], data["origin_distances"])
         if size % 8 or model["base_dim"] % 4:
             raise WeightsError(f"{file}: a size of {size}, {model['base_dim']} wide: neither fits the network")
-        with torch.device("meta"):  # which gives tensors sizes and no memory
+        with torch.device("meta"):  # tensors have sizes but take no memory
             self.network_with_offset = _Predictor(
                 size=size,
                 width=model["base_dim"],
@@ -123,11 +123,11 @@ class PublishedSplatterImage(nn.Module):
             for name in ("v_to_sh_transform", "sh_to_v_transform"):
                 self.register_buffer(name, torch.empty(1, 3, 3))
         tensors = read_tensors(file)
-        if said := _mismatch(self.state_dict(), tensors):
-            raise WeightsError(f"{file}: {said}")
+        if message := _mismatch(self.state_dict(), tensors):
+            raise WeightsError(f"{file}: {message}")
         self.load_state_dict({name: value.clone() for name, value in tensors.items()}, assign=True)
-        if said := self._other_constants():
-            raise WeightsError(f"{file}: {said}")
+        if message := self._other_constants():
+            raise WeightsError(f"{file}: {message}")
         self.fov_degrees = self._field_of_view()
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
@@ -139,20 +139,20 @@ class PublishedSplatterImage(nn.Module):
         )
 
     def object_distance(self, image: Float[Tensor, "3 size size"], focal_length: float) -> float:
-        """How far away an object on `background` is whose largest extent in the picture is that of training's objects.
+        """Estimate the distance of an object on `background`, assuming that it is as large as the training objects.
 
-        The weights of captures want it (upstream's data know it); for a photograph this is our estimate.
+        The weights of captures need this distance. Upstream takes it from the data; this estimate serves photos.
         """
         seen = ((image - self.background).abs() > 0.05).any(0)
         extent = max((int(seen.any(axis).sum()) for axis in (0, 1)), default=0) or self.image_size
         return OBJECT_SIZE * focal_length / extent
 
     def _other_constants(self) -> str | None:
-        """What of the constants in the weights is other than the network takes it to be."""
+        """Name the first constant in the weights that differs from the network's, if there is one."""
         order = torch.tensor(ORDER_OF_HARMONICS)
-        kept = {"v_to_sh_transform": order, "sh_to_v_transform": order.mT}
+        expected = {"v_to_sh_transform": order, "sh_to_v_transform": order.mT}
         for name, value in self.named_buffers():
-            known = torch.full_like(value, 0.25) if name.endswith("resample_filter") else kept.get(name)
+            known = torch.full_like(value, 0.25) if name.endswith("resample_filter") else expected.get(name)
             if known is not None and not torch.equal(known, value):
                 return f"{name} has other values than published weights have"
         corner = self.ray_dirs[0, 0, 0, 0]
@@ -161,13 +161,13 @@ class PublishedSplatterImage(nn.Module):
         return None
 
     def _rays(self, corner: Tensor) -> Float[Tensor, "1 3 size size"]:
-        """Rays through the pixels' centres, from the x and y of the first one."""
+        """Return rays through the pixels' centres, given x and y of the first one."""
         along = torch.linspace(float(corner), -float(corner), self.image_size)
         y, x = torch.meshgrid(along, along, indexing="ij")
         return torch.stack([x, y, torch.ones_like(x)])[None]
 
     def _field_of_view(self) -> float | None:
-        """From the rays: those of weights without one are in pixels, of a focal length of 1."""
+        """Derive the field of view from the rays; None if these are in pixels, for a focal length of 1."""
         corner = -self.ray_dirs[0, 0, 0, 0].double()
         half = self.image_size / 2
         focal_length = (half - 0.5) / corner
@@ -175,13 +175,13 @@ class PublishedSplatterImage(nn.Module):
 
 
 def _mismatch(own: dict[str, Tensor], there: dict[str, Tensor]) -> str | None:
-    """The first tensor that is not the same in both, by name, size and kind."""
+    """Describe the first tensor that differs in name, size or type, if there is one."""
     for name, value in own.items():
         if name not in there:
             return f"{name} is missing there"
         if (there[name].shape, there[name].dtype) != (value.shape, value.dtype):
-            found = f"{list(there[name].shape)} of {there[name].dtype}"
-            return f"{name} is {found} there and {list(value.shape)} of {value.dtype} here"
+            actual = f"{list(there[name].shape)} of {there[name].dtype}"
+            return f"{name} is {actual} there and {list(value.shape)} of {value.dtype} here"
     for name in there:
         if name not in own:
             return f"{name} has no place here"

@@ -1,4 +1,4 @@
-"""The regression baseline "Splatter Image (full images)": one pass of a U-Net, nothing drawn, no latent."""
+"""Regression baseline "Splatter Image (full images)": one pass of a U-Net, without sampling and latent."""
 
 from typing import Any
 
@@ -13,23 +13,23 @@ from completesplat.splatter_image import Parameterization, from_channels, initia
 
 
 class SplatterImageUNet(nn.Module):
-    """Image -> Splatter Image, after Szymanowicz et al., "Splatter Image" (CVPR 2024).
+    """U-Net from an image to a Splatter Image, after Szymanowicz et al., "Splatter Image" (CVPR 2024).
 
-    Upstream's network is EDM's SongUNet without noise level (`scene/gaussian_predictor.py`), whose sizes are the
-    defaults. This one is built of diffusers' blocks of the same kind: they resample within residual blocks, attend
-    with one head, and normalise in 32 groups. What differs from upstream:
+    Upstream's network is EDM's SongUNet without noise level (`scene/gaussian_predictor.py`); defaults are its sizes.
+    This network is built of similar blocks from diffusers, which resample within residual blocks, attend with one head,
+    and normalise in 32 groups. Differences from upstream:
 
-    - The blocks want a time embedding. They get that of a constant timestep 0, a learned bias.
-    - Residual sums are not scaled by sqrt(1/2), and weights start from PyTorch's defaults.
+    - The blocks need a time embedding. They get the one of a constant timestep 0, which is a learned bias.
+    - Residual sums are not scaled by sqrt(1/2), and weights start from PyTorch's default initialisation.
     - Resampling blocks have no 1x1 convolution in their shortcut.
-    - On the way up, attention follows every block of its level instead of the last alone.
-    - The last 3x3 convolution is the head; upstream has a 1x1 convolution behind it.
+    - On the way up, attention follows every block of a level instead of only the last one.
+    - The last 3x3 convolution is the head; upstream has a 1x1 convolution after it.
 
     Args:
         channels: width of each level, from full resolution down; the image's sides are multiples of 2^(levels - 1).
         attention_levels: levels with self-attention (upstream: at 16 pixels, level 3 of images of 128).
         layers_per_block: residual blocks per level on the way down (the way up has one more).
-        dropout: probability of a zero before the second convolution of each residual block.
+        dropout: dropout probability before the second convolution of each residual block.
         gradient_checkpointing: recompute the residual blocks' activations in the backward pass.
     """
 

@@ -1,8 +1,8 @@
-"""The U-Net of Splatter Image, with its authors' names of tensors, so that their weights load.
+"""U-Net of Splatter Image with its authors' tensor names, so that their weights load.
 
-It is DDPM++ as EDM has it (Karras et al. 2022; Song et al. 2021), without a noise level: read at commit 78a6ad0 of
-szymanowiczs/splatter-image, `scene/gaussian_predictor.py`, and written anew. `regressor.SplatterImageUNet` is one of
-the same kind, made of diffusers' blocks, for training.
+It is EDM's version of DDPM++ (Karras et al. 2022; Song et al. 2021) without a noise level, implemented anew after
+`scene/gaussian_predictor.py` of szymanowiczs/splatter-image at commit 78a6ad0. `regressor.SplatterImageUNet` is a
+similar network of diffusers' blocks, for training.
 """
 
 import math
@@ -24,9 +24,9 @@ def _norm(channels: int) -> nn.GroupNorm:
 
 
 class ScaledConvolution(nn.Conv2d):
-    """A convolution behind a doubling ("up") or halving ("down") of the picture, or at its size ("").
+    """Convolution after doubling ("up"), halving ("down") or keeping ("") the image's size.
 
-    The filter of both is a box of two pixels. Weights hold it, so it has a place in the state.
+    Both resampling filters are a box of two pixels. Published weights contain the filter, so it is a buffer.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int, scale: str = "") -> None:
@@ -43,7 +43,7 @@ class ScaledConvolution(nn.Conv2d):
 
 
 class ResidualBlock(nn.Module):
-    """Two convolutions beside a shortcut, then attention of one head if asked for; each sum is scaled by sqrt(1/2)."""
+    """Two convolutions beside a shortcut, then optional attention with one head; each sum is scaled by sqrt(1/2)."""
 
     def __init__(self, inputs: int, outputs: int, scale: str = "", attends: bool = False) -> None:
         super().__init__()
@@ -75,12 +75,12 @@ class ResidualBlock(nn.Module):
 
 
 class SongUNet(nn.Module):
-    """Images of one size to maps of that size.
+    """U-Net from square images to maps of the same size.
 
     Args:
-        size: of the square images in pixels, a multiple of 8; levels are named by their sizes.
-        width: channels of the first level; those below it have twice as many.
-        blocks: residual blocks of each level on the way down; the way up has one more.
+        size: side of the images in pixels, a multiple of 8; levels are named after their sizes.
+        width: channels of the first level; all others have twice as many.
+        blocks: residual blocks per level on the way down; the way up has one more.
         attention_sizes: sizes of levels with attention: in every block on the way down, in the last on the way up.
     """
 
@@ -92,15 +92,15 @@ class SongUNet(nn.Module):
         levels = [(f"{size >> level}x{size >> level}", width * multiple) for level, multiple in enumerate(MULTIPLES)]
         attending = [size >> level in attention_sizes for level in range(len(MULTIPLES))]
         self.enc[f"{levels[0][0]}_conv"] = nn.Conv2d(inputs, width, 3, padding=1)
-        channels, kept = width, [width]
+        channels, skips = width, [width]
         for level, (name, outer) in enumerate(levels):
             if level:
                 self.enc[f"{name}_down"] = ResidualBlock(channels, channels, "down")
-                kept.append(channels)
+                skips.append(channels)
             for index in range(blocks):
                 self.enc[f"{name}_block{index}"] = ResidualBlock(channels, outer, attends=attending[level])
                 channels = outer
-                kept.append(channels)
+                skips.append(channels)
         name = levels[-1][0]
         self.dec[f"{name}_in0"] = ResidualBlock(channels, channels, attends=True)
         self.dec[f"{name}_in1"] = ResidualBlock(channels, channels)
@@ -110,18 +110,18 @@ class SongUNet(nn.Module):
                 self.dec[f"{name}_up"] = ResidualBlock(channels, channels, "up")
             for index in range(blocks + 1):
                 attends = index == blocks and attending[level]
-                self.dec[f"{name}_block{index}"] = ResidualBlock(channels + kept.pop(), outer, attends=attends)
+                self.dec[f"{name}_block{index}"] = ResidualBlock(channels + skips.pop(), outer, attends=attends)
                 channels = outer
         self.dec[f"{name}_aux_norm"] = _norm(channels)
         self.dec[f"{name}_aux_conv"] = nn.Conv2d(channels, outputs, 3, padding=1)
 
     def forward(self, x: Float[Tensor, "batch inputs size size"]) -> Float[Tensor, "batch outputs size size"]:
-        kept = []
+        skips = []
         for block in self.enc.values():
             x = block(x)
-            kept.append(x)
+            skips.append(x)
         for name, block in self.dec.items():
             if isinstance(block, ResidualBlock) and block.inputs != x.shape[1]:
-                x = torch.cat([x, kept.pop()], dim=1)
+                x = torch.cat([x, skips.pop()], dim=1)
             x = block(functional.silu(x) if name.endswith("aux_conv") else x)
         return x

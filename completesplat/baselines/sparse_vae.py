@@ -1,4 +1,4 @@
-"""A VAE of sparse Splatter Images, the second half of what the supplement tried and could not train.
+"""VAE of sparse Splatter Images: the second half of an approach that the supplement reports as failed.
 
 The supplement ("Pre-optimizing 3D Gaussian splats and projecting into Splatter Images") states neither the network nor
 the loss: "We find it difficult to train a VAE to encode each modalities of such sparse splatter images".
@@ -21,16 +21,18 @@ Raw = Float[Tensor, "batch layer 15 height width"]
 
 
 class SparseVAE(nn.Module):
-    """Splatter Image -> latent -> Splatter Image, in the autoreconstructor's blocks without skips.
+    """VAE from a Splatter Image to a Splatter Image, made of the autoreconstructor's blocks without skips.
 
-    A place is one layer of one pixel. The encoder sees the 15 raw values of every place, normalised, or zeros where the
-    place is empty, and whether it is occupied. The decoder's outputs are normalised raw values; a low opacity says that
-    a place is empty. In training a latent is drawn from the posterior, in evaluation its mode is used.
+    A place is one layer of one pixel. For each place the encoder sees 15 normalised raw values (zeros if the place is
+    empty), and whether it is occupied. The decoder's outputs are normalised raw values; a low opacity marks an empty
+    place. In training a latent is drawn from the posterior; in evaluation its mode is used.
 
     Args:
-        encoder: makes an `Encoder` of a number of `in_channels`.
-        reconstructor: its last convolution starts as PyTorch's do, since its outputs are normalised. One with skips,
-            which would carry the Splatter Image past the latent, is refused (`CompleteSplatError`).
+        encoder: builds an `Encoder` from a number of `in_channels`.
+        reconstructor: its last convolution starts with PyTorch's defaults, since its outputs are normalised.
+
+    Raises:
+        CompleteSplatError: the reconstructor has skips, which would carry the Splatter Image past the latent.
     """
 
     mean: Tensor
@@ -44,50 +46,48 @@ class SparseVAE(nn.Module):
         self.encoder = encoder(in_channels=layers * (CHANNELS + 1))
         self.reconstructor = reconstructor
         reconstructor.network.conv_out.reset_parameters()
-        # Of the raw values of occupied places, by layer and channel.
+        # Statistics of the raw values of occupied places, by layer and channel.
         self.register_buffer("mean", torch.zeros(layers, CHANNELS, 1, 1))
         self.register_buffer("std", torch.ones(layers, CHANNELS, 1, 1))
 
     def forward(self, image: SplatterImage) -> Reconstruction:
         """Encode and decode a sparse Splatter Image."""
-        there = occupied(image)[:, :, None]
-        seen = torch.cat([torch.where(there, self.normalize(image.raw), 0.0), there.float()], dim=2)
+        mask = occupied(image)[:, :, None]
+        seen = torch.cat([torch.where(mask, self.normalize(image.raw), 0.0), mask.float()], dim=2)
         posterior, _ = self.encoder.encode(seen.flatten(1, 2))
         latent = posterior.sample() if self.training else posterior.mode()
         decoded = self.reconstructor(latent, ())
         return Reconstruction(SplatterImage(decoded.raw * self.std + self.mean, decoded.parameterization), posterior)
 
     def normalize(self, raw: Raw) -> Raw:
-        """Raw values with mean 0 and deviation 1 in each channel of each layer."""
+        """Normalise raw values to mean 0 and standard deviation 1 in each channel of each layer."""
         return (raw - self.mean) / self.std
 
     @torch.no_grad()
     def measure(self, images: Iterable[SplatterImage]) -> None:
-        """Set the normalisation to mean and deviation over the occupied places of these.
-
-        A channel that does not vary is only centred, a layer without any Gaussian left as it is.
-        """
+        """Set the normalisation to the mean and standard deviation over the occupied places of these images."""
         count, total, squares = (torch.zeros_like(self.mean, dtype=torch.float64) for _ in range(3))
         for image in images:
-            there = occupied(image)[:, :, None]
-            raw = torch.where(there, image.raw, 0.0).double()
-            count += there.double().sum(dim=(0, 3, 4), keepdim=True)[0]
+            mask = occupied(image)[:, :, None]
+            raw = torch.where(mask, image.raw, 0.0).double()
+            count += mask.double().sum(dim=(0, 3, 4), keepdim=True)[0]
             total += raw.sum(dim=(0, 3, 4), keepdim=True)[0]
             squares += raw.square().sum(dim=(0, 3, 4), keepdim=True)[0]
         mean = total / count.clamp(min=1)
         variance = squares / count.clamp(min=1) - mean.square()
         self.mean.copy_(mean)
+        # A channel that does not vary is only centred; a layer without Gaussians is not normalised.
         self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
 
     def errors(self, found: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
-        """How well each group of raw values is reconstructed.
+        """Return the reconstruction error of each group of raw values.
 
-        The mean squared error of the normalised values over occupied places; for "opacity" the binary cross entropy
-        over all places, in nats, where an empty one's opacity is 0.
+        It is the mean squared error of the normalised values over occupied places; for "opacity", the binary cross
+        entropy over all places in nats, where an empty place has opacity 0.
         """
-        there = occupied(truth)[:, :, None]
-        squared = torch.where(there, self.normalize(found.raw) - self.normalize(truth.raw), 0.0).square()
-        places = there.sum().clamp(min=1)
+        mask = occupied(truth)[:, :, None]
+        squared = torch.where(mask, self.normalize(found.raw) - self.normalize(truth.raw), 0.0).square()
+        places = mask.sum().clamp(min=1)
         errors = {
             name: group.sum() / (places * group.shape[2])
             for name, group in SplatterImage(squared, truth.parameterization).split().items()

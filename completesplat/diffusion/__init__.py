@@ -1,1 +1,1 @@
-"""Latent diffusion: conditioning, denoiser, guidance and sampling. Knows latents only, no Gaussians."""
+"""Latent diffusion: conditioning, denoiser, guidance and sampling. It knows latents only, no Gaussians."""

@@ -1,6 +1,6 @@
 """Feature encoders F_feat of the reference image: phi_ref = F_feat(I_ref) (paper, Section 3.3).
 
-`frozen` says whether an encoder stays as it is in training, so that its features may be computed once and kept.
+`frozen` says whether an encoder is constant in training, so that its features can be computed once and stored.
 """
 
 import torch
@@ -13,9 +13,9 @@ from completesplat.errors import WeightsError
 from completesplat.schema import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
-"""Of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
+"""Scale of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
 
-# What the reader of VAEs calls settings, and where they are set for a conditioning.
+# Options as errors of `load_pretrained_encoder` name them, and a conditioning's options in their place.
 SETTINGS = {
     "autoreconstructor.encoder.latent_channels=": "conditioning.out_channels=",
     "autoreconstructor.encoder.": "conditioning.",
@@ -24,13 +24,13 @@ SETTINGS = {
 
 
 class LearnedConditioning(nn.Module):
-    """A small convolutional encoder, trained together with the denoiser.
+    """Small convolutional encoder that is trained together with the denoiser.
 
-    For setups without Stable Diffusion's weights; the paper uses the frozen encoder of Stable Diffusion's VAE.
+    It is for setups without Stable Diffusion's weights; the paper uses the frozen encoder of Stable Diffusion's VAE.
 
     Args:
         out_channels: channels of phi_ref.
-        channels, layers_per_block, norm_groups: see `Encoder`; there are as many levels as the latent's encoder has.
+        channels, layers_per_block, norm_groups: see `Encoder`; with as many levels as the latent's encoder.
     """
 
     frozen = False
@@ -47,18 +47,18 @@ class LearnedConditioning(nn.Module):
         self.network = vae_encoder(3, out_channels, channels, layers_per_block, norm_groups)
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
-        """Features of sRGB images in [0, 1], at the latent's resolution."""
+        """Return features of sRGB images in [0, 1], at the latent's resolution."""
         features: Tensor = self.network(images * 2 - 1)
         return features
 
 
 class StableDiffusionConditioning(nn.Module):
-    """The encoder of Stable Diffusion's original VAE, frozen: the posterior's mean times 0.18215, as in Marigold.
+    """Frozen encoder of Stable Diffusion's original VAE: the posterior's mean times 0.18215, as in Marigold.
 
-    This is not the autoreconstructor's encoder, which training has changed.
+    This is not the autoreconstructor's encoder, whose weights training has changed.
 
     Args:
-        pretrained: folder or hub id of the VAE in diffusers' layout; None where a checkpoint supplies the weights.
+        pretrained: folder or hub id of the VAE in diffusers' layout; None if a checkpoint supplies the weights.
         out_channels: channels of phi_ref, which are the VAE's latent channels.
         channels, layers_per_block, norm_groups: the VAE's sizes, see `Encoder`.
 
@@ -90,7 +90,7 @@ class StableDiffusionConditioning(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Float[Tensor, "batch channel _ _"]:
-        """Features of sRGB images in [0, 1], at an eighth of their resolution."""
+        """Return features of sRGB images in [0, 1], at an eighth of their resolution."""
         mean: Tensor = self.encoder(images)[0].mean
         return mean * STABLE_DIFFUSION_SCALE
 

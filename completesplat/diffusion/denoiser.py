@@ -14,7 +14,7 @@ from completesplat.schema import Few, Levels, Width, Widths
 
 
 class Sizes(TypedDict, total=False):
-    """Sizes that both denoisers have, and whether they save memory; `TextlessStableDiffusion` explains each."""
+    """Sizes of both denoisers, and whether to save memory; `TextlessStableDiffusion` explains each."""
 
     latent_channels: Width
     conditioning_channels: Width
@@ -26,11 +26,11 @@ class Sizes(TypedDict, total=False):
 
 
 class ConditionalUNet(nn.Module):
-    """What both denoisers share: a UNet of diffusers on [conditioning, noisy latent].
+    """Base class of both denoisers: a UNet of diffusers on [conditioning, noisy latent].
 
     Args:
-        kind, attention: diffusers' network, and the prefix of its blocks with attention.
-        attention_settings: the network's arguments besides.
+        kind, attention: diffusers' network, and the name prefix of its blocks with attention.
+        attention_settings: further arguments of the network.
     """
 
     def __init__(
@@ -63,24 +63,24 @@ class ConditionalUNet(nn.Module):
             self.network.enable_gradient_checkpointing()
 
     def forward(self, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features) -> Latents:
-        """Predict the noise in h_t (paper, Eq. 3), or what else it is trained for (`objective.target`), in float32."""
+        """Predict the noise in h_t (paper, Eq. 3), or another target of training (`objective.target`), in float32."""
         inputs = torch.cat([conditioning, noisy_latent], dim=1)
         sample: Tensor = self.network(inputs, timestep, **self.context_of(len(inputs))).sample
         return sample.float()
 
     def context_of(self, batch: int) -> dict[str, Tensor]:
-        """What the network is called with besides."""
+        """Return further inputs of the network."""
         return {}
 
 
 class AttentionToNothing(AttnProcessor2_0):
-    """Cross-attention with the one token of zeros: the same values, without queries and keys where nothing is trained.
+    """Cross-attention to one token of zeros; without gradients, it computes the same values without queries and keys.
 
-    In training every weight has its part in the loss, with a gradient of zero, which DDP waits for.
+    In training, queries and keys are computed because DDP waits for every weight's gradient, even if it is zero.
     """
 
     def __call__(self, attn: Any, hidden_states: Tensor, *inputs: Any, **settings: Any) -> Tensor:
-        """See diffusers' `AttnProcessor2_0`: [batch, place, channel] to the same."""
+        """Attend like diffusers' `AttnProcessor2_0`; input and output are [batch, place, channel]."""
         if torch.is_grad_enabled():
             attended: Tensor = super().__call__(attn, hidden_states, *inputs, **settings)
             return attended
@@ -92,19 +92,19 @@ class TextlessStableDiffusion(ConditionalUNet):
     """Stable Diffusion 1's UNet, cross-attention included: 859.5 M parameters with 8 input channels.
 
     The paper follows Stable Diffusion's denoiser, trained from scratch, and does not say what takes the place of the
-    text. Here it is one token of zeros: keys and values have no bias, so cross-attention adds its output layer's bias,
-    a learned constant, and nothing else. The conditioning is concatenated before the noisy latent, as in Marigold.
+    text. Here it is one token of zeros: keys and values have no bias, so cross-attention adds only the bias of its
+    output layer, a learned constant. The conditioning is concatenated before the noisy latent, as in Marigold.
 
     Args:
         heads: attention heads, at every width (diffusers calls their number `attention_head_dim`).
         context_channels: channels of the token (CLIP's in Stable Diffusion 1).
-        latent_channels, conditioning_channels: of the latent and of phi_ref.
+        latent_channels, conditioning_channels: channels of the latent and of phi_ref.
         channels: width of each level.
         attention_levels: levels with self- and cross-attention.
         layers_per_block: residual blocks per level.
         norm_groups: groups of the group normalisation.
-        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass: less memory for one
-            more forward pass.
+        gradient_checkpointing: in training, recompute the blocks' activations in the backward pass, which saves
+            memory and costs one more forward pass.
     """
 
     context: Tensor
@@ -119,19 +119,19 @@ class TextlessStableDiffusion(ConditionalUNet):
         self.register_buffer("context", torch.zeros(1, 1, context_channels), persistent=False)
 
     def context_of(self, batch: int) -> dict[str, Tensor]:
-        """The token, for each latent."""
+        """Return the token of zeros for each latent."""
         return {"encoder_hidden_states": self.context.expand(batch, -1, -1)}
 
 
 class Denoiser(ConditionalUNet):
-    """UNet built from Stable Diffusion's blocks, without text: its attention is self-attention only.
+    """UNet of Stable Diffusion's blocks without text: its attention is self-attention only.
 
-    The other reading of a denoiser without text, and the smaller one: blocks without cross-attention (and without the
-    feed-forward layers that come with it).
+    This is the other, smaller reading of a denoiser without text: its blocks have neither cross-attention nor the
+    feed-forward layers that come with it.
 
     Args:
         head_channels: channels of one attention head.
-        **sizes: the others of `TextlessStableDiffusion`.
+        **sizes: see `TextlessStableDiffusion`.
     """
 
     def __init__(self, head_channels: Width = 40, **sizes: Unpack[Sizes]) -> None:

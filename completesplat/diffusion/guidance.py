@@ -1,7 +1,7 @@
-"""The paper's two controls of a drawing, and what they may be: guidance and the weight of the skips.
+"""The paper's two controls of sampling, guidance and skip weight, and the values that they may have.
 
-Guidance in the paper's sense: the weight w mixes the unconditional prediction in, which adds diversity. Skips carry
-what the picture shows into the scene.
+Guidance has the paper's meaning: a weight w mixes in the unconditional prediction, which adds diversity. Skips carry
+what the image shows into the scene.
 """
 
 from collections.abc import Callable
@@ -15,20 +15,20 @@ from completesplat.errors import CompleteSplatError
 Latents = Float[Tensor, "batch channel height width"]
 Features = Float[Tensor, "batch feature height width"]
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""(noisy latent, timestep, conditioning) -> predicted noise."""
+"""Denoiser: (noisy latent, timestep, conditioning) -> predicted noise."""
 
 
 def check_guidance_weight(weight: float) -> None:
-    """Refuse a weight outside of [0, 1], which is no share of the unconditional prediction (`CompleteSplatError`)."""
+    """Raise CompleteSplatError for a weight outside of [0, 1], which is no share of the unconditional prediction."""
     if not 0 <= weight <= 1:
         raise CompleteSplatError(f"guidance_weight={weight:g}: must lie between 0 and 1")
 
 
 def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> float:
-    """The weight that is given, else 1, or 0 where something of a picture is hidden (`visible` below 1).
+    """Return the given weight; by default 1, or 0 if part of an image is hidden (`visible` below 1).
 
     Raises:
-        CompleteSplatError: a weight outside of [0, 1], or one above 0 with something hidden.
+        CompleteSplatError: the weight lies outside of [0, 1], or is above 0 although something is hidden.
     """
     if given is not None and not 0 <= given <= 1:
         raise CompleteSplatError(f"skip_weight={given:g}: must lie between 0 and 1")
@@ -43,11 +43,13 @@ def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> f
 def guided_noise(
     denoise: Denoise, noisy_latent: Latents, timestep: Int[Tensor, " batch"], conditioning: Features, weight: float
 ) -> Latents:
-    """eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
+    """Return eps = (1 - w) * eps_conditional + w * eps_unconditional, with w in [0, 1].
 
-    The customary guidance scale is s = 1 - w. The unconditional prediction is made with the conditioning zeroed, as it
-    is with probability 0.2 in training. w = 0 and w = 1 cost one denoiser call, anything between one of twice the
-    batch. `CompleteSplatError`: w outside of [0, 1].
+    The customary guidance scale is s = 1 - w. The unconditional prediction has its conditioning zeroed, as in
+    training with probability 0.2. w = 0 and w = 1 cost one denoiser call; other weights cost one of twice the batch.
+
+    Raises:
+        CompleteSplatError: w lies outside of [0, 1].
     """
     check_guidance_weight(weight)
     if weight == 0:

@@ -1,4 +1,4 @@
-"""The forward process and what the denoiser predicts; the scheduler's settings decide, in training as in sampling.
+"""Forward process and prediction target of the denoiser, as the scheduler's options define them.
 
 A noisy latent is h_t = a h + b eps. Diffusion has a = sqrt(alpha_bar_t) and b = sqrt(1 - alpha_bar_t) (paper, Eq. 2),
 flow matching a = 1 - t and b = t (Lipman et al. 2023; Liu et al. 2023, "rectified flow"). The denoiser predicts
@@ -19,13 +19,13 @@ from completesplat.diffusion.guidance import Latents
 from completesplat.errors import CompleteSplatError
 
 PREDICTION_TYPES = ("epsilon", "v_prediction", "sample")
-"""Of diffusion; flow matching has one."""
+"""Prediction types of diffusion; flow matching has only one."""
 
 
 def signal_and_noise(
     scheduler: Any, timestep: Int[Tensor, "*batch"], like: Tensor
 ) -> tuple[Float[Tensor, "*batch 1 1 1"], Float[Tensor, "*batch 1 1 1"]]:
-    """The factors a of the latent and b of the noise at a timestep, of the type and on the device of `like`."""
+    """Return the factors a of the latent and b of the noise at a timestep, with the type and device of `like`."""
     if is_flow(scheduler):
         time = timestep.to(like)[..., None, None, None] / scheduler.config.num_train_timesteps
         return 1 - time, time
@@ -34,10 +34,7 @@ def signal_and_noise(
 
 
 def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
-    """The right prediction for a latent and the noise that was added to it.
-
-    `CompleteSplatError`: the scheduler predicts something else.
-    """
+    """Return the true prediction for a latent and the noise added to it; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
         signal, share = signal_and_noise(scheduler, timestep, latent)
@@ -46,7 +43,7 @@ def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor
 
 
 def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
-    """The latent h that a prediction stands for. `CompleteSplatError`: the scheduler predicts something else."""
+    """Return the clean latent h that a prediction implies; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
     if kind == "epsilon":
@@ -57,12 +54,12 @@ def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, ti
 
 
 def is_flow(scheduler: Any) -> bool:
-    """Whether a scheduler draws along the straight lines of flow matching."""
+    """Return whether a scheduler samples along the straight lines of flow matching."""
     return isinstance(scheduler, FlowMatchEulerDiscreteScheduler)
 
 
 def prediction_type(scheduler: Any) -> str:
-    """One of `PREDICTION_TYPES`, or "flow". `CompleteSplatError`: the scheduler has another one."""
+    """Return one of `PREDICTION_TYPES`, or "flow"; raise CompleteSplatError if the scheduler has another type."""
     if is_flow(scheduler):
         return "flow"
     kind: str = scheduler.config.prediction_type

@@ -1,4 +1,4 @@
-"""Drawing latents: a denoiser, a diffusers scheduler, nothing else; many of them in parts that fit into memory."""
+"""Sampling of latents with a denoiser and a diffusers scheduler, in parts that fit into memory."""
 
 import copy
 import logging
@@ -21,22 +21,22 @@ Part = TypeVar("Part")
 logger = logging.getLogger(__name__)
 
 OnStep = Callable[[int, int, Tensor], None]
-"""(number of the denoiser call, timestep, estimate of the clean latent)."""
+"""Callback: (number of the denoiser call, timestep, estimate of the clean latent) -> None."""
 
-# What a denoiser was trained with, whatever sampler draws from it.
+# Scheduler options that training fixes for all later samplers.
 FORWARD_PROCESS = ("num_train_timesteps", "beta_start", "beta_end", "beta_schedule", "trained_betas", "prediction_type")
 
 
 class Sampler:
-    """Reverse diffusion with one of diffusers' schedulers that draw no noise of their own.
+    """Reverse diffusion with one of diffusers' deterministic schedulers.
 
     Args:
-        scheduler: e.g. `diffusers.DDIMScheduler`; its settings also define the forward process in training.
-        steps: denoising steps unless a call says otherwise (50 in the paper).
-        ancestral: of flow matching only: renew noise in each step (`renewed`), which forgets errors of earlier ones.
+        scheduler: e.g. `diffusers.DDIMScheduler`; its options also define the forward process in training.
+        steps: denoising steps unless a call overrides them (50 in the paper).
+        ancestral: renew noise in each step (`renewed`), which forgets earlier errors; for flow matching only.
 
     Raises:
-        CompleteSplatError: `ancestral` for diffusion.
+        CompleteSplatError: `ancestral` is set for diffusion.
     """
 
     def __init__(self, scheduler: Any, steps: Annotated[int, Range(1, 10_000)] = 50, ancestral: bool = False) -> None:
@@ -56,13 +56,13 @@ class Sampler:
         steps: int | None = None,
         on_step: OnStep | None = None,
     ) -> Latents:
-        """Denoise pure noise to latents (paper, Section 3.4). The result depends on the noise alone.
+        """Denoise pure noise to latents (paper, Section 3.4). `noise` is the only source of randomness.
 
-        A step costs one denoiser call (two batches in one where the guidance weight lies between 0 and 1), with
-        single-step schedulers of second order, as Heun's, two. `on_step` is called after each of them.
+        A step costs one denoiser call (of twice the batch if the guidance weight lies between 0 and 1). Single-step
+        schedulers of second order, such as Heun's, need two. `on_step` is called after each call.
 
         Raises:
-            CompleteSplatError: a guidance weight outside of [0, 1], or steps that the scheduler cannot make.
+            CompleteSplatError: the guidance weight lies outside of [0, 1], or the scheduler cannot make these steps.
         """
         scheduler = self.set_up(steps, noise.device)
         flow, fresh = is_flow(scheduler), fresh_noise(noise)
@@ -81,19 +81,19 @@ class Sampler:
         return latent
 
     def set_up(self, steps: int | None = None, device: torch.device | None = None) -> Any:
-        """Return a copy of the scheduler that is set to a number of steps (by default the sampler's).
+        """Return a copy of the scheduler, set up for a number of steps (by default the sampler's).
 
-        Schedulers keep state while they draw. Each call has its own, so that several threads can share a model.
+        Schedulers keep state while they sample. Each call gets a copy, so that several threads can share a model.
 
         Raises:
-            CompleteSplatError: a number of steps that the scheduler cannot make.
+            CompleteSplatError: the scheduler cannot make this number of steps.
         """
         scheduler, most = copy.deepcopy(self.scheduler), self.training_timesteps
         steps = self.steps if steps is None else steps
         if not 1 <= steps <= most:
             raise CompleteSplatError(f"steps={steps}: must lie between 1 and {most}")
         if isinstance(scheduler, DDIMScheduler) and most % steps:
-            # It goes down by whole timesteps, and would end each step at a noise level that the next does not start at.
+            # DDIM goes down by whole timesteps, so a step would end at another noise level than the next one starts at.
             advice = f"must divide {most} (10, 20, 25, 40, 50, ...); sampler=dpm20 takes any number"
             raise CompleteSplatError(f"steps={steps}: DDIM's {advice}")
         # diffusers' own spacing for flow matching would end at t = 1/1000 and waste a step from there
@@ -102,34 +102,32 @@ class Sampler:
         return scheduler
 
     def draw_timesteps(self, count: int, device: torch.device) -> Int[Tensor, " count"]:
-        """Timesteps to train at: uniform for diffusion, the logistic of a standard normal for flow matching.
-
-        The latter favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
-        """
+        """Draw timesteps for training: uniform for diffusion, the logistic of a standard normal for flow matching."""
         if is_flow(self.scheduler):
+            # This favours the middle (Esser et al. 2024, "Scaling Rectified Flow Transformers", Section 3.1).
             middle: Tensor = torch.randn(count, device=device).sigmoid()
             return (middle * self.training_timesteps).ceil().long()
         return torch.randint(self.training_timesteps, (count,), device=device)
 
     def add_noise(self, latent: Latents, noise: Tensor, timestep: Tensor) -> Latents:
-        """The forward process h_t = a h + b eps (paper, Eq. 2; `objective.signal_and_noise`)."""
+        """Apply the forward process h_t = a h + b eps (paper, Eq. 2; `objective.signal_and_noise`)."""
         signal, share = signal_and_noise(self.scheduler, timestep, latent)
         return signal * latent + share * noise
 
     @property
     def training_timesteps(self) -> int:
-        """T, the number of noise levels of the forward process."""
+        """Return T, the number of noise levels of the forward process."""
         steps: int = self.scheduler.config.num_train_timesteps
         return steps
 
 
 def renewed(latent: Latents, velocity: Latents, fresh: Latents, time: float, following: float) -> Latents:
-    """A step from time t to s of flow matching that renews the share 1 - r^2 of the noise's variance.
+    """Return a flow matching step from time t to s that renews the share 1 - r^2 of the noise's variance.
 
-    With h_t = (1 - t) h + t eps, n(t) = t / (1 - t) and r = n(s) / n(t), the forward process has made h_t of h_s by
-    noise that is independent of h_s. Given h, its reverse is h_s = (1 - s) h + s (r eps + sqrt(1 - r^2) z) with z new:
-    the ancestral step of diffusion (Ho et al. 2020, Eq. 7; k-diffusion's `sample_euler_ancestral_RF`), in which the
-    denoiser's estimates stand for h and eps.
+    With h_t = (1 - t) h + t eps, n(t) = t / (1 - t) and r = n(s) / n(t), the forward process makes h_t from h_s by
+    adding noise that is independent of h_s. Given h, the reverse is h_s = (1 - s) h + s (r eps + sqrt(1 - r^2) z) with
+    new noise z. This is the ancestral step of diffusion (Ho et al. 2020, Eq. 7; k-diffusion's
+    `sample_euler_ancestral_RF`), with the denoiser's estimates in the place of h and eps.
     """
     clean, noise = latent - time * velocity, latent + (1 - time) * velocity
     ratio = following * (1 - time) / (time * (1 - following))
@@ -137,7 +135,7 @@ def renewed(latent: Latents, velocity: Latents, fresh: Latents, time: float, fol
 
 
 def fresh_noise(noise: Latents) -> Iterator[Latents]:
-    """New noise, again and again: for each latent it depends on that latent's first noise alone."""
+    """Yield new noise for each step; a latent's new noise depends on that latent's first noise alone."""
     seeds = noise.float().contiguous().view(torch.int32).flatten(1).sum(1).tolist()
     generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     while True:
@@ -150,41 +148,45 @@ def _scheduler_names(*samplers: Mapping[str, Any]) -> list[str]:
 
 
 def of_one_kind(*samplers: Mapping[str, Any]) -> bool:
-    """Whether the samplers of these configurations are all of diffusion, or all of flow matching."""
+    """Return whether these sampler configs are all for diffusion, or all for flow matching."""
     return len({name.startswith("FlowMatch") for name in _scheduler_names(*samplers)}) == 1
 
 
 def with_forward_process(sampler: Mapping[str, Any], trained: Mapping[str, Any]) -> dict[str, Any]:
-    """A sampler's configuration with the noise schedule and the prediction type of the one trained with.
+    """Return a sampler's config with the noise schedule and prediction type of the sampler used in training.
 
-    `CompleteSplatError`: one of the two is of diffusion, the other of flow matching.
+    Raises:
+        CompleteSplatError: one of the two is for diffusion, the other for flow matching.
     """
     if not of_one_kind(sampler, trained):
         names = _scheduler_names(sampler, trained)
         raise CompleteSplatError(f"sampler: {names[0]} cannot draw from a denoiser that was trained for {names[1]}")
-    kept = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
-    return {**sampler, "scheduler": {**sampler["scheduler"], **kept}}
+    fixed = {key: value for key, value in trained["scheduler"].items() if key in FORWARD_PROCESS}
+    return {**sampler, "scheduler": {**sampler["scheduler"], **fixed}}
 
 
 def draw_noise(
     images: int, samples: int, shape: tuple[int, ...], seed: int | Sequence[int]
 ) -> Float[Tensor, "latent _ _ _"]:
-    """Noise of this shape for several samples of each image, those of one image next to each other.
+    """Draw noise of this shape for several samples of each image, those of one image next to each other.
 
-    `seed` is that of all noise, or there is one for each image; `CompleteSplatError`: another number of seeds.
+    Raises:
+        CompleteSplatError: `seed` is neither one seed for all noise nor one seed for each image.
     """
     seeds = [seed] if isinstance(seed, int) else list(seed)
     if not isinstance(seed, int) and len(seeds) != images:
         raise CompleteSplatError(f"seed={seeds}: {len(seeds)} seeds for {images} images; give one for each image")
     shape = (images * samples // len(seeds), *shape)
-    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(one)) for one in seeds])
+    return torch.cat([torch.randn(shape, generator=torch.Generator().manual_seed(number)) for number in seeds])
 
 
 def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None) -> list[Part]:
-    """`draw` for all of `count` samples, at most `most` at a time (None: all at once), in their order.
+    """Call `draw` for all of `count` samples in order, at most `most` at a time (None: all at once).
 
-    Where a GPU's memory does not suffice, a part is drawn again by halves, with a warning.
-    `torch.cuda.OutOfMemoryError`: a single sample does not fit.
+    If a GPU's memory does not suffice, log a warning and draw with parts of half the size.
+
+    Raises:
+        torch.cuda.OutOfMemoryError: a single sample does not fit.
     """
     parts: list[Part] = []
     start, size = 0, min(count if most is None else most, count)
@@ -196,7 +198,7 @@ def in_parts(draw: Callable[[slice], Part], count: int, most: int | None = None)
         except torch.cuda.OutOfMemoryError:
             if size == 1:
                 raise
-        # Not in the handler, where the error still holds what was computed.
+        # This is outside of the handler, where the error would still hold the computed tensors.
         torch.cuda.empty_cache()
         logger.warning("%d samples do not fit into the GPU's memory; going on with %d at a time", size, (size + 1) // 2)
         size = (size + 1) // 2

@@ -1,4 +1,4 @@
-"""Learned perceptual similarity (LPIPS), on VGG16's features with torchvision's weights."""
+"""Learned perceptual similarity (LPIPS) on VGG16's features, with torchvision's weights."""
 
 from importlib.resources import as_file, files
 
@@ -14,16 +14,16 @@ from completesplat.weights import weights_file
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 ADVICE = f"fetch VGG16 with `curl -LO {URL}` and give the file as loss.terms.lpips.term.vgg_weights=FILE"
-# Mean and deviation of ImageNet's colours on [-1, 1], as rounded by Zhang et al. (`lpips/lpips.py`, ScalingLayer).
+# Mean and standard deviation of ImageNet's colours on [-1, 1] (Zhang et al., `lpips/lpips.py`, ScalingLayer).
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST_NORM = 1e-10
 
 
 class VGG16Features(nn.Module):
-    """The convolutions of VGG16 (Simonyan and Zisserman 2015, configuration D).
+    """Convolutions of VGG16 (Simonyan and Zisserman 2015, configuration D).
 
-    The layers are numbered as in torchvision's `vgg16`, so its state dict's keys fit: `features.0.weight` and on.
+    The layers are numbered as in torchvision's `vgg16`, so its state dict's keys fit: `features.0.weight` and so on.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class VGG16Features(nn.Module):
         self.features = nn.Sequential(*layers)
 
     def forward(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
-        """What each block gives before it is pooled: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
+        """Return each block's output before pooling: relu1_2, relu2_2, relu3_3, relu4_3, relu5_3."""
         outputs = []
         for layer in self.features:
             if isinstance(layer, nn.MaxPool2d):
@@ -49,14 +49,14 @@ class VGG16Features(nn.Module):
 
 
 def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
-    """VGG16's features from a state dict of torchvision's `vgg16`; the classifier in it is left out.
+    """Load VGG16's features from a state dict of torchvision's `vgg16`, without its classifier.
 
     Args:
         weights: a file, or a URL (http or https) that is downloaded into torch's hub cache once.
         sha256: the file's SHA-256, or its first digits.
 
     Raises:
-        WeightsError: the weights are missing, cannot be downloaded, are another file, or have another layout.
+        WeightsError: the weights are missing, cannot be downloaded, have another SHA-256, or have another layout.
     """
     path = weights_file(weights, sha256, ADVICE, "loss.terms.lpips.term.vgg_sha256")
     try:
@@ -64,7 +64,7 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
         part = {key: value for key, value in contents.items() if key.startswith("features.")}
     except Exception as error:
         raise WeightsError(f"{path}: not a readable state dict ({type(error).__name__}); {ADVICE}") from error
-    # Without values of its own, the network draws nothing: a run's seed means the same with and without this loss.
+    # On "meta", the network draws no random weights: a run's seed gives the same with and without this loss.
     with torch.device("meta"):
         network = VGG16Features()
     try:
@@ -79,7 +79,7 @@ class PerceptualDistance(nn.Module):
     """LPIPS, version 0.1, VGG (Zhang et al. 2018, Eq. 1; their repository `PerceptualSimilarity`), frozen.
 
     Args:
-        features: network that gives the activations to compare.
+        features: network whose activations are compared.
         heads: non-negative weight of each channel of each activation.
     """
 
@@ -97,27 +97,24 @@ class PerceptualDistance(nn.Module):
     def forward(
         self, first: Float[Tensor, "image 3 height width"], second: Float[Tensor, "image 3 height width"]
     ) -> Float[Tensor, " image"]:
-        """Distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels.
-
-        The weights follow the images to their device.
-        """
-        # Weights that moved in inference mode (a validation before the first step) could not take part in training.
+        """Return the distance of each pair of sRGB images with values in [0, 1] and sides of at least 16 pixels."""
+        # Weights moved to a device in inference mode (validation before the first step) could not be used in training.
         with torch.inference_mode(False):
             self.to(first.device)
         layers = zip(self.heads, self.directions(first), self.directions(second), strict=True)
-        maps = [nn.functional.conv2d((one - other).square(), head) for head, one, other in layers]
+        maps = [nn.functional.conv2d((left - right).square(), head) for head, left, right in layers]
         return torch.stack([differences.mean((1, 2, 3)) for differences in maps]).sum(0)
 
     def directions(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
-        """The activations of each layer, of unit length over the channels; zero where no channel is active."""
+        """Return each layer's activations with unit length over the channels; zero where no channel is active."""
         activations = self.features((2 * images - 1 - self.shift) / self.scale)
-        # Unlike a square root of a sum, this norm has a finite gradient (zero) where all channels are zero.
+        # Unlike the square root of a sum, this norm has a finite gradient (zero) where all channels are zero.
         norms = [torch.linalg.vector_norm(layer, dim=1, keepdim=True) for layer in activations]
         return [layer / (norm + SMALLEST_NORM) for layer, norm in zip(activations, norms, strict=True)]
 
 
 def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
-    """The weights of version 0.1 for VGG, as torchmetrics ships them."""
+    """Load the weights of version 0.1 for VGG, which torchmetrics ships."""
     resource = files("torchmetrics.functional.image") / "lpips_models" / "vgg.pth"
     with as_file(resource) as path:
         weights = torch.load(path, map_location="cpu", weights_only=True)
@@ -127,10 +124,10 @@ def load_heads() -> list[Float[Tensor, "1 _ 1 1"]]:
 class LearnedPerceptualSimilarity:
     """LPIPS with VGG16, averaged over the views (paper, Eq. 1, third term); always in float32.
 
-    The network is no part of the trained module, so no checkpoint holds it.
+    The network is not part of the trained module, so no checkpoint holds it.
 
     Args:
-        vgg_weights, vgg_sha256: see `load_vgg16`; None as the latter takes any file of the right layout.
+        vgg_weights, vgg_sha256: see `load_vgg16`; `vgg_sha256=None` accepts any file of the right layout.
     """
 
     def __init__(self, vgg_weights: str, vgg_sha256: str | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Regularisers of the Gaussians themselves; both off by default (weight 0), and not in the paper."""
+"""Regularisers of the Gaussians, both off by default (weight 0) and not in the paper."""
 
 from jaxtyping import Float
 from torch import Tensor

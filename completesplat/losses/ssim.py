@@ -9,7 +9,7 @@ from completesplat.scene import Views
 
 
 class StructuralDissimilarity:
-    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term; it does not state 1 - SSIM or half of it).
+    """1 - SSIM, averaged over pixels and views (paper, Eq. 1, second term, which may also mean half of it).
 
     The Gaussian window has 11 pixels a side (Wang et al. 2004, as in Splatter Image's metric).
     """

@@ -18,7 +18,7 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, the posterior if any."""
+    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, and the posterior if any."""
 
     images: Float[Tensor, "batch view 3 height width"]
     gaussians: Gaussians
@@ -26,13 +26,13 @@ class Prediction(TensorDataclass):
 
 
 class LossTerm(Protocol):
-    """One term: a scalar from a prediction and the true views of the same cameras."""
+    """Loss term: a scalar from a prediction and the true views of the same cameras."""
 
     def __call__(self, prediction: Prediction, truth: Views) -> Float[Tensor, ""]: ...
 
 
 class Weighted(NamedTuple):
-    """A term with its weight in the sum, and the optimizer step from which it takes part."""
+    """Loss term, its weight in the sum, and the optimizer step from which on it counts."""
 
     weight: float
     term: LossTerm
@@ -40,7 +40,7 @@ class Weighted(NamedTuple):
 
 
 class Term(TypedDict, total=False):
-    """The settings of a `Weighted`."""
+    """Options of a `Weighted`."""
 
     weight: Annotated[float, Range(0)]
     term: Any
@@ -48,14 +48,14 @@ class Term(TypedDict, total=False):
 
 
 class WeightedSum:
-    """Sum of weighted terms, by name.
+    """Weighted sum of named loss terms.
 
     Args:
-        terms: name -> {weight, term, start_step (default 0)}; an entry that is None is left out (that is how an
-            ablation drops one), and so is one of weight 0.
+        terms: name -> {weight, term, start_step (default 0)}; an entry is left out if it is None (as in an
+            ablation) or has weight 0.
 
     Raises:
-        CompleteSplatError: there is nothing to train on at step 0.
+        CompleteSplatError: no term counts at step 0.
     """
 
     def __init__(self, terms: Mapping[str, Term | None]) -> None:
@@ -66,7 +66,7 @@ class WeightedSum:
     def __call__(
         self, prediction: Prediction, truth: Views, step: int = 0
     ) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
-        """The weighted sum at an optimizer step, and the unweighted value of each of its terms for logging.
+        """Return the weighted sum at an optimizer step, and each term's unweighted value for logging.
 
         A term is not computed before its `start_step`.
         """

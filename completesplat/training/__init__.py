@@ -1,1 +1,1 @@
-"""Lightning modules, schedules and checkpoints. No other part of the package needs Lightning, but the data modules."""
+"""Lightning modules, schedules and checkpoints. Only they and the data modules need Lightning."""

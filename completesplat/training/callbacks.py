@@ -1,4 +1,4 @@
-"""Callbacks of training: seeds of steps, steps left out, averaged weights, the progress bar."""
+"""Training callbacks: seeds of steps, skipped steps, averaged weights, the progress bar."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -26,9 +26,9 @@ logger = logging.getLogger(__name__)
 
 
 class StepSeeds(Callback):
-    """Seeds torch's global generators anew before every training batch.
+    """Callback that seeds torch's global generators before every training batch.
 
-    What is drawn then depends on (seed, epoch, batch, process) alone, also in a run that is resumed within an epoch.
+    Random numbers then depend on (seed, epoch, batch, process) alone, also in a run that is resumed within an epoch.
     """
 
     def __init__(self, seed: int) -> None:
@@ -39,20 +39,20 @@ class StepSeeds(Callback):
 
 
 def step_seed(*place: int) -> int:
-    """64 bits that are different and unrelated for different places (NumPy's `SeedSequence`)."""
+    """Return a 64-bit seed that differs from, and is unrelated to, those of other places (NumPy's `SeedSequence`)."""
     return int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0])
 
 
 class BadSteps(Callback):
-    """Leaves out the optimizer steps whose loss, or norm of all gradients, is not finite.
+    """Callback that skips optimizer steps whose loss, or norm of all gradients, is not finite.
 
-    Such a step leaves weights, their averages and the optimizer's state as they are. It is counted as a step of the
-    run, so the schedule and the order of the data go on. All processes leave out the same steps. The bar and the
-    loggers get their number so far, `train/bad_steps`. With `trainer.precision=16-mixed` they include the first steps,
-    which look for the loss's scale.
+    A skipped step does not change weights, their averages or the optimizer's state. It counts as a step of the run, so
+    the schedule and the order of the data go on. All processes skip the same steps. The bar and the loggers get the
+    number of skipped steps as `train/bad_steps`. With `trainer.precision=16-mixed` it includes the first steps, which
+    search for the loss's scale.
 
     Args:
-        most_bad_steps: so many in a row, or all steps of a shorter run, end the run with `DivergenceError`.
+        most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.
     """
 
     def __init__(self, most_bad_steps: Positive = 10) -> None:
@@ -68,14 +68,14 @@ class BadSteps(Callback):
         self.total, self.in_a_row = state_dict["total"], state_dict["in_a_row"]
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
-        self.losses.append(loss.detach())  # several where gradients are accumulated
+        self.losses.append(loss.detach())  # several if gradients are accumulated
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
         norm = whole(torch.nn.utils.get_total_norm(gradients)).to(pl_module.device)
         finite = torch.stack([*self.losses, norm]).isfinite().all()
         self.losses = []
-        # Processes have losses of their own, and the same gradients.
+        # Processes have different losses, but the same gradients.
         if trainer.strategy.reduce((~finite).float(), reduce_op="sum") == 0:
             self.in_a_row = 0
         else:
@@ -84,24 +84,24 @@ class BadSteps(Callback):
             if self.in_a_row == self.most_bad_steps:
                 raise DivergenceError(self.divergence)
             for parameter in pl_module.parameters():
-                parameter.grad = None  # which optimizers pass over
+                parameter.grad = None  # optimizers skip these parameters
         pl_module.log(BAD_STEPS, float(self.total), prog_bar=True, batch_size=1)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Raise `DivergenceError` if no step changed the weights, before a checkpoint of them is written."""
+        """Raise DivergenceError if no step changed the weights, before a checkpoint of them is written."""
         if 0 < self.total == trainer.global_step:
             raise DivergenceError(self.divergence)
 
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
-    """Return the step, the loss term and the first layer with gradients that are not finite."""
+    """Describe a bad step: its number, and the loss term and first layer that are not finite."""
     logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
     terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
     layers = [n for n, p in module.named_parameters() if p.grad is not None and not own_part(p.grad).isfinite().all()]
-    found = gathered((terms, layers))
-    term = next((f"loss term {terms[0]}" for terms, _ in found if terms), "the last losses are finite")
-    layer = next((f"that of {layers[0]} is the first" for _, layers in found if layers), "their norm is too large")
+    results = gathered((terms, layers))
+    term = next((f"loss term {terms[0]}" for terms, _ in results if terms), "the last losses are finite")
+    layer = next((f"that of {layers[0]} is the first" for _, layers in results if layers), "their norm is too large")
     return (
         f"step {trainer.global_step}: {steps} steps in a row had a loss or gradients that are not finite: {term}; "
         f"of the gradients {layer}; lower optimizer.lr, or start again from an earlier checkpoint with another seed"
@@ -126,7 +126,7 @@ class ExponentialMovingAverage(WeightAveraging):
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:
-        """The average in the place of the weights, as in validation."""
+        """Use the average in the place of the weights, as in validation."""
         self._swap_models(module)
         try:
             yield
@@ -136,27 +136,27 @@ class ExponentialMovingAverage(WeightAveraging):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Not after a step that was left out."""
+        """Update the average, except after a skipped step."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         if not any(isinstance(callback, BadSteps) and callback.in_a_row for callback in callbacks):
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Not yet: the checkpoint that is written now must hold the weights too, for a run that goes on."""
+        """Wait for `on_fit_end`: the checkpoint that is written now must hold the weights too, to resume the run."""
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_end(trainer, pl_module)
 
 
 class Progress(RichProgressBar):
-    """Lightning's bar, over the optimizer steps of the whole run, whose end its time left tells.
+    """Lightning's progress bar over the optimizer steps of the whole run, so that it shows the run's remaining time.
 
-    Where nobody watches (no terminal), a line after every validation. A line at the start says when that is.
+    Without a terminal, it logs a line after every validation. A line at the start tells the validation interval.
     """
 
     @property
     def total_train_batches(self) -> int | float:
-        """Steps of the run; batches of an epoch where the run has no number of steps."""
+        """Return the steps of the run, or the batches of an epoch if the run has no number of steps."""
         steps = self.trainer.max_steps
         return steps if steps > 0 else super().total_train_batches
 
@@ -178,7 +178,7 @@ class Progress(RichProgressBar):
         super()._update(progress_bar_id, current, visible, hard)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """The figures behind the bar."""
+        """Return the figures at the end of the bar."""
         metrics = super().get_metrics(trainer, pl_module)
         metrics.pop("v_num", None)
         if not metrics.get(BAD_STEPS):
@@ -189,8 +189,8 @@ class Progress(RichProgressBar):
         super().on_validation_end(trainer, pl_module)
         if get_console().is_terminal or not trainer.is_global_zero:
             return
-        shown = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
-        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in shown.items()))
+        metrics = {k: v for k, v in trainer.callback_metrics.items() if k == "train/loss" or k.startswith("val/")}
+        logger.info("step %s: %s", _steps(trainer), ", ".join(f"{k} {v:.4g}" for k, v in metrics.items()))
 
     def _get_train_description(self, current_epoch: int) -> str:
         return "Training" if self.trainer.max_steps > 0 else f"Epoch {current_epoch}"

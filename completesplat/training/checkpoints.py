@@ -1,4 +1,4 @@
-"""Checkpoints: when they are written, how a file is replaced whole, and how damaged ones are told from whole ones."""
+"""Checkpoints: when they are written, how files are replaced atomically, and how damaged files are recognised."""
 
 import hashlib
 import logging
@@ -34,43 +34,43 @@ logger = logging.getLogger(__name__)
 
 
 class CheckpointFiles(TorchCheckpointIO):
-    """Writes straight into a file beside the final place and renames it: there is a whole checkpoint or none.
+    """Checkpoint files that are written beside their final place and renamed, so that they are whole or missing.
 
-    Lightning's own first makes the whole file in memory, for 860 million parameters with optimizer and average 15 GB.
-    A checkpoint is a zip archive: its checksum is the archive's comment.
+    Lightning's own class first builds the file in memory: 15 GB for 860 million parameters with optimizer and average.
+    A checkpoint is a zip archive; its checksum is the archive's comment.
     """
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
     ) -> None:
-        """Replace what is at this path; `DiskError` if the disk refuses, and the old file stays."""
+        """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
         with _replaced(Path(path), bytes_of(checkpoint)) as unfinished:
             torch.save(checkpoint, unfinished)
             _add_checksum(unfinished)
 
     def load_checkpoint(self, path: str | os.PathLike[str], *options: Any, **more: Any) -> dict[str, Any]:
-        """As `read_checkpoint`, on the CPU."""
+        """Load a checkpoint with `read_checkpoint`, on the CPU."""
         return read_checkpoint(Path(path))
 
 
 class Checkpoints(Checkpoint):
-    """Writes `last.ckpt` anew at intervals and at the end of training, and milestones that are kept.
+    """Callback that replaces `last.ckpt` at intervals and at the end of training, and writes permanent milestones.
 
-    Every time one file is written: at a milestone `step=N.ckpt`, and `last.ckpt` becomes a second name (hard link) of
-    it. A run that is killed at any moment leaves a whole `last.ckpt`. The one before it stays as `previous.ckpt` until
-    the end of training.
+    Only one file is written each time: at a milestone this is `step=N.ckpt`, and `last.ckpt` becomes its second name (a
+    hard link). A run that is killed at any moment leaves a whole `last.ckpt`. The checkpoint before it stays as
+    `previous.ckpt` until the end of training.
 
-    Loggers get a step's rows, and those of its validation, after the last callback of the step. So the file is written
-    before the next batch, with the loops' state as it was at the end of the step (also at the end of training, which
-    Lightning takes for the end of an epoch): where a run goes on, nothing that the step had to log is missing. It holds
-    the figures that were logged so far, too, which the end of a run reports.
+    Loggers get the rows of a step and of its validation after the last callback of the step. The file is therefore
+    written before the next batch, with the loops' state at the end of the step (also at the end of training, which
+    Lightning takes for the end of an epoch), so that a resumed run lacks no row. The file also holds the figures that
+    were logged so far, because the end of a run reports them.
 
-    While training lasts, signals are kept: after the step in which one came to any of the processes, all save, and end
+    During training, signals are only recorded. After the step in which any process got one, all processes save and end
     with `Interrupted`.
 
     Args:
-        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between them; None: do not matter.
-        keep_every: optimizer steps between milestones (at least 1); None: none are kept.
+        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between checkpoints; None: ignored.
+        keep_every: optimizer steps between milestones (at least 1); None: no milestones.
     """
 
     def __init__(
@@ -95,21 +95,21 @@ class Checkpoints(Checkpoint):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.step = self.saved_step = trainer.global_step
         self.saved_at = monotonic()
-        for one in trainer.loggers:
-            if isinstance(one, ContinuedCSVLogger):
-                one.experiment.goes_on_from = trainer.global_step
+        for run_logger in trainer.loggers:
+            if isinstance(run_logger, ContinuedCSVLogger):
+                run_logger.experiment.goes_on_from = trainer.global_step
         begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
         last = self.folder / LAST
         if trainer.is_global_zero:
-            make_folder(self.folder)  # once: a run whose folder is removed is not to go on
+            make_folder(self.folder)  # only here: a run whose folder is removed must not go on
         if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
-            link(begun, last)  # in the place of a damaged one, which is not to become the one before
+            link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
         keep_signals(True)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        # Several batches share an optimizer step where gradients are accumulated; these are not in a checkpoint.
+        # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped:
             self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
@@ -152,20 +152,20 @@ class Checkpoints(Checkpoint):
             return True
         if self.every_minutes is None:
             return False
-        # All processes save together, and their clocks differ.
+        # All processes save together, although their clocks differ.
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        own = not_finite({name: own_part(value) for name, value in module.state_dict().items()})
-        if (name := next(filter(None, gathered(own)), None)) is not None:
-            said = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
-            raise DivergenceError(f"step {trainer.global_step}: {said}")
+        local = not_finite({name: own_part(value) for name, value in module.state_dict().items()})
+        if (name := next(filter(None, gathered(local)), None)) is not None:
+            message = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
+            raise DivergenceError(f"step {trainer.global_step}: {message}")
         self.due = False
         self.step = self.saved_step = trainer.global_step
         self.saved_at = monotonic()
         last = self.folder / LAST
         if trainer.is_global_zero and last.is_file():
-            link(last, self.folder / PREVIOUS)  # before the new one is there, so that there are never three
+            link(last, self.folder / PREVIOUS)  # before the new file exists, so that there are never three
         if not self._is_milestone():
             return trainer.save_checkpoint(last)
         milestone = self.folder / f"step={self.step}.ckpt"
@@ -176,7 +176,7 @@ class Checkpoints(Checkpoint):
 
 
 def link(source: Path, target: Path) -> None:
-    """Give a file a second name, which may belong to another file until then; a copy where there are no hard links."""
+    """Give a file a second name, which may be another file's until then; copy it if there are no hard links."""
     with _replaced(target) as unfinished:
         try:
             os.link(source, unfinished)
@@ -185,12 +185,12 @@ def link(source: Path, target: Path) -> None:
 
 
 def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
-    """A file that is unfinished always has the same name: a run that is killed again and again leaves one of them."""
+    """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave only one."""
     return atomic_path(path, f".{path.name}.unfinished", size)
 
 
 def bytes_of(contents: Any) -> int:
-    """Of the tensors in nested containers: a file that holds them is at least so large."""
+    """Return the bytes of all tensors in nested containers, the least size of a file that holds them."""
     if isinstance(contents, Tensor):
         return contents.nbytes
     if isinstance(contents, Mapping):
@@ -199,7 +199,7 @@ def bytes_of(contents: Any) -> int:
 
 
 def _add_checksum(path: Path) -> None:
-    """Make the SHA-256 of all that stands before it the last 64 bytes of a zip archive without a comment."""
+    """Append to a zip archive without a comment the SHA-256 of all bytes before it, as the archive's comment."""
     with path.open("rb+") as file:
         file.seek(-2, os.SEEK_END)
         file.write((len(CHECKSUM) + DIGEST_BYTES).to_bytes(2, "little") + CHECKSUM)
@@ -210,9 +210,10 @@ def _add_checksum(path: Path) -> None:
 
 
 def newest_whole(last: Path) -> Path | None:
-    """`last.ckpt`, or with a warning the one before it or the latest milestone beside it; None if there is no last one.
+    """Return `last.ckpt`, or with a warning an older checkpoint if it is damaged; None if there is no `last.ckpt`.
 
-    `WeightsError`: none of them is whole.
+    Raises:
+        WeightsError: all of them are damaged.
     """
     if not last.is_file():
         return None

@@ -1,4 +1,4 @@
-"""The latent cache: a training set encoded once by the frozen autoreconstructor, and latents drawn from it."""
+"""Latent cache: a training set encoded once by the frozen autoreconstructor, and latents drawn from it."""
 
 import hashlib
 import logging
@@ -49,7 +49,7 @@ logger = logging.getLogger(__name__)
 
 
 def fingerprint(module: nn.Module) -> str:
-    """SHA-256 (hexadecimal) of a module's weights: names, types, shapes and bytes."""
+    """Return the SHA-256 (hexadecimal) of a module's weights: names, types, shapes and bytes."""
     digest = hashlib.sha256()
     for name, value in sorted(module.state_dict().items()):
         digest.update(f"{name} {value.dtype} {tuple(value.shape)} ".encode())
@@ -58,7 +58,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def posterior_fingerprint(autoreconstructor: VariationalAutoReconstructor) -> str:
-    """Of all weights that latents depend on."""
+    """Return the fingerprint of all weights that latents depend on."""
     encoder, views = autoreconstructor.encoder, autoreconstructor.view_encoder
     return fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
 
@@ -69,13 +69,14 @@ def check_cache(
     source: SequenceSource,
     conditioning: nn.Module | None = None,
 ) -> None:
-    """Refuse a stale cache. (The data module compares picture sizes and all other settings of the data.)
+    """Raise an error for a stale cache. (The data module compares image sizes and all other data options.)
 
     Args:
-        conditioning: a frozen one needs its own features, one that is trained needs pictures; None is not looked at.
+        conditioning: needs its stored features if it is frozen, else stored images; None is not checked.
 
-    `WeightsError`: made with another autoreconstructor or conditioning; `DataError`: of other data, or its latents
-    have another shape than this autoreconstructor's.
+    Raises:
+        WeightsError: the cache was made with another autoreconstructor or conditioning.
+        DataError: the cache is of other data, or its latents have another shape than this autoreconstructor's.
     """
     if store.origin.encoder != posterior_fingerprint(autoreconstructor):
         raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
@@ -92,7 +93,7 @@ def check_cache(
 
 
 def features_fingerprint(conditioning: nn.Module | None) -> str | None:
-    """Of a frozen conditioning, whose features are stored; None for one that is trained on pictures, or for none."""
+    """Return the fingerprint of a frozen conditioning, whose features are stored; else None."""
     return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
 
 
@@ -104,21 +105,21 @@ def encoded(
     precision: torch.dtype,
     device: torch.device | str,
 ) -> Rows:
-    """The rows "mean", "log_variance" and "condition" of these scenes' references, by frozen networks."""
+    """Return the rows "mean", "log_variance" and "condition" of these scenes' references, by frozen networks."""
     scenes = scenes.to(device)
     images = scenes.reference.images
     views = scenes.all_views() if autoreconstructor.sees_views else None
     posterior, _ = autoreconstructor.posterior(images, views, scenes.depth_range)
-    made = {"mean": posterior.mean, "log_variance": posterior.log_variance}
+    outputs = {"mean": posterior.mean, "log_variance": posterior.log_variance}
     if conditioning is not None:
-        made["condition"] = conditioning(images)
-    stored = {name: value.to(precision).cpu().numpy() for name, value in made.items()}
+        outputs["condition"] = conditioning(images)
+    stored = {name: value.to(precision).cpu().numpy() for name, value in outputs.items()}
     pictures = (images * 255).round().to(torch.uint8).cpu().numpy()
     return {"condition": pictures, **stored} if conditioning is None else stored
 
 
 class Moments:
-    """Sums over all elements of each channel of what was encoded, in float64, for mean and deviation of a draw."""
+    """Sums over all encoded elements of each channel, in float64, for mean and standard deviation of latents."""
 
     def __init__(self) -> None:
         self.count, self.total, self.squares = 0, 0.0, 0.0
@@ -126,20 +127,20 @@ class Moments:
     def add(
         self, mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
     ) -> None:
-        """Some more rows."""
+        """Add more rows."""
         mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
         self.count += mean[:, 0].size
         self.total = self.total + mean.sum((0, 2, 3))
         self.squares = self.squares + (np.square(mean) + variance).sum((0, 2, 3))
 
     def join(self, other: "Moments") -> None:
-        """What another one has added up, too."""
+        """Add the sums of other rows."""
         self.count += other.count
         self.total = self.total + other.total
         self.squares = self.squares + other.squares
 
     def results(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Mean and deviation, from Var[h] = E[mean^2] + E[variance] - E[mean]^2: no draw is needed for it."""
+        """Return mean and standard deviation; Var[h] = E[mean^2] + E[variance] - E[mean]^2 needs no samples."""
         mean = np.asarray(self.total) / self.count
         std = np.sqrt(np.asarray(self.squares) / self.count - np.square(mean))
         return tuple(mean.tolist()), tuple(std.tolist())
@@ -157,19 +158,20 @@ def encode_training_set(
     device: torch.device | str = "cpu",
     progress: bool = True,
 ) -> LatentCache:
-    """Encode every frame of every sequence of a packed training set, as it is without augmentation.
+    """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished store of the same is left as it is. Nothing that opens is left behind by a run that was interrupted.
-    Several processes share the batches, and the first one writes what all have encoded: the store of one process.
+    A finished store of the same encodings is not changed. An interrupted run leaves no readable store. Several
+    processes share the batches, and the first one writes the same store as a single process would.
 
     Args:
         frames: the largest number of frames of a sequence, evenly spaced; None: all.
-        views: other views, evenly spread over the sequence, that a posterior which sees views is given.
+        views: number of other views, evenly spread over the sequence, for a posterior that sees views.
         precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
-            first of the diffusion's timesteps adds noise of 0.029 to latents of deviation 1) and 0.8% in variances.
-        conditioning: frozen, images -> features, which are stored; None: the pictures are.
+            first of the diffusion's timesteps adds noise of 0.029 to latents of unit variance) and 0.8% in variances.
+        conditioning: frozen network from images to features, which are stored; None: the images are stored.
 
-    `DataError`: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
+    Raises:
+        DataError: data not packed or damaged, no space, another store in the folder, or encodings that are not finite.
     """
     views = views if autoreconstructor.sees_views else 0
     source = _packed(data)
@@ -205,7 +207,7 @@ def _packed(data: SceneDataModule) -> PackedSource:
 
 
 class FrameToEncode(NamedTuple):
-    """A scene whose reference is to be encoded, and the number of its frame."""
+    """Scene whose reference is to be encoded, and the number of its frame."""
 
     scene: SceneBatch
     number: int
@@ -214,7 +216,7 @@ class FrameToEncode(NamedTuple):
 def _references(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
 ) -> Iterator[tuple[PosedSequence, int]]:
-    """Sequence and place of all references, by row; `sequences` gets an entry for each sequence that they are of."""
+    """Yield sequence and place of all references, by row; append each of their sequences to `sequences`."""
     rows = 0
     for name in track(source.names, "encoding sequences", disable=not progress):
         sequence = source.read(name)
@@ -236,25 +238,24 @@ def _encoded_batches(
     encode: Callable[[SceneBatch], Rows],
     batch_size: int,
 ) -> Iterator[tuple[Rows, Moments]]:
-    """The rows of all batches, in order, and the moments of each batch.
+    """Yield the rows and moments of all batches, in order; all processes must iterate, because each encodes a share.
 
-    Each process encodes its share; all of them have to ask for them. (Rows that were sent lie in another order in
-    memory, and their sums are rounded otherwise.)
+    Moments are computed before rows are sent, because their order in memory then changes, and with it the rounding.
     """
     rank, count = processes()
     while group := list(islice(references, count * batch_size)):
-        own = group[rank * batch_size : (rank + 1) * batch_size]
-        found: tuple[Rows, Moments] | DataError | None = None
-        if own:
+        local = group[rank * batch_size : (rank + 1) * batch_size]
+        result: tuple[Rows, Moments] | DataError | None = None
+        if local:
             try:
-                batch = list(map(load, own))
-                rows, moments = encode(stack([one.scene for one in batch])), Moments()
+                batch = list(map(load, local))
+                rows, moments = encode(stack([frame.scene for frame in batch])), Moments()
                 _refuse_not_finite(rows, batch)
                 moments.add(rows["mean"], rows["log_variance"])
-                found = rows, moments
-            except DataError as error:  # which is every process's
-                found = error
-        for encoded_there in gathered(found):
+                result = rows, moments
+            except DataError as error:  # all processes raise it below
+                result = error
+        for encoded_there in gathered(result):
             if isinstance(encoded_there, DataError):
                 raise encoded_there
             if encoded_there is not None:
@@ -262,7 +263,7 @@ def _encoded_batches(
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
-    """Say how large the store is going to be; `DataError` if the disk has less space than that."""
+    """Log the size of the future store; raise DataError if the disk has less space."""
     most = [len(shard.sequences) * (frames or shard.frames) for shard in source.shards]
     total = sum(min(shard.frames, limit) for shard, limit in zip(source.shards, most, strict=True))
     contents = f"{total:,} frames of {len(source.names):,} sequences"
@@ -272,7 +273,7 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 def _write_store(
     out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Moments]], sequences: Sequence[CachedSequence]
 ) -> None:
-    """The first process writes what all encode; the others wait for it. `sequences` are there when `batches` end."""
+    """Write all processes' encodings in the first one; the others wait. `batches` completes `sequences`."""
     if is_first():
         arrays, moments = _write_arrays(out, blank, batches)
         checksums = sha256_of(out / arrays[CHECKSUMS].file)
@@ -284,15 +285,15 @@ def _write_store(
 
 
 def _write_arrays(out: Path, blank: Rows, batches: Iterator[tuple[Rows, Moments]]) -> tuple[dict[str, Array], Moments]:
-    """Rows like those of `blank`; what was written, and its moments."""
+    """Write rows like those of `blank`; return what was written, and its moments."""
     moments = Moments()
     with ExitStack() as files:
         writers = {
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in {**blank, CHECKSUMS: row_checksums(blank)}.items()
         }
-        for rows, of_batch in batches:
-            moments.join(of_batch)
+        for rows, batch_moments in batches:
+            moments.join(batch_moments)
             rows[CHECKSUMS] = row_checksums(rows)
             for name, writer in writers.items():
                 writer.append(rows[name])

@@ -1,4 +1,4 @@
-"""Pictures of a few fixed scenes while a model trains, and figures of its Gaussians and latents."""
+"""Images of a few fixed scenes while a model trains, and figures of its Gaussians and latents."""
 
 import json
 from abc import abstractmethod
@@ -38,14 +38,14 @@ PERCENTILES = (10, 50, 90)
 
 
 class DrawsFixedScenes(Callback):
-    """Draws the first scenes of the validation set.
+    """Base class of callbacks that draw the first scenes of the validation set, without an effect on training.
 
-    The model is in evaluation mode, with averaged weights if training keeps them. Training is the same without.
+    The model is in evaluation mode, with averaged weights if training keeps them.
 
     Args:
-        folder, scenes: of the pictures, and how many scenes they show.
-        every_n_steps: optimizer steps between them; there is another one at the end of training.
-        views: targets of a scene, evenly spread over those that it has; all, if these are fewer.
+        folder, scenes: folder of the images, and the number of scenes in them.
+        every_n_steps: optimizer steps between drawings; there is one more at the end of training.
+        views: targets of a scene, evenly spread over all its targets; all, if these are fewer.
     """
 
     def __init__(self, folder: str, every_n_steps: int, scenes: int, views: int) -> None:
@@ -88,9 +88,9 @@ class DrawsFixedScenes(Callback):
 
 @contextmanager
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Evaluation with averaged weights if there are any; afterwards all is as it was, random numbers too.
+    """Switch to evaluation, with averaged weights if there are any, and afterwards restore all, random numbers too.
 
-    All processes have to enter it: where networks are divided over them, they are whole inside.
+    All processes have to enter it, because networks that are divided over them are whole inside.
     """
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
@@ -108,27 +108,27 @@ def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
 
 
 def fixed_scenes(data: Any, count: int, views: int = 1) -> list[SceneBatch]:
-    """The first validation scenes, with some of their targets."""
-    found: list[SceneBatch] = []
+    """Return the first validation scenes, with some of their targets."""
+    scenes: list[SceneBatch] = []
     for batch in data.val_dataloader():
         for index in range(len(batch.names)):
             scene = batch[index]
             targets = len(scene.targets.images)
             chosen = [i * targets // views for i in range(views)] if targets > views else list(range(targets))
-            found.append(replace(scene, targets=scene.targets[chosen]))
-        if len(found) >= count:
+            scenes.append(replace(scene, targets=scene.targets[chosen]))
+        if len(scenes) >= count:
             break
-    return found[:count]
+    return scenes[:count]
 
 
 class Pictures(DrawsFixedScenes):
-    """What the first target of each scene looks like, and what its Gaussians are like; see `DrawsFixedScenes`.
+    """Callback that draws the first target of each scene and figures of its Gaussians; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/layers_000500.png` the layers of its
     Splatter Image (`layer_maps`), `folder/newest/` the scenes themselves (`write_newest`). All loggers get
-    `gaussians/opacity_p10`, `_p50`, `_p90`, the same of all `distributions`, what the layers hold on the object
-    (`layer_figures`), and what the latent carries of a model that has a posterior (`latent_bits`). Weights & Biases
-    gets the pictures and histograms too.
+    `gaussians/opacity_p10`, `_p50`, `_p90`, the same percentiles of all `distributions`, figures of the layers on the
+    object (`layer_figures`), and the latent's bits if the model has a posterior (`latent_bits`). Weights & Biases gets
+    the images and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
@@ -151,31 +151,31 @@ class Pictures(DrawsFixedScenes):
         scalars |= layer_figures(gaussians, batch)
         if posterior is not None:
             scalars |= latent_bits(posterior)
-        shown = {"pictures": pictures["step"], "layers": pictures["layers"]}
-        log_drawings(trainer, scalars, shown, {f"histograms/{name}": of for name, of in values.items()})
+        images = {"pictures": pictures["step"], "layers": pictures["layers"]}
+        log_drawings(trainer, scalars, images, {f"histograms/{name}": array for name, array in values.items()})
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
     """Write the scenes [batch] as `scene_0.ply` and so on, and `scenes.json`, over those of an earlier step.
 
     The JSON holds `step`, `up`, and for each file its name, its `scene` and its `reference_camera`. Gaussians are as in
-    predictions. A scene of which nothing can be stored is left out.
+    predictions. A scene without storable Gaussians is left out.
     """
     make_folder(folder)
     described = []
     for index, name in enumerate(scenes.names):
         scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
-        kept = scene.keep(storable(scene))
-        if kept.count:
+        selected = scene.keep(storable(scene))
+        if selected.count:
             file = f"scene_{index}.ply"
-            write_ply(folder / file, with_screen_space_dilation(kept, camera), [f"scene {name}", f"step {step}"])
+            write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])
             described.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
-    found = {"step": step, "up": up.tolist(), "scenes": described}
-    write_text(folder / "scenes.json", json.dumps(found, indent=2) + "\n")
+    summary = {"step": step, "up": up.tolist(), "scenes": described}
+    write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
 
 
 def up_of(module: SceneModule) -> Float[Tensor, "3"]:
-    """Where up is in the reference's frame: as measured on the training set, else above the picture."""
+    """Return the up direction in the reference's frame: as measured on the training set, else the image's."""
     if isinstance(module, LatentDiffusion):
         return module.completesplat.up
     measured = module.camera if isinstance(module, ReconstructionModule) else {}
@@ -183,16 +183,16 @@ def up_of(module: SceneModule) -> Float[Tensor, "3"]:
 
 
 def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
-    """A column for each panel, a row for each scene."""
+    """Draw a sheet with a column for each panel and a row for each scene."""
     return picture_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
 
 
 def scene_panels(
     rasterizer: Rasterizer, gaussians: Gaussians, scenes: SceneBatch, background: float
 ) -> dict[str, Float[Tensor, "batch 3 height width"]]:
-    """Input and first target, what the Gaussians [batch] show from the target's camera, and each layer by itself.
+    """Return input and first target, renders of the Gaussians [batch] from the target's camera, and of each layer.
 
-    The error is the mean absolute difference of the colours, times 4. Depth has a scale of its own for each scene.
+    The error is the mean absolute difference of the colours, times 4. Each scene has a separate scale of depth.
     """
     target = scenes.targets[:, :1]
 
@@ -218,13 +218,13 @@ def scene_panels(
 
 
 def layers_of(gaussians: Gaussians, scenes: SceneBatch) -> Gaussians:
-    """The Gaussians of a Splatter Image [batch], by layer and the reference's pixel: [batch layer height width]."""
+    """Arrange the Gaussians of a Splatter Image by the reference's pixels: [batch layer height width]."""
     size = scenes.reference.images.shape[-2:]
     return gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))
 
 
 def layer_maps(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, Float[Tensor, "batch 3 height width"]]:
-    """Input, and the depth (one scale for all layers of a scene), opacity and colour of each layer, by its pixels."""
+    """Return the input, and depth (one scale for all layers of a scene), opacity and colour of each layer's pixels."""
     layers = layers_of(gaussians, scenes)
     depths = torch.stack([color_depth(depth)[0] for depth in layers.means[..., 2].unsqueeze(2)])
     panels = {"input": scenes.reference.images}
@@ -236,23 +236,23 @@ def layer_maps(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, Float[Tens
 
 
 def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
-    """Of each layer on the object: mean opacity, and mean distance behind the first layer.
+    """Return each layer's mean opacity on the object, and mean distance behind the first layer.
 
-    `layers/opacity_1` and so on; `layers/behind_2` and so on, in scene units along the reference's optical axis. A
+    Keys are `layers/opacity_1`, ... and `layers/behind_2`, ... (in scene units along the reference's optical axis). A
     layer whose opacity goes to zero is dead: it shows nothing of what is hidden.
     """
     layers, on_object = layers_of(gaussians, scenes), scenes.reference.masks[:, 0]
-    found = {}
+    figures = {}
     for layer in range(layers.opacities.shape[1]):
         behind = layers.means[:, layer, ..., 2] - layers.means[:, 0, ..., 2]
         values = {"opacity": layers.opacities[:, layer]} | ({"behind": behind} if layer else {})
         for name, value in values.items():
-            found[f"layers/{name}_{layer + 1}"] = ((value * on_object).sum() / on_object.sum().clamp(min=1)).item()
-    return found
+            figures[f"layers/{name}_{layer + 1}"] = ((value * on_object).sum() / on_object.sum().clamp(min=1)).item()
+    return figures
 
 
 def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]]:
-    """Opacities, decimal logarithms of the scales (all axes), and depths in the reference's frame, in scene units."""
+    """Return opacities, decimal logarithms of all scales, and depths in the reference's frame, in scene units."""
     values = {
         "opacity": gaussians.opacities,
         "log10_scale": gaussians.scales.log10(),
@@ -262,14 +262,14 @@ def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]
 
 
 def percentiles(values: Mapping[str, Float[np.ndarray, " _"]]) -> dict[str, float]:
-    """`name_p10` and so on for each."""
-    return {f"{name}_p{p}": float(np.percentile(of, p)) for name, of in values.items() for p in PERCENTILES}
+    """Return the percentiles of each entry, named `name_p10` and so on."""
+    return {f"{name}_p{p}": float(np.percentile(array, p)) for name, array in values.items() for p in PERCENTILES}
 
 
 def latent_bits(posterior: Posterior) -> dict[str, float]:
-    """KL of the latent to the prior: `latent/bits` a scene, of which `latent/bits_0` and so on in each channel.
+    """Return the latent's KL to the prior per scene: `latent/bits`, and `latent/bits_0`, ... for each channel.
 
-    `latent/active_channels` counts the channels that are active (`completesplat.autoreconstructor.posterior`).
+    `latent/active_channels` counts the active channels (`completesplat.autoreconstructor.posterior`).
     """
     bits = posterior.channel_bits().tolist()
     channels = {f"latent/bits_{index}": value for index, value in enumerate(bits)}
@@ -282,8 +282,8 @@ def log_drawings(
     pictures: Mapping[str, Image.Image],
     histograms: Mapping[str, Float[np.ndarray, " _"]] | None = None,
 ) -> None:
-    """Numbers for all loggers, pictures and histograms for Weights & Biases."""
-    step = trainer.global_step - 1  # as Lightning counts: a row bears the number of the optimizer steps before its own
+    """Log numbers to all loggers, and images and histograms to Weights & Biases."""
+    step = trainer.global_step - 1  # as Lightning counts: a row has the number of optimizer steps before its own
     for logger in trainer.loggers:
         logger.log_metrics(dict(scalars), step=step)
         if isinstance(logger, WandbLogger):

@@ -1,4 +1,4 @@
-"""Two loggers: `metrics.csv`, which a continued run goes on with, and one run of Weights & Biases for a directory."""
+"""Loggers: `metrics.csv`, which a resumed run continues, and one run of Weights & Biases for each directory."""
 
 import csv
 import io
@@ -24,17 +24,17 @@ from completesplat.errors import CompleteSplatError
 
 MODES = ("online", "offline", "disabled")
 ANSWER_SECONDS, START_SECONDS = 4, 6
-"""How long a server may take to answer at all, and to start a run: together the longest that it can delay training."""
+"""Time for a server to answer at all, and to start a run; their sum is the longest possible delay of training."""
 AXIS, DATA = "trainer/global_step", "WANDB_DATA_DIR"
 
 log = logging.getLogger(__name__)
 
 
 class ContinuedCSVLogger(CSVLogger):
-    """Writes `metrics.csv`, each row at once, so that a run that is killed keeps what it logged.
+    """Logger that writes each row to `metrics.csv` at once, so that a killed run keeps its rows.
 
-    Of what the file holds already, the rows before the step that the run goes on from, and before the first that is
-    logged now, stay: what an interrupted run did after its last checkpoint is done again.
+    A resumed run keeps the file's rows before the step of its checkpoint and before the first new row, because it
+    repeats the steps after its last checkpoint.
     """
 
     def __init__(self, save_dir: str) -> None:
@@ -43,14 +43,14 @@ class ContinuedCSVLogger(CSVLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> "MetricsFile":
-        """The file (Lightning's name for what a logger writes to)."""
+        """Return the metrics file, which Lightning calls the experiment."""
         if self._experiment is None:
             self._experiment = MetricsFile(self.log_dir)
         return self._experiment  # type: ignore[return-value]
 
 
 class MetricsFile(ExperimentWriter):
-    """Rows of numbers, appended to `metrics.csv`; it is made anew, as a whole, when a column is added."""
+    """Rows of numbers that are appended to `metrics.csv`; a new column replaces the whole file."""
 
     def __init__(self, log_dir: str) -> None:
         super().__init__(log_dir)
@@ -59,10 +59,10 @@ class MetricsFile(ExperimentWriter):
         self.goes_on_from: int | None = None
 
     def _check_log_dir_exists(self) -> None:
-        """Keep the old file until there is something to put in its place; Lightning would delete it here."""
+        """Keep the old file until it is replaced; Lightning would delete it here."""
 
     def save(self) -> None:
-        """Write the rows that are not written yet; `DiskError` if the disk refuses."""
+        """Write the rows that are not written yet; raise DiskError if the disk refuses."""
         if not self.metrics:
             return
         new = set().union(*self.metrics) - set(self.metrics_keys)
@@ -88,7 +88,7 @@ class MetricsFile(ExperimentWriter):
         if not self.path.is_file():
             return []
         with self.path.open(newline="") as file:
-            # The last line of a process that was killed may have no end.
+            # The last line of a killed process may be incomplete.
             rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
         first = min(row["step"] for row in self.metrics)
         first = first if self.goes_on_from is None else min(first, self.goes_on_from)
@@ -96,15 +96,15 @@ class MetricsFile(ExperimentWriter):
 
 
 class WandbRun(WandbLogger):
-    """Logs to the one run of a directory: its id is in `save_dir/wandb_id`, so that a run that goes on stays one run.
+    """Logger of a directory's only W&B run. Its id is in `save_dir/wandb_id`, so a resumed run continues it.
 
-    `mode=online` becomes `offline`, with a warning, where the server does not answer or refuses; `wandb sync` uploads
-    what was logged later. If W&B's own process dies, training goes on without it.
+    `mode=online` becomes `offline`, with a warning, if the server does not answer or refuses; `wandb sync` uploads the
+    log later. If W&B's own process dies, training goes on without it.
 
     Args:
         mode: online, offline or disabled.
-        group, name: by default the sweep's folder, in a sweep, and the name of the directory.
-        scenes: shown of a test.
+        group, name: by default the sweep's folder (in a sweep), and the directory's name.
+        scenes: number of scenes of a test that are shown.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class WandbRun(WandbLogger):
         if mode not in MODES:
             raise CompleteSplatError(f"wandb.mode={mode}: choose one of {', '.join(MODES)}")
         folder = Path(save_dir).absolute()
-        if group is None and (folder.parent / "multirun.yaml").is_file():  # hydra's, in a sweep's folder
+        if group is None and (folder.parent / "multirun.yaml").is_file():  # Hydra's file in a sweep's folder
             group = folder.parent.name
         about = {"mode": mode, "group": group, "job_type": job_type}
         try:
@@ -134,7 +134,7 @@ class WandbRun(WandbLogger):
     @property
     @rank_zero_experiment
     def experiment(self) -> Any:
-        """W&B's run (Lightning's name for what a logger writes to), which begins at the first access."""
+        """Return W&B's run, which begins at the first access."""
         if self._experiment is None:
             self._experiment = self._begin()
             self._experiment.define_metric(AXIS)
@@ -166,19 +166,19 @@ class WandbRun(WandbLogger):
 
     @rank_zero_only
     def log_hyperparams(self, params: Any) -> None:
-        """Add settings to the run's."""
+        """Add options to the run's config."""
         with self._dispensable():
             self.experiment.config.update(params, allow_val_change=True)
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, Any], step: int | None = None) -> None:
-        """Numbers, or W&B's pictures, histograms, tables and videos."""
+        """Log numbers, or W&B's images, histograms, tables and videos."""
         with self._dispensable(), self._files_beside():
             self.experiment.log({**metrics, **({} if step is None else {AXIS: step})})
 
     @rank_zero_only
     def finish(self, exit_code: int) -> None:
-        """Close the run, if it was begun."""
+        """Close the run if it has begun."""
         import wandb
 
         if self._experiment is None:
@@ -188,17 +188,17 @@ class WandbRun(WandbLogger):
         self._experiment = None
         if self.lost:
             with suppress(ConnectionError):
-                wandb.teardown()  # so that the next job of a sweep gets a process of its own
+                wandb.teardown()  # so that the next job of a sweep gets a new process
 
     @contextmanager
     def _files_beside(self) -> Iterator[None]:
-        """W&B copies what tables show to a folder of the user's, which would outgrow the home; here, to the run's."""
-        given = os.environ.get(DATA)
-        os.environ[DATA] = given or str(Path(self._save_dir).absolute() / "wandb")  # type: ignore[arg-type]
+        """Let W&B copy the media of tables to the run's folder, because they would fill the user's home."""
+        previous = os.environ.get(DATA)
+        os.environ[DATA] = previous or str(Path(self._save_dir).absolute() / "wandb")  # type: ignore[arg-type]
         try:
             yield
         finally:
-            if given is None:
+            if previous is None:
                 del os.environ[DATA]
 
     @contextmanager
@@ -213,7 +213,7 @@ class WandbRun(WandbLogger):
 
 @contextmanager
 def finished(loggers: Iterable[Logger]) -> Iterator[None]:
-    """Close W&B's runs in the end, so that what the next job logs does not go there; exit code 1 after an error."""
+    """Close W&B's runs in the end, so that the next job does not log to them; exit code 1 after an error."""
     exit_code = 1
     try:
         yield
@@ -224,25 +224,25 @@ def finished(loggers: Iterable[Logger]) -> Iterator[None]:
 
 
 def wandb_runs(loggers: Iterable[Logger]) -> list[WandbRun]:
-    """Those of the loggers that log to W&B."""
+    """Return the loggers that log to W&B."""
     return [logger for logger in loggers if isinstance(logger, WandbRun)]
 
 
 def answers(url: str, seconds: float) -> bool:
-    """Whether there is a server that answers, by a refusal too, within a time that includes the look-up of its name."""
-    found: list[bool] = []
-    # Left behind if it takes longer: a look-up of a name cannot be interrupted.
-    asking = threading.Thread(target=lambda: found.append(_asked(url, seconds)), daemon=True)
+    """Return whether a server answers, even with a refusal, within a time that includes the look-up of its name."""
+    replies: list[bool] = []
+    # The look-up of a name cannot be interrupted, so a thread that takes longer is abandoned.
+    asking = threading.Thread(target=lambda: replies.append(_asked(url, seconds)), daemon=True)
     asking.start()
     asking.join(seconds)
-    return found == [True]
+    return replies == [True]
 
 
 def _asked(url: str, seconds: float) -> bool:
     try:
         urlopen(url, timeout=seconds).close()
     except HTTPError as error:
-        return error.code < 502  # a proxy reports 502 and above of a server that it does not reach
+        return error.code < 502  # a proxy reports 502 and above for a server that it does not reach
     except URLError as error:
         return isinstance(error.reason, SSLError)  # W&B may trust more certificates than Python
     except OSError:

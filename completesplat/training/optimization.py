@@ -1,4 +1,4 @@
-"""Muon, and learning-rate schedules, stepped once per optimizer step. `total_steps` is the length of the run."""
+"""Muon, and learning-rate schedules that step once per optimizer step. `total_steps` is the length of the run."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,31 +20,31 @@ def muon(
     momentum: Share = 0.95,
     newton_schulz_steps: Positive = 5,
 ) -> Optimizer:
-    """Muon (Jordan 2024, of the library pytorch_optimizer) for matrices and kernels; Adam for biases and norms.
+    """Build Muon (Jordan 2024; library pytorch_optimizer) for matrices and kernels, with Adam for biases and norms.
 
-    A convolution's kernel is taken as the matrix [out in*height*width]. A step of it has about the same length in all
-    directions, which takes fewer steps than Adam and, on a CPU, a third more time for each.
+    A convolution's kernel is treated as the matrix [out in*height*width]. An update has about the same length in all
+    directions, so Muon needs fewer steps than Adam but, on a CPU, a third more time for each.
 
     Args:
-        lr: of matrices and kernels; how large their gradients are makes no difference.
-        adam_lr, adam_betas: of the rest.
-        newton_schulz_steps: iterations that make a step orthogonal.
+        lr: learning rate of matrices and kernels; the size of their gradients makes no difference.
+        adam_lr, adam_betas: learning rate and betas of biases and norms.
+        newton_schulz_steps: iterations that make an update orthogonal.
     """
-    from pytorch_optimizer import Muon  # which imports a hundred others
+    from pytorch_optimizer import Muon  # imports a hundred other modules
 
-    given = list(parameters)
-    matrices = {"params": [p for p in given if p.ndim > 1], "lr": lr, "use_muon": True}
-    others = {"params": [p for p in given if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
+    tensors = list(parameters)
+    matrices = {"params": [p for p in tensors if p.ndim > 1], "lr": lr, "use_muon": True}
+    others = {"params": [p for p in tensors if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
     groups = [group for group in (matrices, others) if group["params"]]
     optimizer: Any = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
-    if given[0].device.type == "cpu" and not torch.cpu._is_avx512_bf16_supported():
+    if tensors[0].device.type == "cpu" and not torch.cpu._is_avx512_bf16_supported():
         optimizer._orthogonalize = _orthogonal_in_float32
     result: Optimizer = optimizer
     return result
 
 
 def _orthogonal_in_float32(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Tensor]:
-    """As the library, whose bfloat16 takes a hundred times as long on a processor that does not compute in it."""
+    """Orthogonalise in float32, because the library's bfloat16 takes a hundred times as long on CPUs without it."""
     from pytorch_optimizer.optimizer.utils.matrix import zero_power_via_newton_schulz_5
 
     settings = {"num_steps": group["ns_steps"], "weights": group["ns_coeffs"], "dtype": torch.float32}
@@ -54,7 +54,7 @@ def _orthogonal_in_float32(group: Mapping[str, Any], updates: Sequence[Tensor]) 
 def exponential(
     optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
 ) -> LambdaLR:
-    """Linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
+    """Build linear warm-up, then exponential decay to `final_ratio` at the end (Marigold, `src/util/lr_scheduler.py`).
 
     The paper follows Marigold without giving numbers; warm-up and ratio are Marigold's.
     """
@@ -64,20 +64,20 @@ def exponential(
 def cosine(
     optimizer: Optimizer, total_steps: float, warmup_steps: Natural = 100, final_ratio: Share = 0.01
 ) -> LambdaLR:
-    """Linear warm-up, then half a cosine down to `final_ratio` at the end."""
+    """Build linear warm-up, then half a cosine down to `final_ratio` at the end."""
     half_a_cosine = lambda x: final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * x))  # noqa: E731
     return _after_warmup(optimizer, half_a_cosine, total_steps, warmup_steps)
 
 
 def constant(optimizer: Optimizer, total_steps: float) -> LambdaLR:
-    """The optimizer's learning rate throughout, as in the paper's first stage."""
+    """Keep the optimizer's learning rate throughout, as in the paper's first stage."""
     return LambdaLR(optimizer, lambda step: 1.0)
 
 
 def _after_warmup(
     optimizer: Optimizer, decay: Callable[[float], float], total_steps: float, warmup_steps: int
 ) -> LambdaLR:
-    """A linear rise, then `decay` of the share of the other steps that is done: none in a run without an end."""
+    """Build a linear rise, then `decay` of the completed share of the remaining steps (0 in a run without an end)."""
 
     def factor(step: int) -> float:
         if step < warmup_steps:

@@ -1,4 +1,4 @@
-"""The supplement's second failed approach as a whole: fit Gaussians, project them, train a VAE on the projections."""
+"""Supplement's second failed approach as a whole: fit Gaussians, project them, train a VAE on the projections."""
 
 import hashlib
 import logging
@@ -32,15 +32,15 @@ logger = logging.getLogger(__name__)
 
 
 class FittedScenes:
-    """Fits each sequence when it is first asked for, to all its pictures; what is in the folder is not fitted again.
+    """Store of Gaussians that are fitted to all images of a sequence when it is first asked for.
 
-    One sequence at a time is in memory: its pictures and masks (16 bytes a pixel) and its Gaussians. A file takes 56
-    bytes for each Gaussian, a folder of 1,000 sequences with 4,000 Gaussians each 224 MB.
+    One sequence at a time is in memory: its images and masks (16 bytes a pixel) and its Gaussians. A file takes 56
+    bytes for each Gaussian, so 1,000 sequences with 4,000 Gaussians each take 224 MB.
 
     Args:
-        folder: of the files, which several processes may share.
+        folder: folder of the files, which several processes may share; scenes in it are not fitted again.
         fit: a batch of one scene -> its Gaussians, in the reference camera's frame.
-        settings: what the fit depends on besides the pictures: another text means other files.
+        settings: text of all that the fit depends on besides the images; another text means other files.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class FittedScenes:
         self.settings = settings
 
     def complete(self, names: Sequence[str], progress: bool) -> None:
-        """Fit those that are not there yet (`DataError` if a sequence cannot be read); a bar, or ten lines, show it."""
+        """Fit missing scenes, with a bar or ten log lines; raise DataError if a sequence cannot be read."""
         missing = [name for name in names if not self._path(name).is_file()]
         bar = progress and get_console().is_terminal
         for done, name in enumerate(track(missing, "fitting Gaussians to scenes", disable=not bar), start=1):
@@ -62,7 +62,7 @@ class FittedScenes:
                 logger.info("fitted Gaussians to %d of %d scenes", done, len(missing))
 
     def seen_from(self, name: str, frame: int) -> Gaussians:
-        """A sequence's Gaussians in the frame of one of its cameras, on the CPU."""
+        """Return a sequence's Gaussians in the frame of one of its cameras, on the CPU."""
         if not self._path(name).is_file():
             self._make(name)
         cameras = self.stores[name].source.read(name).cameras
@@ -70,7 +70,7 @@ class FittedScenes:
         return Gaussians(**load_file(self._path(name))).transform(to_frame.float())
 
     def _make(self, name: str) -> None:
-        """In the frame of the first camera."""
+        """Fit a sequence in the frame of its first camera, and write its file."""
         store = self.stores[name]
         sequence = store.source.read(name)
         gaussians = self.fit(stack([store.scene(sequence, 0, range(1, len(sequence.frames)))]))[0]
@@ -78,27 +78,27 @@ class FittedScenes:
             save_file({key: value.cpu().contiguous() for key, value in vars(gaussians).items()}, temporary)
 
     def _path(self, name: str) -> Path:
-        """Names of sequences may have slashes."""
+        """Return the file of a sequence, named by a hash because names of sequences may have slashes."""
         key = hashlib.sha256(f"{name}\n{self.settings}".encode()).hexdigest()[:24]
         return self.folder / f"{key}.safetensors"
 
 
 class PreoptimizedVAE(Preoptimized):
-    """A VAE trained on `Preoptimized`'s Splatter Images, and what it makes of the test scenes' ones.
+    """Training and test of a VAE on `Preoptimized`'s Splatter Images.
 
-    Before training, Gaussians are fitted to each training sequence and kept in files (`FittedScenes`), to those of the
-    validation set when they are first looked at. From these a training step makes the Splatter Images of its reference
-    views, so the pictures' augmentation has no effect. Scenes of the test are fitted as they are tested, to the views
+    Before training, Gaussians are fitted to each training sequence and stored in files (`FittedScenes`). Validation
+    sequences are fitted when they are first used. A training step projects these Gaussians into the Splatter Images of
+    its reference views, so image augmentation has no effect. Test scenes are fitted when they are tested, to the views
     that they are scored on.
 
-    The loss, which the paper does not state, is the mean of the errors of depth, offset, scale, rotation and colour,
-    plus the weighted error of the opacity (`SparseVAE.errors`), plus the weighted KL, divided by the number of raw
-    values as `KullbackLeibler` is by those of a picture.
+    The paper does not state the loss. Here it is the mean error of depth, offset, scale, rotation and colour, plus the
+    weighted error of the opacity (`SparseVAE.errors`), plus the weighted KL. The KL is divided by the number of raw
+    values, as `KullbackLeibler` divides it by that of an image.
 
     Args:
-        folder: of the fitted Gaussians.
-        normalization_batches: of the training set, on which the normalisation of raw values is measured.
-        opacity_weight, kl_weight: of the loss.
+        folder: folder of the fitted Gaussians.
+        normalization_batches: number of training batches on which the normalisation of raw values is measured.
+        opacity_weight, kl_weight: weights in the loss.
         **preoptimized: see `Preoptimized`.
     """
 
@@ -120,7 +120,7 @@ class PreoptimizedVAE(Preoptimized):
         self._kept: FittedScenes | None = None
 
     def on_fit_start(self) -> None:
-        """Fit the training set, each process its share of it, and measure the normalisation."""
+        """Fit the training set, each process a share, and measure the normalisation."""
         trainer: Any = self.trainer
         data = trainer.datamodule
         if data.latent_cache is not None:
@@ -139,7 +139,7 @@ class PreoptimizedVAE(Preoptimized):
         self._kept = None
 
     def fitted(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """While it is trained, what is kept of whole sequences; otherwise Gaussians fitted to the scenes' views."""
+        """Return stored Gaussians of whole sequences during training; otherwise fit Gaussians to the scenes' views."""
         if self._kept is None:
             gaussians = super().fitted(scenes, seed)
             return replace(gaussians, quaternions=normalize_quaternion(gaussians.quaternions))
@@ -161,6 +161,6 @@ class PreoptimizedVAE(Preoptimized):
         return total
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Gaussians of the Splatter Images after they have passed through the VAE."""
+        """Return the Gaussians of Splatter Images that have passed through the VAE."""
         image: SplatterImage = self.vae(self.splatter_image(scenes, seed)).splatter_image
         return image.gaussians(scenes.reference.cameras, scenes.depth_range)

@@ -1,4 +1,4 @@
-"""The supplement's "Reconstructor-only without the Encoder": codes of pictures are optimised, not predicted."""
+"""Supplement's "Reconstructor-only without the Encoder": codes of images are optimised, not predicted."""
 
 from typing import Any
 
@@ -18,11 +18,11 @@ from completesplat.training.reconstruction import ReconstructionModule
 
 
 class ReconstructorOnly(ReconstructionModule):
-    """Codes and reconstructor are trained together; a picture of the test gets a new code, the reconstructor stays.
+    """Joint training of codes and reconstructor; a test image gets a new code for the fixed reconstructor.
 
     Args:
-        loss: weighted terms by name, in training of all views, in the test of the reference alone.
-        code_steps, code_rate: of the optimisation of a new code (800 and 0.005 in DeepSDF).
+        loss: weighted terms by name; training uses all views, the test the reference alone.
+        code_steps, code_rate: steps and learning rate of a new code's optimisation (800 and 0.005 in DeepSDF).
     """
 
     model: AutoDecoder
@@ -35,42 +35,42 @@ class ReconstructorOnly(ReconstructionModule):
         self.code_rate = code_rate
 
     def setup(self, stage: str) -> None:
-        """A code for every picture of the training set, unless a checkpoint brought them."""
+        """Make room for a code for each training image, unless a checkpoint brought codes."""
         if stage == "fit" and not len(self.model.codes):
             source = self.trainer.datamodule.source("train")  # type: ignore[attr-defined]
             self.model.make_room(sum(_frames(source, name) for name in source.names))
 
     def on_fit_start(self) -> None:
-        """Refuse several processes, each of which would give the rows of the codes to other pictures."""
+        """Raise CompleteSplatError for several processes, because each would assign the codes to other images."""
         super().on_fit_start()
         if self.trainer.world_size > 1:
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
 
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
-        """Splatter Images of training pictures from their own codes; in evaluation, of any picture from new ones."""
+        """Reconstruct training images from their codes; in evaluation, reconstruct any image from a new code."""
         if not self.training:
             return Reconstruction(self.model(self.infer_codes(scenes, seed=0)), None)
         return Reconstruction(self.model(self.model.codes_of(scenes.names, scenes.reference_frame)), None)
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Gaussians from new codes that make the reference view look right; the seed decides where they start."""
+        """Return Gaussians of new codes that are optimised for the reference view from seeded initial values."""
         return self.gaussians(self.infer_codes(scenes, seed), scenes)
 
     def infer_codes(self, scenes: SceneBatch, seed: int) -> Codes:
-        """Codes optimised for the reference views alone, at fixed weights."""
+        """Optimise new codes for the reference views alone, at fixed weights."""
         with torch.inference_mode(False), torch.autocast(self.device.type, enabled=False):
-            # Tensors made in inference mode stay unusable for autograd; their copies do not.
+            # Autograd cannot use tensors that were made in inference mode, but it can use copies.
             scenes = scenes.map(torch.clone)
             codes = self.model.new_codes(len(scenes.names), seed)
             return optimize_codes(codes, lambda x: self.reference_loss(x, scenes), self.code_steps, self.code_rate)
 
     def gaussians(self, codes: Codes, scenes: SceneBatch) -> Gaussians:
-        """Gaussians from codes."""
+        """Decode codes to Gaussians."""
         image: SplatterImage = self.model(codes)
         return image.gaussians(scenes.reference.cameras, scenes.depth_range)
 
     def reference_loss(self, codes: Codes, scenes: SceneBatch) -> Float[Tensor, ""]:
-        """The loss of the reference views alone, at the step that training has come to."""
+        """Return the loss of the reference views alone, with the terms of the current training step."""
         views: Views = scenes.reference.map(lambda tensor: tensor[:, None])
         gaussians = self.gaussians(codes, scenes)
         images = self.rasterizer(gaussians, views.cameras).over(self.background)
@@ -79,7 +79,7 @@ class ReconstructorOnly(ReconstructionModule):
 
 
 def _frames(source: SequenceSource, name: str) -> int:
-    """How many there are of a sequence: none of one that cannot be read."""
+    """Return the number of a sequence's frames; 0 if it cannot be read."""
     try:
         return len(source.read(name).frames)
     except DataError:

@@ -1,4 +1,4 @@
-"""Samples of latent diffusion for a few fixed scenes while it trains, and how one of them forms."""
+"""Samples of latent diffusion for a few fixed scenes while it trains, and the denoising of one sample."""
 
 from dataclasses import dataclass
 
@@ -22,16 +22,16 @@ from completesplat.training.scene_module import SceneModule
 
 
 class Samples(DrawsFixedScenes):
-    """Several samples of each scene, seen from its reference and its targets; see `DrawsFixedScenes`.
+    """Callback that draws samples of each scene from its reference and its targets; see `DrawsFixedScenes`.
 
-    `folder/step_000500.png` has for each scene a row of true pictures (the input first), one for each sample, and the
-    depth of the first sample. `folder/strip_000500.png` shows the first sample while it is denoised: the scenes that
-    estimates of the clean latent stand for, from the reference and from the middle target. All loggers get, of the
-    targets' views, `samples/diversity` (not of one sample), `samples/psnr` (mean over the samples) and
-    `samples/psnr_of_mean` (of their mean picture); Weights & Biases also both pictures.
+    `folder/step_000500.png` has rows for each scene: true images (the input first), each sample, and the depth of the
+    first sample. `folder/strip_000500.png` shows how the first sample is denoised: the scenes of the clean latent's
+    estimates, from the reference and from the middle target. All loggers get metrics of the targets' views:
+    `samples/diversity` (of two samples or more), `samples/psnr` (mean over the samples) and `samples/psnr_of_mean` (of
+    their mean image). Weights & Biases gets both image files too.
 
     Args:
-        samples: of a scene, always from the same noise.
+        samples: samples of a scene, always from the same noise.
         strip: the largest number of denoiser calls shown, evenly spaced from the first to the last.
     """
 
@@ -54,38 +54,38 @@ class Samples(DrawsFixedScenes):
         pictures = {"step": samples_sheet(drawn), "strip": strip_sheet(drawn)}
         for kind, picture in pictures.items():
             write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
-        each = [one.scores() for one in drawn]
-        scalars = {f"samples/{name}": sum(scores[name] for scores in each) / len(each) for name in each[0]}
+        scores = [scene.scores() for scene in drawn]
+        scalars = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
         log_drawings(trainer, scalars, {"samples": pictures["step"], "denoising": pictures["strip"]})
 
     def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
         views = scene.all_views()
-        shown: dict[int, tuple[int, Gaussians]] = {}
+        steps: dict[int, tuple[int, Gaussians]] = {}
         calls = evenly_spaced(len(module.completesplat.sampler.set_up().timesteps), self.strip)
 
         def keep(call: int, timestep: int, estimates: Gaussians) -> None:
             if call in calls:
                 # Samples that do not fit into memory together come in parts, the first sample in the first part.
-                shown.setdefault(call, (timestep, estimates[:1]))
+                steps.setdefault(call, (timestep, estimates[:1]))
 
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=keep)
         pair = [0, 1 + (len(views.images[0]) - 1) // 2]  # the reference, and the middle one of the targets
         cameras = views.cameras[0]
         seen = module.render_from(gaussians, cameras)
-        denoising = [module.render_from(part, cameras[pair]).over(module.background)[0] for _, part in shown.values()]
+        denoising = [module.render_from(part, cameras[pair]).over(module.background)[0] for _, part in steps.values()]
         return SceneDrawings(
             views.images[0],
             seen.over(module.background).clamp(0, 1),
             seen.expected_depth()[:1],
-            [timestep for timestep, _ in shown.values()],
+            [timestep for timestep, _ in steps.values()],
             torch.stack([views.images[0, pair], *denoising]).clamp(0, 1),
         )
 
 
 @dataclass(frozen=True)
 class SceneDrawings:
-    """True pictures and renders of one scene, the reference view first; of the strip, what is true comes first."""
+    """True images and renders of one scene, the reference view first; the strip starts with true images."""
 
     true: Float[Tensor, "view 3 height width"]
     samples: Float[Tensor, "sample view 3 height width"]
@@ -94,22 +94,22 @@ class SceneDrawings:
     strip: Float[Tensor, "call 2 3 height width"]
 
     def scores(self) -> dict[str, float]:
-        """Of the targets' views."""
+        """Score the targets' views."""
         images, true = self.samples[:, 1:], self.true[1:]
-        found = {
+        scores = {
             "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),
             "psnr_of_mean": psnr(images.mean(0), true).mean().item(),
         }
-        return found | {"diversity": diversity(images)} if len(images) > 1 else found
+        return scores | {"diversity": diversity(images)} if len(images) > 1 else scores
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most `most` of the numbers below `count`, the last one always."""
+    """Return at most `most` evenly spaced numbers below `count`, always with the last one."""
     return sorted({round(place) for place in np.linspace(count - 1, 0, most)})
 
 
 def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
-    """A column for each view; views that a scene has less than others stay white."""
+    """Draw a sheet with a column for each view; views that a scene lacks stay white."""
     rows: list[list[SheetCell | None]] = []
     for scene in drawn:
         samples = [labelled(f"sample {i + 1}", images) for i, images in enumerate(scene.samples)]
@@ -119,7 +119,7 @@ def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
 
 
 def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
-    """A column for each denoiser call that was kept."""
+    """Draw a sheet with a column for each denoiser call in the strips."""
     views = ("input's view", "middle target")
     rows = [
         labelled(name, images) for scene in drawn for name, images in zip(views, scene.strip.unbind(1), strict=True)
@@ -128,6 +128,6 @@ def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
 
 
 def labelled(name: str, images: Float[Tensor, "picture 3 height width"]) -> list[SheetCell | None]:
-    """A row of a sheet, its name above the first picture. What is not finite is black."""
+    """Return a row of a sheet, with its name above the first image. Values that are not finite are black."""
     first, *others = images.nan_to_num()
     return [SheetCell(first, name), *map(SheetCell, others)]

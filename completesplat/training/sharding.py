@@ -1,4 +1,4 @@
-"""FSDP2: the trained networks, their gradients, averages and the optimizer's state divided over processes."""
+"""FSDP2: trained networks, their gradients, averages and the optimizer's state, divided over processes."""
 
 import secrets
 import shutil
@@ -28,19 +28,19 @@ from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUF
 
 
 class FullyShardedStrategy(DDPStrategy):
-    """Every process trains on its share of a batch, as with DDP, and keeps its share of the trained networks.
+    """DDP strategy that also divides the trained networks: each process keeps a share and trains on a share of a batch.
 
-    They are whole while they compute. Each of `SceneModule.networks` is one unit of torch's `fully_shard`, and so is
-    its average. Outside of training all is as with DDP: processes that test have different numbers of scenes, and
-    cannot wait for each other in every layer.
+    Networks are whole while they compute. Each of `SceneModule.networks` is one unit of torch's `fully_shard`, and so
+    is its average. Outside of training everything is as with DDP, because processes that test have different numbers
+    of scenes, and cannot wait for each other in every layer.
 
-    A checkpoint has two parts: `last.ckpt` holds what all processes know, and the names and checksums of the files
+    A checkpoint has two parts: `last.ckpt` holds what all processes have, and the names and checksums of the files
     beside it, one for each process, in which `torch.distributed.checkpoint` writes the divided tensors as safetensors.
-    `read_checkpoint` puts them together, so that any number of processes reads what any other number wrote.
+    `read_checkpoint` joins them, so that any number of processes can read what any other number wrote.
     """
 
     def configure_ddp(self) -> None:
-        """Divide the networks, in the place of wrapping the module."""
+        """Divide the networks instead of wrapping the module."""
         module: Any = self.lightning_module
         _refuse_undivided(module)
         mesh = init_device_mesh(self.root_device.type, (self.world_size,))
@@ -49,11 +49,11 @@ class FullyShardedStrategy(DDPStrategy):
             for place in module.networks:
                 network = each.get_submodule(place)
                 self.whole.append((each, place, _without_weights(network)))
-                # Outside of their passes networks are always divided, also behind those of validation.
+                # Networks are always divided outside of their passes, also after those of validation.
                 fully_shard(network, mesh=mesh, reshard_after_forward=True)
 
     def load_optimizer_state_dict(self, checkpoint: Mapping[str, Any]) -> None:
-        """Take this process's share of a state that is whole."""
+        """Load this process's share of a whole state."""
         for optimizer, state in zip(self.optimizers, checkpoint["optimizer_states"], strict=True):
             trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
             for index, entries in state["state"].items():
@@ -61,7 +61,7 @@ class FullyShardedStrategy(DDPStrategy):
         super().load_optimizer_state_dict(checkpoint)
 
     def save_checkpoint(self, checkpoint: dict[str, Any], filepath: str | Path, storage_options: Any = None) -> None:
-        """Each process writes its share, then the first one the rest. `DiskError` where the disk refuses."""
+        """Write each process's share, then the rest in the first one; raise DiskError if the disk refuses."""
         path, divided = Path(filepath), dict[str, Tensor]()
         contents = _taken_apart(checkpoint, "", divided)
         folder = path.parent / self.broadcast(f"{secrets.token_hex(6)}{SHARDS_SUFFIX}")
@@ -83,23 +83,23 @@ class FullyShardedStrategy(DDPStrategy):
             raise
 
     def _save_shards(self, divided: dict[str, Tensor], folder: Path) -> None:
-        """Write this process's share of the tensors. Where one cannot, all end; the first raises what that did."""
+        """Write this process's share of the tensors. If one process fails, all end; the first raises the error."""
         try:
             save(divided, storage_writer=HuggingFaceStorageWriter(str(folder), save_distributed=True))
-        except CheckpointException as error:  # no `Exception`
+        except CheckpointException as error:  # is not a subclass of `Exception`
             shutil.rmtree(folder, ignore_errors=True)
             self.barrier()
             if not self.is_global_zero:
-                raise SystemExit(DiskError.exit_status) from error  # the line is to be there once
+                raise SystemExit(DiskError.exit_status) from error  # the message should appear once
             raise next(iter(error.failures.values()))[0] from error
 
     def on_exception(self, exception: BaseException) -> None:
-        """Other processes may be gone, and the networks cannot be put together."""
+        """Leave the networks divided, because other processes may be gone."""
         self.whole = []
         super().on_exception(exception)
 
     def teardown(self) -> None:
-        """Every process gets the whole networks, which are saved and tested next."""
+        """Give every process the whole networks, which are saved and tested next."""
         for module, place, network in getattr(self, "whole", []):
             divided = module.get_submodule(place)
             weights = {name: whole(value) for name, value in divided.state_dict().items()}
@@ -110,18 +110,18 @@ class FullyShardedStrategy(DDPStrategy):
 
 
 def whole(value: Tensor) -> Tensor:
-    """A tensor that may be divided over processes, all of which must call this then, as each has it alone."""
+    """Return the whole of a tensor; if it is divided over processes, all of them must call this."""
     return value.full_tensor() if isinstance(value, DTensor) else value
 
 
 def own_part(value: Any) -> Any:
-    """This process's part of a tensor that may be divided over processes: the same memory."""
+    """Return this process's part of a tensor that may be divided over processes, without a copy."""
     return value.to_local() if isinstance(value, DTensor) else value
 
 
 @contextmanager
 def whole_networks(module: nn.Module) -> Iterator[None]:
-    """Divided networks are whole inside, where one process alone may compute with them. All have to enter and leave."""
+    """Make divided networks whole inside, so that a process can compute alone. All have to enter and leave."""
     networks = [part for part in module.modules() if isinstance(part, FSDPModule)]
     for network in networks:
         network.set_reshard_after_forward(False)
@@ -135,7 +135,7 @@ def whole_networks(module: nn.Module) -> Iterator[None]:
 
 
 def remove_unused_shards(folder: Path) -> None:
-    """Remove the shards of checkpoints that are no longer there; those of damaged ones stay with all others."""
+    """Remove all shards that no readable checkpoint of the folder names."""
     used = {shards_of(path).get("folder") for path in folder.glob("*.ckpt")}
     for shards in folder.glob(f"*{SHARDS_SUFFIX}"):
         if shards.name not in used:
@@ -149,7 +149,7 @@ def _averages(module: LightningModule) -> list[nn.Module]:
 
 
 def _refuse_undivided(module: SceneModule) -> None:
-    """`CompleteSplatError` if something is trained that is in none of the networks, or whose memory has gaps."""
+    """Raise CompleteSplatError if a trained parameter is in none of the networks, or is not contiguous."""
     inside = {parameter for place in module.networks for parameter in module.get_submodule(place).parameters()}
     for name, parameter in module.named_parameters():
         if parameter.requires_grad and parameter not in inside:
@@ -159,7 +159,7 @@ def _refuse_undivided(module: SceneModule) -> None:
 
 
 def _without_weights(network: nn.Module) -> nn.Module:
-    """A copy whose parameters take no memory."""
+    """Copy a network with parameters that take no memory."""
     empty = {
         id(parameter): nn.Parameter(torch.empty_like(parameter, device="meta"), parameter.requires_grad)
         for parameter in network.parameters()
@@ -168,7 +168,7 @@ def _without_weights(network: nn.Module) -> nn.Module:
 
 
 def _divided_as(parameter: Tensor, value: Any) -> Any:
-    """A value of the optimizer's state of a parameter, divided as that is if it has its shape."""
+    """Divide a value of a parameter's optimizer state like the parameter, if it has its shape."""
     if not isinstance(parameter, DTensor) or not isinstance(value, Tensor) or value.shape != parameter.shape:
         return value
     mesh, placements = parameter.device_mesh, parameter.placements
@@ -176,7 +176,7 @@ def _divided_as(parameter: Tensor, value: Any) -> Any:
 
 
 def _taken_apart(contents: Any, name: str, divided: dict[str, Tensor]) -> Any:
-    """Nested containers with names in the place of the divided tensors, which `divided` gets by these names."""
+    """Replace divided tensors in nested containers by names, and store them in `divided` by these names."""
     if isinstance(contents, DTensor):
         divided[name] = contents
         return DIVIDED + name

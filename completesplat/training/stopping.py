@@ -1,4 +1,4 @@
-"""How training ends after a signal: all processes together, and queued again where SLURM asks for it."""
+"""End of training after a signal: all processes stop together, and SLURM requeues the job if it is set up to."""
 
 import logging
 import os
@@ -23,19 +23,17 @@ from completesplat import signals
 from completesplat.signals import Interrupted
 
 LOOK_SECONDS, GRACE_SECONDS = 0.5, 5.0
-"""How often a process looks after those that it started, and how long one has to end by itself."""
+"""Interval of a process's checks of those that it started, and their time to end by themselves."""
 
 logger = logging.getLogger(__name__)
 
 
 @contextmanager
 def stopped_together() -> Iterator[None]:
-    """Trainers inside leave signals to `completesplat.signals`, and the processes that they start end with this one.
+    """Leave signals to `completesplat.signals`, and let processes that trainers or `Fabric` start end with this one.
 
-    So do those of Lightning's `Fabric`.
-
-    Lightning's own handlers wait for other processes in the middle of a step, for ever if these are not there; they end
-    `fit` and `test` with exit status 0, and its observer kills the first process when another one has got a signal.
+    Lightning's own handlers wait for other processes in the middle of a step, for ever if these are gone. They end
+    `fit` and `test` with exit status 0, and its observer kills the first process if another one has got a signal.
     """
     started: list[subprocess.Popen[bytes]] = []
     observers: list[_Observer] = []
@@ -59,12 +57,12 @@ def stopped_together() -> Iterator[None]:
             raise
         for process in started:
             _end(process, number)
-        raise Interrupted(number) from error  # other processes may have gone before, for which this one waited
+        raise Interrupted(number) from error  # this process may have waited for others that ended earlier
     finally:
         connector.register_signal_handlers = before[0]
         for launcher in launchers:
             launcher._launch_process_observer = before[1]  # type: ignore[attr-defined]
-        # Their sockets are open until here: what is opened with the number of a closed one would be written to.
+        # Their sockets stay open until here, because Python would write into a file that reuses a closed one's number.
         if observers:
             signal.set_wakeup_fd(-1)
 
@@ -80,10 +78,10 @@ def _end(process: "subprocess.Popen[bytes]", number: int) -> None:
 
 
 class _Observer(_ChildProcessObserver):
-    """A process that was ended by a signal ends this one as if it had got it; after other failures, as Lightning's.
+    """Observer that sends this process a signal that ended another; after other failures it acts as Lightning's.
 
-    While this process waits for another one, Python's handlers do not run. Outside of training the signal ends it then
-    after `GRACE_SECONDS` all the same.
+    While this process waits for another one, Python's handlers do not run. Outside of training the signal then still
+    ends it after `GRACE_SECONDS`.
     """
 
     def __init__(self, main_pid: int, processes: list[subprocess.Popen[bytes]]) -> None:
@@ -96,13 +94,13 @@ class _Observer(_ChildProcessObserver):
     def _run(self) -> bool:
         codes = [process.poll() for process in self._child_processes]
         theirs = {code - 128 if code > 0 else -code for code in codes if code} & set(signals.ENDING)
-        own = set() if signals.are_kept() else self._own() & set(signals.ENDING)
+        local = set() if signals.are_kept() else self._own() & set(signals.ENDING)
         if signals.received() is not None:
             return True
-        if not theirs | own:
+        if not theirs | local:
             return super()._run()
-        number = min(theirs | own)
-        if not own:
+        number = min(theirs | local)
+        if not local:
             os.kill(self._main_pid, number)
         time.sleep(GRACE_SECONDS)
         if signals.received() is None:
@@ -120,13 +118,13 @@ class _Observer(_ChildProcessObserver):
 
 
 def agreed(trainer: Trainer) -> int | None:
-    """The signal that a process of the run has got, if any has. All processes have to ask."""
-    own = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)
-    return int(trainer.strategy.reduce(own, reduce_op="max")) or None
+    """Return the signal that a process of the run has got, if any has. All processes have to call this."""
+    local = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)
+    return int(trainer.strategy.reduce(local, reduce_op="max")) or None
 
 
 def end_training(trainer: Trainer, number: int) -> None:
-    """`Interrupted` in all processes, after the job was queued again where this signal asks for that."""
+    """Raise Interrupted in all processes, after requeueing the job if this signal asks for it."""
     if trainer.is_global_zero:
         _requeue(trainer, number)
     trainer.strategy.barrier("end_training")
@@ -139,7 +137,7 @@ def _requeue(trainer: Any, number: int) -> None:
         return
     if number != environment.requeue_signal:
         return
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # with which SLURM ends what it queues again
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # SLURM sends it to a job that it requeues
     job = os.environ["SLURM_JOB_ID"]
     if "SLURM_ARRAY_JOB_ID" in os.environ:
         job = f"{os.environ['SLURM_ARRAY_JOB_ID']}_{os.environ['SLURM_ARRAY_TASK_ID']}"

@@ -17,12 +17,12 @@ STATUS = Path("/proc/self/status")
 
 
 class Throughput(Callback):
-    """Logs speed and memory with the trainer's interval.
+    """Callback that logs speed and memory at the trainer's interval.
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
-    for data, are of the steps since the last row; for memory see `memory`. All are means over the processes. The clock
-    stands still during validation, while checkpoints are written, and from a row to the next batch: while pictures are
-    drawn, if their interval is a multiple of the trainer's, and this callback stands before those.
+    for data, cover the steps since the last row; for memory see `memory`. All are means over the processes. The clock
+    stops during validation, while checkpoints are written, and from a row to the next batch. The latter excludes the
+    drawing of images if its interval is a multiple of the trainer's, and this callback comes first.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -67,7 +67,7 @@ class Throughput(Callback):
 
 
 class DataClock(Profiler):
-    """A profiler that times fetching batches and saving checkpoints, and passes every call on to another profiler."""
+    """Profiler that times fetching batches and saving checkpoints, and passes every call on to another profiler."""
 
     def __init__(self, profiler: Profiler) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class DataClock(Profiler):
             setattr(self, name, getattr(profiler, name))
 
     def start(self, action_name: str) -> None:
-        """Called by Lightning before an action."""
+        """Start timing before an action of Lightning."""
         if action_name in (FETCHING, SAVING):
             self.since = time.perf_counter()
         if action_name == FETCHING and self.begin is None:
@@ -86,7 +86,7 @@ class DataClock(Profiler):
         self.profiler.start(action_name)
 
     def stop(self, action_name: str) -> None:
-        """Called by Lightning behind it."""
+        """Stop timing after an action of Lightning."""
         self.profiler.stop(action_name)
         if action_name == FETCHING:
             self.waited += time.perf_counter() - self.since
@@ -95,7 +95,7 @@ class DataClock(Profiler):
 
 
 def memory(device: torch.device) -> dict[str, float]:
-    """In GiB: `memory/process_gb`, what this process has now (on Linux), `memory/gpu_gb`, the most torch has had."""
+    """Return in GiB: `memory/process_gb`, this process's memory (on Linux), and `memory/gpu_gb`, torch's maximum."""
     values = {}
     if STATUS.exists():
         lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())

@@ -1,7 +1,7 @@
-"""Folders of trained weights: those that come with the package, a user's own, or a repository of the Hugging Face hub.
+"""Folders of trained weights: in this package, of a user, or in a repository of the Hugging Face hub.
 
-A folder holds `config.json`, `model.safetensors` and `SHA256SUMS` (as `sha256sum -c` reads it); the ones in this folder
-have a model card too, `README.md`.
+A folder holds `config.json`, `model.safetensors` and `SHA256SUMS` (for `sha256sum -c`). Weights in this package have a
+model card too, `README.md`.
 """
 
 import hashlib
@@ -16,21 +16,21 @@ from completesplat.names import printable
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"
-# Of a training run: its weights, which are written in the end, its settings, its newest checkpoint, fitted scenes.
+# In a training run's folder: its final weights, its config, its newest checkpoint, fitted scenes.
 RUN_WEIGHTS, RUN_CONFIG_FILE, RUN_CHECKPOINT, SCENES = "weights", "config.yaml", "checkpoints/last.ckpt", "scenes"
-NEWEST = "pictures/newest"  # of a training run, too: its fixed scenes as they are now, with `scenes.json`
-CAMERA = "camera"  # in stage 1's checkpoints, what was measured of the training set
+NEWEST = "pictures/newest"  # in a training run's folder, too: its fixed scenes as they are now, with `scenes.json`
+CAMERA = "camera"  # in stage 1's checkpoints: the typical camera of the training set
 LARGEST_TEXT = 1_000_000
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
 def checkpoint_of(weights: Path | str) -> Path | None:
-    """The checkpoint that is meant: a file, or the newest of the folder of a run which has no weights yet; else None.
+    """Return the checkpoint that `weights` means: a file, or the newest of a run without final weights; else None.
 
-    Of a run without checkpoints, because it has nothing to train, the place where it would be.
+    For a run without checkpoints (it has nothing to train), return the path where one would be.
     """
     path = Path(str(weights)).expanduser()
-    if str(weights) in in_the_box() or not os.path.exists(path):  # `Path.exists` raises where a name is too long
+    if str(weights) in in_the_box() or not os.path.exists(path):  # `Path.exists` raises if a name is too long
         return None
     if path.is_file():
         return path
@@ -40,15 +40,17 @@ def checkpoint_of(weights: Path | str) -> Path | None:
 
 
 def in_the_box() -> list[str]:
-    """Names of the weights that come with the package."""
+    """Return the names of the weights that come with the package."""
     return sorted(path.parent.name for path in BOX.glob(f"*/{WEIGHTS_FILE}"))
 
 
 def weights_folder(weights: Path | str) -> Path:
-    """The folder that is meant: a name of `in_the_box`, else a folder or a run's, else an id of the Hugging Face hub.
+    """Return the folder that `weights` means: a name of `in_the_box`, a folder, a run's folder, or an id on the hub.
 
-    Of the hub, files are downloaded once (a token, a mirror, work without a network: by its environment variables).
-    `WeightsError`: there are none, files are missing, or one has another checksum.
+    Files on the Hugging Face hub are downloaded once; its environment variables set a token, a mirror, or offline use.
+
+    Raises:
+        WeightsError: there is no such folder, files are missing, or one has another checksum.
     """
     folder = _locate(str(weights))
     for name in (CONFIG_FILE, WEIGHTS_FILE):
@@ -68,14 +70,14 @@ def weights_folder(weights: Path | str) -> Path:
 
 
 def read_small(path: Path) -> str:
-    """The text of a file that says something about weights; `WeightsError` for one of more than 1 MB."""
+    """Return the text of a file about weights; raise WeightsError if it has more than 1 MB."""
     if path.stat().st_size > LARGEST_TEXT:
         raise WeightsError(f"{path}: of {path.stat().st_size} bytes, and {LARGEST_TEXT} are plenty")
     return path.read_text(errors="replace")
 
 
 def write_sums(folder: Path) -> None:
-    """Write the checksums of the two files that a model is read from."""
+    """Write the checksums of the two files of a model."""
     lines = [f"{sha256_of(folder / name)}  {name}\n" for name in (CONFIG_FILE, WEIGHTS_FILE)]
     write_text(folder / SUMS_FILE, "".join(lines))
 
@@ -98,41 +100,42 @@ def _download(hub_id: str) -> Path:
 
     try:
         return Path(snapshot_download(hub_id, allow_patterns=[CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE]))
-    except Exception as error:  # of the hub, of its HTTP library and of the file system
+    except Exception as error:  # from the hub, its HTTP library or the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(f"{hub_id}: no folder here, and not to be had from the hub ({reason})") from error
 
 
 def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: str) -> Path:
-    """The file, or that of a URL (http or https), downloaded into torch's hub cache once.
+    """Return the path of a file, or of the file at a URL (http or https), downloaded into torch's hub cache once.
 
     Args:
         sha256: the file's SHA-256, or its first digits; None takes any file.
-        advice: how to get the right file and where to give it, the end of every refusal.
-        hash_setting: the setting that `sha256` came from.
+        advice: the end of every error message: how to get the right file, and which option takes it.
+        hash_setting: the option that `sha256` came from.
 
-    `WeightsError`: the file is missing, cannot be downloaded, or is another one.
+    Raises:
+        WeightsError: the file is missing, cannot be downloaded, or has another SHA-256.
     """
     expected = None if sha256 is None else sha256.lower()
     url = weights.startswith(("http://", "https://"))
     path = _download_file(weights, expected, advice) if url else Path(weights).expanduser()
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
-    if expected is not None and not (found := sha256_of(path)).startswith(expected):
+    if expected is not None and not (actual := sha256_of(path)).startswith(expected):
         raise WeightsError(
-            f"{path}: SHA-256 {found}, not {sha256}; {advice} (if that file is meant, {hash_setting}={found})"
+            f"{path}: SHA-256 {actual}, not {sha256}; {advice} (if that file is meant, {hash_setting}={actual})"
         )
     return path
 
 
 def sha256_of(path: Path) -> str:
-    """The SHA-256 of a file, in hexadecimal digits."""
+    """Return the SHA-256 of a file in hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _download_file(url: str, sha256: str | None, advice: str) -> Path:
-    """The file of a URL in torch's hub cache, where torchvision keeps its own too."""
+    """Download a URL's file into torch's hub cache, which torchvision uses too, unless it is there."""
     import torch
 
     path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name

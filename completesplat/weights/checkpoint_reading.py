@@ -1,7 +1,8 @@
-"""Files of `torch.save`: plain tensors, in no more memory than the file has bytes; checkpoints, without Lightning.
+"""Reading of checkpoints and other `torch.save` files: plain tensors, in no more memory than the file has bytes.
 
-`torch.load(weights_only=True)` runs no code of a file, but what it may call can make much of a few bytes. The pickle is
-therefore read as a list of steps before it is loaded, and only the calls that `torch.save` writes are allowed.
+`torch.load(weights_only=True)` runs no code of a file, but the calls that it allows can turn a few bytes into much
+memory. The pickle is therefore read as a list of steps before it is loaded, and may only contain calls that torch.save
+writes. None of this needs Lightning.
 """
 
 import hashlib
@@ -22,21 +23,21 @@ from completesplat.schema import shown
 from completesplat.weights import sha256_of
 
 END, END_BYTES = b"PK\5\6", 22
-"""How the last record of a zip archive begins, and its length without the comment behind it."""
+"""First bytes of a zip archive's last record, and the record's length without the comment at its end."""
 CHECKSUM, DIGEST_BYTES = b"sha256:", 64
 SHARDS, SHARDS_SUFFIX = "shards", ".shards"
-"""The entry of a checkpoint that several processes wrote: the folder beside it with the files of their divided tensors,
-and the SHA-256 of each."""
+"""Entry of a checkpoint that several processes wrote: the folder beside it with the files of their divided tensors, and
+the SHA-256 of each file."""
 DIVIDED = "divided:"
-"""How the name begins that stands in the place of such a tensor."""
+"""Prefix of the name that replaces a divided tensor."""
 ZIP = b"PK\3\4"
 MOST_REPEATED = 2**22
-"""Numbers of a tensor that has more of them than its file, because it repeats them."""
+"""Largest number of elements of a tensor that has more of them than its file, because it repeats them."""
 PLAIN = re.compile(
     r"torch (\w+Storage|Size|device|[a-z]\w*)|torch\._utils _rebuild_(tensor(_v[23])?|parameter)"
     r"|collections (OrderedDict|Counter)|_codecs encode"
 )
-"""What tensors, containers and bytes are made with. torch allows more, such as byte arrays of any length."""
+"""Names that build tensors, containers and bytes. torch allows more, such as byte arrays of any length."""
 NUMBERS = {"BININT", "BININT1", "BININT2", "LONG1"}
 TEXTS = {"BINUNICODE", "SHORT_BINSTRING"}
 TUPLES = {"EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"}
@@ -46,7 +47,7 @@ LONGEST_NAME = 16
 
 
 class Step(NamedTuple):
-    """An operation of a pickle, its argument, and the steps whose results it takes (kept for calls and tuples)."""
+    """Operation of a pickle, its argument, and the steps whose results it takes (kept for calls and tuples)."""
 
     name: str
     argument: Any = None
@@ -61,12 +62,12 @@ def read_tensor_file(path: Path, mmap: bool = False) -> Any:
 
     Raises:
         TensorFileError: the file is no zip archive from its first byte on, is damaged, has records or tensors that are
-            larger than itself, or holds other things than tensors and plain values.
+            larger than itself, or holds anything but tensors and plain values.
     """
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
-            # From other first bytes torch reads an older form, whatever archive is at the end.
+            # If a file starts with other bytes, torch reads an older format, even if an archive follows.
             if file.read(len(ZIP)) != ZIP:
                 raise TensorFileError("not an archive of torch.save")
             file.seek(0)
@@ -82,12 +83,12 @@ def read_tensor_file(path: Path, mmap: bool = False) -> Any:
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except TensorFileError:
         raise
-    except Exception as error:  # torch, zipfile and pickletools have many for a damaged file
+    except Exception as error:  # torch, zipfile and pickletools raise many kinds for a damaged file
         raise TensorFileError(type(error).__name__) from error
 
 
 def _check_steps(pickle: bytes) -> None:
-    """Refuse a pickle with a step that may make more than the file holds."""
+    """Raise TensorFileError for a pickle with a step that may make more than the file holds."""
     stack: list[Step] = []
     marks: list[int] = []
     memo: dict[Any, Step] = {}
@@ -108,19 +109,19 @@ def _check_steps(pickle: bytes) -> None:
             if not _is_plain(step):
                 made = next((value.argument for value in step.inputs if value.name == "GLOBAL"), argument or name)
                 raise TensorFileError(f"made of {shown(made)}, not of tensors alone")
-            # Of a storage its length stays, of other calls their name alone.
+            # Keep the length of a storage, and only the name of any other call.
             length = step.inputs[0].inputs[-1].argument if name == "BINPERSID" else None
             stack[first:] = [Step(name, length) if name in CALLS else step] * len(opcode.stack_after)
 
 
 def _is_plain(step: Step) -> bool:
-    """Whether `torch.save` writes such a step: its arguments stand beside it, so that nothing large is copied often."""
+    """Return whether `torch.save` writes this step; with arguments beside it, no large value is repeated."""
     match step:
         case Step("GLOBAL"):
             return PLAIN.fullmatch(step.argument) is not None
         case Step("BUILD", _, (_, state)):
             return state.name in MAPPINGS
-        # The archive's reader takes no notice of capitals: other keys could name one record many times.
+        # The archive's reader ignores case, so keys with letters could name one record many times.
         case Step("BINPERSID", _, (Step("TUPLE", _, (_, Step("GLOBAL"), key, _, length)),)):
             return key.name in TEXTS and re.fullmatch("[0-9]+", key.argument) is not None and length.name in NUMBERS
         case Step("REDUCE", _, (Step("GLOBAL", function), arguments)) if arguments.name in TUPLES:
@@ -129,7 +130,7 @@ def _is_plain(step: Step) -> bool:
 
 
 def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
-    """Whether a call makes no more than what its arguments are in the file."""
+    """Return whether a call makes no more than its arguments hold in the file."""
     match function.split()[1], arguments:
         case "OrderedDict", ():
             return True
@@ -140,7 +141,7 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
         case "device", (place, *index):
             return place.name in TEXTS and all(number.name in NUMBERS for number in index)
         case "encode", (text, codec):
-            # Of other codecs some make twice as many bytes, as often as they are asked.
+            # Some other codecs double the bytes each time they are called.
             return text.name in TEXTS and codec == Step(codec.name, "latin1")
         case "_rebuild_parameter", _:
             return True
@@ -154,9 +155,9 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
 
 
 def check_whole(path: Path) -> None:
-    """`WeightsError` unless a checkpoint is as it was written; of one without a checksum, as torch writes, its end.
+    """Raise WeightsError unless a checkpoint, with its shards if several processes wrote it, is as it was written.
 
-    The shards of one that several processes wrote belong to it.
+    Without a checksum, as in files that torch wrote, only the end is checked.
     """
     bytes_of_end = END_BYTES + len(CHECKSUM) + DIGEST_BYTES
     with path.open("rb") as file:
@@ -182,7 +183,7 @@ def check_whole(path: Path) -> None:
 
 
 def shards_of(path: Path) -> dict[str, Any]:
-    """The folder and the files of a checkpoint's divided tensors; an empty mapping if it has none, or is unreadable."""
+    """Return the folder and files of a checkpoint's divided tensors; {} if it has none or is unreadable."""
     if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
         return {}
     try:
@@ -193,23 +194,20 @@ def shards_of(path: Path) -> dict[str, Any]:
 
 
 def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint's contents with its divided tensors in their places, as one process would have written it.
-
-    They are safetensors: reading them runs nothing.
-    """
+    """Put the divided tensors of a checkpoint back into its contents, as if one process had written it."""
     if (shards := contents.pop(SHARDS, None)) is None:
         return contents
-    from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # takes its time
+    from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # slow to import
     from torch.distributed.checkpoint.state_dict_loader import load
 
     folder = path.parent / Path(shards["folder"]).name
     reader = HuggingFaceStorageReader(str(folder))
     entries: dict[str, Any] = reader.read_metadata().state_dict_metadata
-    asked = sum(entry.size.numel() * entry.properties.dtype.itemsize for entry in entries.values())
-    if asked > sum(file.stat().st_size for file in folder.iterdir()):
+    needed = sum(entry.size.numel() * entry.properties.dtype.itemsize for entry in entries.values())
+    if needed > sum(file.stat().st_size for file in folder.iterdir()):
         raise WeightsError(f"{path}: not a readable checkpoint (its tensors are larger than the files in {folder})")
     tensors = {name: torch.empty(entry.size, dtype=entry.properties.dtype) for name, entry in entries.items()}
-    load(tensors, storage_reader=reader, no_dist=True)
+    load(tensors, storage_reader=reader, no_dist=True)  # safetensors, so this runs no code of the files
 
     def filled(value: Any) -> Any:
         if isinstance(value, str) and value.startswith(DIVIDED):
@@ -223,10 +221,11 @@ def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """A checkpoint's contents.
+    """Read a checkpoint's contents.
 
-    `WeightsError`: the file is missing, damaged, no checkpoint of plain tensors, made to take more memory than it has
-    bytes, or its weights are not finite.
+    Raises:
+        WeightsError: the file is missing, damaged, no checkpoint of plain tensors, made to take more memory than it has
+            bytes, or its weights are not finite.
     """
     if not Path(path).is_file():
         raise WeightsError(f"{path}: no such checkpoint")
@@ -245,12 +244,12 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
 
 
 def not_finite(weights: Mapping[str, Any]) -> str | None:
-    """The name of the first tensor that holds NaN or infinities, if there is one."""
+    """Return the name of the first tensor that holds NaN or infinities, if there is one."""
     return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:
-    """Load the weights below `prefix` of a checkpoint into a module; `WeightsError` unless all are there and fit."""
+    """Load a checkpoint's weights below `prefix` into a module; raise WeightsError unless all are present and fit."""
     weights = read_checkpoint(path)["state_dict"]
     part = {key.removeprefix(prefix): value for key, value in weights.items() if key.startswith(prefix)}
     try:

@@ -1,7 +1,7 @@
-"""The weights of Splatter Image that its authors published (Szymanowicz et al., CVPR 2024), as they are on the hub.
+"""Files of Splatter Image's published weights (Szymanowicz et al., CVPR 2024), as they are on the hub.
 
-`config_NAME.yaml` is Hydra's record of a training, of which a few settings are read as data; `model_NAME.pth` a
-checkpoint of torch with `model_state_dict`. The weights of objects of all kinds are `model_latest.pth` there.
+`config_NAME.yaml` is Hydra's record of a training run, of which a few options are read as data. `model_NAME.pth` is a
+checkpoint of torch with `model_state_dict`. The weights for objects of all kinds are in `model_latest.pth`.
 """
 
 import os
@@ -28,7 +28,7 @@ MODEL_FILE = re.compile(r"model_(\w+)\.pth")
 
 
 class Camera(TypedDict):
-    """What is read of the section `data`."""
+    """Options that are read from the section `data`."""
 
     training_resolution: Annotated[int, Range(8, 1024)]
     znear: Annotated[float, Range(-1e6, 1e6)]
@@ -39,7 +39,7 @@ class Camera(TypedDict):
 
 
 class Network(TypedDict):
-    """What is read of the section `model`; the values that have no choice are those of all published weights."""
+    """Options that are read from the section `model`; all published weights share the literal values."""
 
     name: Literal["SingleUNet"]
     base_dim: Width
@@ -51,7 +51,7 @@ class Network(TypedDict):
 
 
 class Embedding(TypedDict):
-    """What is read of the section `cam_embd`: models of two pictures embed their cameras."""
+    """Options that are read from the section `cam_embd`: models of two images embed their cameras."""
 
     embedding: None
 
@@ -60,7 +60,7 @@ SECTIONS = {"data": Camera, "model": Network, "cam_embd": Embedding}
 
 
 class Published(NamedTuple):
-    """The two files, and the sections `data` and `model` of the first."""
+    """Checkpoint of published weights, and the sections `data` and `model` of its config."""
 
     weights: Path
     data: Camera
@@ -68,26 +68,26 @@ class Published(NamedTuple):
 
 
 def is_published(weights: Path | str) -> bool:
-    """Whether weights are meant that are read here: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
+    """Return whether `weights` are Splatter Image's: `splatter_image:NAME`, a `.pth` file, or its folder or run."""
     path = Path(str(weights)).expanduser()
     return str(weights).startswith(PREFIX) or path.suffix == ".pth" or (os.path.isdir(path) and bool(_models_in(path)))
 
 
 def find(weights: str) -> Published:
-    """The files that `weights` means: `splatter_image:NAME` of the hub (downloaded once), or a file or folder here.
+    """Find the files of `weights`: `splatter_image:NAME` on the hub (downloaded once), or a local file or folder.
 
     Raises:
-        WeightsError: they are missing, cannot be downloaded, or have settings that no published weights have.
+        WeightsError: they are missing, cannot be downloaded, or have options that no published weights have.
     """
     config, model = _download(weights.removeprefix(PREFIX)) if weights.startswith(PREFIX) else _local(weights)
     return Published(model, **_read_config(config))
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors of a checkpoint by name, mapped from the file: what is not used of it takes no memory.
+    """Read the tensors of a checkpoint by name, mapped from the file, so that unused ones take no memory.
 
     Raises:
-        WeightsError: it is damaged, holds other things than plain data, or no tensors of a model.
+        WeightsError: the file is damaged, holds anything but plain data, or has no tensors of a model.
     """
     try:
         checkpoint = read_tensor_file(path, mmap=True)
@@ -100,7 +100,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def write_trained(folder: Path, weights: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write weights that were trained on, as their authors' files: their settings go with them as they are."""
+    """Write fine-tuned weights in the format of their authors' files, with an unchanged copy of their config."""
     make_folder(folder)
     config = _config_beside(weights)
     write_text(folder / config.name, read_small(config))
@@ -109,13 +109,13 @@ def write_trained(folder: Path, weights: Path, tensors: Mapping[str, Tensor]) ->
 
 
 def _models_in(folder: Path) -> list[Path]:
-    found = [*folder.glob("model_*.pth"), *(folder / RUN_WEIGHTS).glob("model_*.pth")]
-    return sorted(path for path in found if _config_beside(path).is_file())
+    paths = [*folder.glob("model_*.pth"), *(folder / RUN_WEIGHTS).glob("model_*.pth")]
+    return sorted(path for path in paths if _config_beside(path).is_file())
 
 
 def _config_beside(model: Path) -> Path:
-    found = MODEL_FILE.fullmatch(model.name)
-    name = GENERAL if model.name == GENERAL_FILE else found[1] if found else "NAME"
+    match = MODEL_FILE.fullmatch(model.name)
+    name = GENERAL if model.name == GENERAL_FILE else match[1] if match else "NAME"
     return model.with_name(f"config_{name}.yaml")
 
 
@@ -143,7 +143,7 @@ def _download(name: str) -> tuple[Path, Path]:
     files = f"config_{name}.yaml", GENERAL_FILE if name == GENERAL else f"model_{name}.pth"
     try:
         config, model = (Path(hf_hub_download(HUB, file)) for file in files)
-    except Exception as error:  # of the hub, of its HTTP library and of the file system
+    except Exception as error:  # from the hub, its HTTP library or the file system
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(
             f"{PREFIX}{name}: not to be had from the hub ({reason}); where there is a network, `hf download {HUB} "
@@ -153,7 +153,7 @@ def _download(name: str) -> tuple[Path, Path]:
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """The settings in `SECTIONS`; one that is missing counts as null, `input_images` as 1."""
+    """Read the options in `SECTIONS`; a missing option counts as null, a missing `input_images` as 1."""
     text = read_small(path)
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
@@ -161,14 +161,14 @@ def _read_config(path: Path) -> dict[str, Any]:
         config = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as YAML ({type(error).__name__})") from error
-    found: dict[str, Any] = {}
+    sections: dict[str, Any] = {}
     for section, kind in SECTIONS.items():
-        given = config.get(section) if isinstance(config, Mapping) else None
-        given = {"input_images": 1} | dict(given) if isinstance(given, Mapping) else {}
-        found[section] = {name: given.get(name) for name in kind.__annotations__}
-        for name, value, reason in refused(kind, found[section]):
-            said = f"{path}: {section}{name} is {shown(value)}: {reason}"
-            raise WeightsError(f"{said}; only Splatter Image's weights for one picture, as published, are read")
-    if not found["data"]["znear"] < found["data"]["zfar"]:
+        options = config.get(section) if isinstance(config, Mapping) else None
+        options = {"input_images": 1} | dict(options) if isinstance(options, Mapping) else {}
+        sections[section] = {name: options.get(name) for name in kind.__annotations__}
+        for name, value, reason in refused(kind, sections[section]):
+            message = f"{path}: {section}{name} is {shown(value)}: {reason}"
+            raise WeightsError(f"{message}; only Splatter Image's weights for one picture, as published, are read")
+    if not sections["data"]["znear"] < sections["data"]["zfar"]:
         raise WeightsError(f"{path}: data.znear must be below data.zfar")
-    return {"data": found["data"], "model": found["model"]}
+    return {"data": sections["data"], "model": sections["model"]}
