@@ -167,9 +167,6 @@ def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor
     """Return the squared Frechet distance of normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6).
 
     Computed in float64. It needs far more items than features; values for sets of different sizes do not compare.
-
-    Raises:
-        ValueError: a set has fewer than two items.
     """
     from torchmetrics.image.fid import FrechetInceptionDistance
 
@@ -194,9 +191,6 @@ def kernel_distance(
 
     The kernel is (x.y / features + 1)^3. The value is a mean over random subsets of at most `subset_size` items, in
     float64, not times 1000. It depends on the order of the items if a set is larger than a subset.
-
-    Raises:
-        ValueError: a set has fewer than two items.
     """
     from torchmetrics.image.kid import poly_mmd
 

@@ -40,11 +40,7 @@ def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
 
 
 def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
-    """Return the mode of each sample, or `REJECTED` if it is not near enough to one.
-
-    Raises:
-        ValueError: fewer than two modes, equal modes, or no pixels.
-    """
+    """Return the mode of each sample, or `REJECTED` if it is not near enough to one."""
     if len(modes) < 2 or not modes.shape[1]:
         raise ValueError("needs two modes and a pixel")
     between = distances(modes, modes).fill_diagonal_(torch.inf)
@@ -65,11 +61,7 @@ def mean_of(
 
 
 def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
-    """Score one scene; samples and modes are the region's pixels of all views in one row.
-
-    Raises:
-        ValueError: no samples, or input that `classify` refuses.
-    """
+    """Score one scene; samples and modes are the region's pixels of all views in one row."""
     if not len(samples):
         raise ValueError("needs a sample")
     classes = classify(samples, modes, probabilities)
@@ -102,11 +94,7 @@ def draw_modes(
 def spread_and_error(
     samples: Float[Tensor, "sample *view 3 height width"], truth: Float[Tensor, "*view 3 height width"]
 ) -> tuple[PerPixel, PerPixel]:
-    """Return the samples' variance (unbiased) and the squared error of their mean, averaged over the channels.
-
-    Raises:
-        ValueError: fewer than two samples.
-    """
+    """Return the samples' variance (unbiased) and the squared error of their mean, averaged over the channels."""
     if len(samples) < 2:
         raise ValueError("needs two samples")
     return samples.var(dim=0).mean(-3), (samples.mean(dim=0) - truth).square().mean(-3)

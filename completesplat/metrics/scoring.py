@@ -257,11 +257,7 @@ def depth_errors(
 
 
 def best(scores: Sequence[float], higher_is_better: bool = True) -> int:
-    """Return the index of the best sample, the first of equals.
-
-    Raises:
-        ValueError: there are no scores, or one is not a number.
-    """
+    """Return the index of the best sample, the first of equals."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
 
@@ -284,11 +280,7 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
 
 
 def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
-    """Return the root mean square difference of two samples' renders, averaged over all pairs and views.
-
-    Raises:
-        ValueError: fewer than two samples.
-    """
+    """Return the root mean square difference of two samples' renders, averaged over all pairs and views."""
     if len(images) < 2:
         raise ValueError("needs two samples")
     differences = [(a - b).square().mean((1, 2, 3)).sqrt() for a, b in combinations(images, 2)]

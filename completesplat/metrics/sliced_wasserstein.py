@@ -20,11 +20,7 @@ SMALLEST_DEVIATION = 1e-4  # 1/40 of an 8-bit step: less is rounding and is not 
 
 
 def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image 3 _ _"]]:
-    """Return Burt and Adelson's pyramid: full resolution first, then halved levels, a small image last.
-
-    Raises:
-        ValueError: the images are smaller than 16 pixels.
-    """
+    """Return Burt and Adelson's pyramid: full resolution first, then halved levels, a small image last."""
     if min(images.shape[-2:]) < SMALLEST_SIDE:
         raise ValueError(f"needs images of at least {SMALLEST_SIDE} pixels")
     levels = []
@@ -55,9 +51,6 @@ def descriptors(
 
     An image's patches depend on the image and its seed only, so several processes may describe parts of a set. A
     prediction and its truth share their seeds.
-
-    Raises:
-        ValueError: the images are smaller than 16 pixels, or there is not one seed per image.
     """
     if len(seeds) != len(images):
         raise ValueError(f"{len(images)} images need as many seeds, not {len(seeds)}")
@@ -77,9 +70,6 @@ def sliced_wasserstein(first: Sequence[Float[Tensor, "_ 147"]], second: Sequence
     """Return the mean distance over the levels of two sets' descriptors, times 1000 as in the paper's tables.
 
     It ignores brightness and contrast, which normalising each set removes. The projections are always the same.
-
-    Raises:
-        ValueError: sets of different sizes.
     """
     if [len(level) for level in first] != [len(level) for level in second]:
         raise ValueError("needs two sets of one size")

@@ -71,11 +71,7 @@ class Rasterizer(Protocol):
 
 
 def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:
-    """Check that all tensors are float32 and on this device.
-
-    Raises:
-        CompleteSplatError: a tensor is not; the message names the rasterizer.
-    """
+    """Check that all tensors are float32 and on this device; the error names the rasterizer."""
     tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for key, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device != device:

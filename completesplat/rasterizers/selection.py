@@ -47,11 +47,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
 
 
 def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
-    """Return the `cuda` backend, without which training takes far too long.
-
-    Raises:
-        CompleteSplatError: it does not work here.
-    """
+    """Return the `cuda` backend, without which training takes far too long; fail if it does not work here."""
     try:
         return CudaRasterizer(constants)
     except CompleteSplatError as error:

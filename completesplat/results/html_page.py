@@ -303,9 +303,6 @@ def page(folder: Path, out: Path, most: Mapping[str, Any], made: Mapping[str, st
         most: limits: `frames` of a turn, `samples` of a photo, `predictions`, `runs`, `pictures` of a run's subfolder,
             and `megabytes` of all images.
         made: command, date and commit of the page.
-
-    Raises:
-        CompleteSplatError: there is no such folder, or it has nothing to show.
     """
     tree, budget = find(folder), ByteBudget(most["megabytes"])
     all_runs, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]

@@ -254,9 +254,6 @@ def tables(tree: RunTree | None) -> list[Table]:
 
     A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs
     of a sweep over ablations are listed in the ablation tables alone.
-
-    Raises:
-        CompleteSplatError: there are no results.
     """
     if tree is None:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]

@@ -76,11 +76,7 @@ class RunTree:
 
 
 def find(folder: Path) -> RunTree:
-    """Search a folder and everything below it, except hidden folders.
-
-    Raises:
-        CompleteSplatError: there is no such folder.
-    """
+    """Search a folder and everything below it, except hidden folders."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
     tree, results = RunTree(folder), []

@@ -28,11 +28,7 @@ PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
 
 
 def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
-    """Return all pairs of (skip weight, guidance weight) and the paper's three.
-
-    Raises:
-        CompleteSplatError: a weight is outside of [0, 1].
-    """
+    """Return all pairs of (skip weight, guidance weight) and the paper's three; check that weights are in [0, 1]."""
     pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
     for skip_weight, guidance_weight in pairs:
         allowed_skip_weight(skip_weight)
@@ -123,11 +119,7 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
 
 
 def check_box(box: Sequence[float]) -> None:
-    """Check a box in shares of an image.
-
-    Raises:
-        CompleteSplatError: it is not a box, has no pixels, or reaches beyond the image.
-    """
+    """Check that a box in shares of an image is valid, has pixels and lies inside the image."""
     if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
         raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
 

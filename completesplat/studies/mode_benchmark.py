@@ -238,11 +238,7 @@ def measure(
 
 
 def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
-    """Return the usable ones of the first `count` scenes (None: all), and the reasons why others are not.
-
-    Raises:
-        CompleteSplatError: no scene is usable.
-    """
+    """Return the usable ones of the first `count` scenes (None: all), and the reasons why others are not."""
     selected, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:

@@ -56,11 +56,7 @@ def autoreconstructor_of(module: Any) -> VariationalAutoReconstructor | None:
 
 
 def first_scenes(data: Any, count: int) -> list[SceneBatch]:
-    """Return the first test scenes of a data module, each as a batch of one.
-
-    Raises:
-        DataError: there are fewer.
-    """
+    """Return the first test scenes of a data module, each as a batch of one."""
     data.setup("test")
     all_scenes = (batch[i : i + 1] for batch in data.test_dataloader() for i in range(len(batch.names)))
     scenes = list(islice(all_scenes, count))

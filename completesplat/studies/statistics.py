@@ -37,7 +37,7 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
     Sequences (of at least one frame) are read one by one and only a few numbers of each are kept. No image is read.
 
     Returns:
-        `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min` and `max` of all frames and
+        `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min`, `max` of all frames and
         `median` of the sequences' medians; None in a split without sequences. `histograms`: measure -> `edges` and, by
         split, `counts` of the sequences' medians (of the maxima for the distance from the first camera).
     """
