@@ -40,7 +40,11 @@ def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
 
 
 def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
-    """Return the mode of each sample, or `REJECTED` if it is not near enough to one."""
+    """Return the mode of each sample, or `REJECTED` if it is not near enough to one.
+
+    Raises:
+        ValueError: fewer than two modes, equal modes, or no pixels.
+    """
     if len(modes) < 2 or not modes.shape[1]:
         raise ValueError("needs two modes and a pixel")
     between = distances(modes, modes).fill_diagonal_(torch.inf)

@@ -51,6 +51,9 @@ def descriptors(
 
     An image's patches depend on the image and its seed only, so several processes may describe parts of a set. A
     prediction and its truth share their seeds.
+
+    Raises:
+        ValueError: the images are smaller than 16 pixels, or there is not one seed per image.
     """
     if len(seeds) != len(images):
         raise ValueError(f"{len(images)} images need as many seeds, not {len(seeds)}")

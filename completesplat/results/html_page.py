@@ -303,6 +303,9 @@ def page(folder: Path, out: Path, most: Mapping[str, Any], made: Mapping[str, st
         most: limits: `frames` of a turn, `samples` of a photo, `predictions`, `runs`, `pictures` of a run's subfolder,
             and `megabytes` of all images.
         made: command, date and commit of the page.
+
+    Raises:
+        CompleteSplatError: there is no such folder, or it has nothing to show.
     """
     tree, budget = find(folder), ByteBudget(most["megabytes"])
     all_runs, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]
@@ -337,14 +340,14 @@ def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
     tables: dict[Path, list[Table]] = {run.folder: own_tables(entries([run])) for run in tree.scores}
     for run in tree.modes:
         tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
-    shown = []
+    selected = []
     for path in tree.runs:
         by_part = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
         figures = {part: paths for part, paths in by_part.items() if paths}
         shows = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
         if shows and path.resolve() != out.resolve():
-            shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
-    return shown
+            selected.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
+    return selected
 
 
 def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str, str]) -> str:

@@ -254,6 +254,9 @@ def tables(tree: RunTree | None) -> list[Table]:
 
     A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs
     of a sweep over ablations are listed in the ablation tables alone.
+
+    Raises:
+        CompleteSplatError: there are no results.
     """
     if tree is None:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]
@@ -267,7 +270,7 @@ def tables(tree: RunTree | None) -> list[Table]:
     single = entries([run for run in tree.scores if not compared.get(run.folder.parent)])
     for table in published():
         if table.options:
-            made += [table for group in compared.values() for table in group] or [published_ablations(table)]
+            made += [ablation for group in compared.values() for ablation in group] or [published_ablations(table)]
         else:
             made.append(beside(table, single))
     elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
