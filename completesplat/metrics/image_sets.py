@@ -166,14 +166,14 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256) -> Inception
 def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
     """Return the squared Frechet distance of normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6).
 
-    Computed in float64. It needs far more items than features; values for sets of different sizes do not compare.
+    It is computed in float64 and needs far more items than features. Values for sets of different sizes do not compare.
     """
     from torchmetrics.image.fid import FrechetInceptionDistance
 
     _check_sizes(first, second)
     identity = nn.Identity()
     identity.num_features = first.shape[1]  # type: ignore[assignment]
-    # The sets are complete, but among several processes torchmetrics would wait for more and add them.
+    # The sets are complete; among several processes torchmetrics would wait for the others' sets and add them.
     metric = FrechetInceptionDistance(identity, sync_on_compute=False).to(first.device)
     metric.update(first.double(), real=True)
     metric.update(second.double(), real=False)

@@ -59,8 +59,8 @@ class Evaluation:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
         if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
-        of_sets = list((sets or {}).values())
-        absent = [metric for metric in (perceptual, *of_sets) if isinstance(metric, Missing)]
+        candidates = list((sets or {}).values())
+        absent = [metric for metric in (perceptual, *candidates) if isinstance(metric, Missing)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
@@ -68,7 +68,7 @@ class Evaluation:
             message = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
             raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {message}")
         self.samples, self.criterion, self.seed = samples, criterion, seed
-        self.set_metrics = [metric for metric in of_sets if metric is not None and not isinstance(metric, Missing)]
+        self.set_metrics = [metric for metric in candidates if metric is not None and not isinstance(metric, Missing)]
         self.reset()
 
     def reset(self) -> None:
@@ -167,7 +167,7 @@ class Evaluation:
             self.skipped += skipped
 
     def results(self) -> dict[str, Any]:
-        """Return {predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": all novel views}}."""
+        """Return {predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": n of novel views}}."""
         results: dict[str, Any] = {}
         for predictor, scenes in self.scores.items():
             names = sorted(scenes)

@@ -72,7 +72,7 @@ def descriptors(
 def sliced_wasserstein(first: Sequence[Float[Tensor, "_ 147"]], second: Sequence[Float[Tensor, "_ 147"]]) -> float:
     """Return the mean distance over the levels of two sets' descriptors, times 1000 as in the paper's tables.
 
-    It ignores brightness and contrast, which normalising each set removes. The projections are always the same.
+    It ignores brightness and contrast, because each set is normalised. The projections are always the same.
     """
     if [len(level) for level in first] != [len(level) for level in second]:
         raise ValueError("needs two sets of one size")

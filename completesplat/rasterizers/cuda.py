@@ -83,8 +83,8 @@ class CudaRasterizer:
             near_plane=self._near_plane,
             far_plane=FARTHEST,
             eps2d=self.constants.blur,
-            # Packing gains little, because views see nearly every Gaussian; and its kernels can add the
-            # gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
+            # Packing gains little, because views see nearly every Gaussian; and gsplat's packed kernels can add
+            # the gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
             packed=False,
             render_mode="RGB+D",
             rasterize_mode="classic",

@@ -132,8 +132,8 @@ def origin(path: Path, levels: int = 1) -> dict[str, str]:
     records = (mapping_or_empty(place / RECORD) for place in [path, *path.parents[:levels]])
     record: dict[str, Any] = next(filter(None, records), {})
     command = record.get("command")
-    command_line = {"command": typed(command) if isinstance(command, list) else ""}
-    return command_line | {key: str(record.get(key) or "") for key in ("started", "commit")}
+    values = {"command": typed(command) if isinstance(command, list) else ""}
+    return values | {key: str(record.get(key) or "") for key in ("started", "commit")}
 
 
 def typed(command: Sequence[Any]) -> str:
@@ -206,7 +206,7 @@ def _jobs(folder: Path) -> list[Job]:
     recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
-    # Jobs that ended before they wrote a record are among those that wait.
+    # `waiting` includes jobs that ended before they wrote a record, so as many folders without one are left out.
     silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
 

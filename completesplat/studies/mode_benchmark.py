@@ -177,9 +177,9 @@ class Measured:
     def shares(self) -> dict[str, list[dict[str, Any]]]:
         """Return by method the modes' shares of samples, over all scenes whose modes have the same probabilities.
 
-        `total_variation` is between the probabilities and these shares (of samples that are not rejected); with many
-        samples, chance alone makes it small. If kinds of scenes differ in their probabilities, it reveals a model that
-        has learned how often modes occur, but not when.
+        `total_variation` is between the probabilities and these shares (of samples that are not rejected); chance adds
+        little to it, because there are many samples. If kinds of scenes differ in their probabilities, it reveals a
+        model that has learned how often modes occur, but not when.
         """
         rows: dict[str, list[dict[str, Any]]] = {}
         for method, kinds in self.classes.items():

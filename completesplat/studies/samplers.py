@@ -28,7 +28,7 @@ def rows(
     settings: Mapping[str, float],
     tick: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """Return a row for each sampler that fits the denoiser and each number of steps; the first is in `REFERENCES`.
+    """Return a row for each fitting sampler and number of steps; the first row is one of `REFERENCES`.
 
     PSNR and SSIM are of novel views, averaged over samples, views and scenes; `agreement` is the PSNR against the
     reference's renders from the same noise. `ms` is the time per sample of the fastest scene, with its reconstruction

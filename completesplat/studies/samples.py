@@ -21,7 +21,7 @@ from completesplat.scene import SceneBatch
 
 @dataclass(frozen=True)
 class SampleRenderer:
-    """Renderer of samples (of one noise, whatever the settings) in the reference view and then all targets.
+    """Renderer of samples (from the same noise, whatever the settings) in the reference view and then all targets.
 
     `background` is the grey value behind the Gaussians.
     """
