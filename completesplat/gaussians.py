@@ -1,4 +1,4 @@
-"""The scene representation: a set of 3D Gaussians with activated parameters, in world space."""
+"""Scene representation: a set of 3D Gaussians with activated parameters, in world space."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Gaussians(TensorDataclass):
-    """3D Gaussians. Every value is final: scales in world units, opacities in [0, 1], sRGB colours from 0 to 1.
+    """3D Gaussians with final values: scales in world units, opacities in [0, 1], sRGB colours from 0 to 1.
 
-    Quaternions are (w, x, y, z), of any length but zero for a defined rotation. There is one colour for all
-    directions (only the DC term of spherical harmonics exists, as in the paper), so none is stored as a harmonic.
+    Quaternions are (w, x, y, z), of any length but zero for a defined rotation. Colours are stored as they are seen,
+    not as harmonics, because there is one colour for all directions (the DC term only, as in the paper).
     """
 
     means: Float[Tensor, "*batch gaussian 3"]
@@ -34,32 +34,32 @@ class Gaussians(TensorDataclass):
 
     @property
     def count(self) -> int:
-        """Number of Gaussians in each set."""
+        """Return the number of Gaussians in each set."""
         return self.means.shape[-2]
 
     def covariances(self) -> Float[Tensor, "*batch gaussian 3 3"]:
-        """R S S^T R^T (Kerbl et al. 2023, Eq. 6)."""
+        """Return R S S^T R^T (Kerbl et al. 2023, Eq. 6)."""
         root = quaternion_to_matrix(self.quaternions) * self.scales[..., None, :]
         return root @ root.mT
 
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "Gaussians":
         """Move the Gaussians by a rotation and translation (the upper left block must be a rotation)."""
         rotation = matrix_to_quaternion(matrix[..., :3, :3])[..., None, :]
-        # Normalised first, because a zero quaternion would stay zero instead of taking the rotation.
+        # Normalise first, because a zero quaternion would stay zero instead of taking the rotation.
         quaternions = quaternion_multiply(rotation, normalize_quaternion(self.quaternions))
         return replace(self, means=transform_points(matrix, self.means), quaternions=quaternions)
 
     def keep(self, mask: Bool[Tensor, " gaussian"]) -> "Gaussians":
-        """The marked Gaussians of one unbatched set."""
+        """Return the Gaussians of one unbatched set that the mask marks."""
         return self[mask]
 
     def finite(self) -> Bool[Tensor, "*batch gaussian"]:
-        """Which Gaussians have finite values throughout."""
+        """Return a mask of the Gaussians whose values are all finite."""
         marks = [self.opacities.isfinite()]
         marks += [x.isfinite().all(-1) for x in (self.means, self.quaternions, self.scales, self.colors)]
         return torch.stack(marks).all(0)
 
 
 def concatenate(sets: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of the sets (of equal batch shape) in one."""
+    """Join sets of equal batch shape into one."""
     return tensors.concatenate(sets, axis=sets[0].opacities.ndim - 1)

@@ -1,4 +1,4 @@
-"""What a data module yields: images with their cameras, for a reference view and its targets; or their latents."""
+"""Batches of a data module: images with cameras, of a reference view and its targets; or their latents."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ from completesplat.tensors import TensorDataclass, concatenate
 class Views(TensorDataclass):
     """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1).
 
-    `depths` is the true depth along the optical axes in units of the cameras, 0 where it is unknown; None: not read.
+    `depths` is the true depth along the optical axes in the cameras' units, 0 where it is unknown; None: not loaded.
     """
 
     images: Float[Tensor, "*batch 3 height width"]
@@ -28,9 +28,9 @@ class SceneBatch(TensorDataclass):
 
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
-    `visible` is 1 where the conditioning may see the reference picture, 0 within the boxes of masked diffusion.
-    `names` are sequences, `reference_frame` the reference's place in its sequence. `seen` are the same scenes in the
-    smaller pictures that a model sees whose renders are compared with these; None: it sees these.
+    `visible` is 1 where the conditioning may see the reference image, 0 within the boxes of masked diffusion.
+    `names` are those of sequences, `reference_frame` is the reference's index in its sequence. `seen` holds the same
+    scenes as the smaller images that the model takes, if its renders are compared with larger ones; else None.
     """
 
     reference: Views
@@ -42,12 +42,12 @@ class SceneBatch(TensorDataclass):
     seen: "SceneBatch | None" = None
 
     def __getitem__(self, index: int | slice) -> "SceneBatch":
-        """One scene of a batch, or some of them."""
+        """Select one scene of a batch, or several."""
         seen = None if self.seen is None else self.seen[index]
         return replace(super().__getitem__(index), names=self.names[index], seen=seen)
 
     def all_views(self) -> Views:
-        """Reference and targets along one view axis, the reference first: [batch 1+view ...]."""
+        """Join reference and targets along one view axis, the reference first: [batch 1+view ...]."""
         axis = self.depth_range.ndim - 1
         parts = [self.reference.map(lambda tensor: tensor.unsqueeze(axis)), self.targets]
         if any(part.depths is None for part in parts):
@@ -57,11 +57,11 @@ class SceneBatch(TensorDataclass):
 
 @dataclass(frozen=True)
 class CachedScene(TensorDataclass):
-    """What stage 2 needs of scenes whose reference pictures were encoded beforehand.
+    """Scenes for stage 2 whose reference images were encoded beforehand.
 
     `mean` and `log_variance` are those of the autoreconstructor's posterior, not scaled. `condition` is the reference
-    picture (sRGB, 0 to 1; 0 within the boxes of masked diffusion), or the features that a frozen conditioning makes of
-    it. `names` and `reference_frame` are as in `SceneBatch`.
+    image (sRGB, 0 to 1; 0 within the boxes of masked diffusion), or the features that a frozen conditioning computes
+    from it. `names` and `reference_frame` are as in `SceneBatch`.
     """
 
     mean: Float[Tensor, "*batch channel height width"]
@@ -71,5 +71,5 @@ class CachedScene(TensorDataclass):
     names: str | tuple[str, ...]
 
     def __getitem__(self, index: int | slice) -> "CachedScene":
-        """One scene of a batch, or some of them."""
+        """Select one scene of a batch, or several."""
         return replace(super().__getitem__(index), names=self.names[index])

@@ -1,6 +1,6 @@
-"""Splatter Images: M layers of 15 raw values a pixel, and the activations that turn them into Gaussians.
+"""Splatter Images: M layers of 15 raw values per pixel, and the activations that turn them into Gaussians.
 
-All activations of the project live here (paper, supplement A.1; values and initialisation of Szymanowicz et al.,
+All activations of the project are here (paper, supplement A.1; values and initialisation of Szymanowicz et al.,
 "Splatter Image", `gaussian_predictor.py`). Per layer and pixel, in this order: depth 1, offset 3, opacity 1,
 scale 3, rotation 4, colour 3. Gaussians are in the reference camera's frame, ordered by layer, row, column.
 """
@@ -26,9 +26,9 @@ SH_C0 = 0.28209479177387814
 
 
 class Group(NamedTuple):
-    """Raw values that belong together: their number, and gain and bias of Splatter Image's head (`initialize_head`).
+    """Group of raw values: their number, and the gain and bias of Splatter Image's head (`initialize_head`).
 
-    Depth and scale start where the `Parameterization` says.
+    The `Parameterization` sets the biases of depth and scale instead.
     """
 
     channels: int
@@ -50,16 +50,16 @@ CHANNELS = sum(group.channels for group in GROUPS.values())
 def independent_depths(
     raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
 ) -> Float[Tensor, "*batch layer height width"]:
-    """z = near + (far - near) * sigmoid(raw) for every layer: the plain reading of the paper."""
+    """Return z = near + (far - near) * sigmoid(raw) for every layer, the plain reading of the paper."""
     return near + (far - near) * raw.sigmoid()
 
 
 def incremental_depths(
     raw: Float[Tensor, "*batch layer height width"], near: Tensor, far: Tensor
 ) -> Float[Tensor, "*batch layer height width"]:
-    """The first layer as `independent_depths`; each further one lies exp(raw) behind the last (Flash3D).
+    """Return the first layer as `independent_depths` does; each further one lies exp(raw) behind the last (Flash3D).
 
-    The head starts it `Parameterization.layer_step` behind.
+    `initialize_head` makes that distance `Parameterization.layer_step` at first.
     """
     first = independent_depths(raw[..., :1, :, :], near, far)
     steps = raw[..., 1:, :, :].clamp(-10, 6).exp()
@@ -77,18 +77,18 @@ Length = Annotated[float, Range(1e-9, 1e9)]
 
 @dataclass(frozen=True)
 class Parameterization:
-    """How raw values are read.
+    """Settings of the activations that turn raw values into Gaussians.
 
     Attributes:
         layers: M, Gaussians per pixel (2 in the paper).
         layer_depths: relation between the depths of one pixel's layers, a key of `LAYER_DEPTHS`.
-        first_depth: where in the depth range, as a share of it, Gaussians start. One half is the object's distance in
-            Splatter Image, whose range lies evenly around it.
-        first_scale: standard deviation that Gaussians start with, in scene units; 0.02 in Splatter Image, a pixel or so
-            of an object seen in 128.
-        layer_step: how far behind the last a layer starts with incremental depths, in scene units.
+        first_depth: initial depth of Gaussians, as a share of the depth range. One half is the object's distance in
+            Splatter Image, whose range is centred on it.
+        first_scale: initial standard deviation of Gaussians, in scene units; 0.02 in Splatter Image, about one pixel
+            of an object in an image of 128.
+        layer_step: initial distance of a layer behind the last with incremental depths, in scene units.
         smallest_scale, largest_scale: the exponential of the raw scale is clamped to this range, in scene units
-            (the paper does not state one; the clamp has no gradient outside, full gradient inside).
+            (the paper states none). The clamp has no gradient outside and the full gradient inside.
     """
 
     layers: Few = 2
@@ -101,7 +101,7 @@ class Parameterization:
 
     @property
     def channels(self) -> int:
-        """Channels of the network's output: M * 15."""
+        """Return the channels of the network's output: M * 15."""
         return self.layers * CHANNELS
 
 
@@ -113,7 +113,7 @@ class SplatterImage(TensorDataclass):
     parameterization: Parameterization
 
     def split(self) -> dict[str, Float[Tensor, "*batch layer channel height width"]]:
-        """The raw values by group, in the order of `GROUPS`."""
+        """Return the raw values by group, in the order of `GROUPS`."""
         parts = torch.split(self.raw, [group.channels for group in GROUPS.values()], dim=-3)
         return dict(zip(GROUPS, parts, strict=True))
 
@@ -121,7 +121,7 @@ class SplatterImage(TensorDataclass):
         """Activate the raw values and place each Gaussian on its pixel's ray (supplement A.1).
 
         Args:
-            cameras: the reference cameras [*batch], of which only the intrinsics matter; the result is in their frames.
+            cameras: the reference cameras [*batch]; only their intrinsics matter, and the result is in their frames.
             depth_range: near and far along the optical axis, in scene units.
         """
         parts, settings = self.split(), self.parameterization
@@ -145,18 +145,18 @@ class SplatterImage(TensorDataclass):
 def from_channels(
     output: Float[Tensor, "batch channel height width"], parameterization: Parameterization
 ) -> SplatterImage:
-    """Read a network's output, whose channels are ordered by layer, then by group."""
+    """Wrap a network's output, whose channels are ordered by layer, then by group."""
     raw = rearrange(output, "batch (layer channel) height width -> batch layer channel height width", channel=CHANNELS)
     return SplatterImage(raw, parameterization)
 
 
 @torch.no_grad()
 def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None:
-    """Initialise a network's last convolution, behind group normalisation and SiLU, as Splatter Image's output starts.
+    """Initialise a network's last convolution, after group normalisation and SiLU, like Splatter Image's output.
 
-    Upstream's output passes a 3x3 convolution of 128 channels to N (xavier, weights times 0.2) and then a 1x1
-    convolution with a gain for each group (`gaussian_predictor.py`, SongUNet and SingleImageSongUNetPredictor). Here
-    there is one convolution, with the variance that lets its raw values deviate as theirs do.
+    Upstream's output passes a 3x3 convolution from 128 to N channels (xavier, weights times 0.2) and then a 1x1
+    convolution with a gain for each group (`gaussian_predictor.py`, SongUNet and SingleImageSongUNetPredictor). The
+    single convolution here has the variance that gives its raw values the same standard deviation.
     """
     assert head.bias is not None
     inputs = head.weight[0].numel()
@@ -174,7 +174,7 @@ def initialize_head(head: nn.Conv2d, parameterization: Parameterization) -> None
 
 
 def _upstream_variance(group: Group) -> float:
-    """Variance of upstream's raw values for inputs whose mean square is 1: inputs times variance of a weight, twice."""
+    """Return the variance of upstream's raw values for inputs of mean square 1: inputs times weight variance, twice."""
     inputs, outputs = 128 * 9, CHANNELS * 9
     first = inputs * 0.2**2 * 2 / (inputs + outputs)
     second = CHANNELS * group.gain**2 * 2 / (CHANNELS + group.channels)

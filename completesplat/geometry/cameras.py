@@ -1,4 +1,4 @@
-"""Pinhole cameras, and the only place that states their conventions.
+"""Pinhole cameras and their conventions, which are stated here only.
 
 Axes are OpenCV's: +x right, +y down, +z forward. `world_to_camera` maps homogeneous world points to camera
 points. Intrinsics are in pixels; pixel (column i, row j) covers [i, i + 1) x [j, j + 1), so its centre lies at
@@ -27,27 +27,27 @@ class Cameras(TensorDataclass):
 
     @property
     def camera_to_world(self) -> Float[Tensor, "*batch 4 4"]:
-        """The rigid inverse of `world_to_camera`."""
+        """Return the rigid inverse of `world_to_camera`."""
         return invert_rigid(self.world_to_camera)
 
     @property
     def centers(self) -> Float[Tensor, "*batch 3"]:
-        """Optical centres in world coordinates."""
+        """Return the optical centres in world coordinates."""
         return self.camera_to_world[..., :3, 3]
 
     def relative_to(self, reference: "Cameras") -> "Cameras":
-        """The same cameras in a world whose frame is the reference camera's frame."""
+        """Return the cameras in a world whose frame is the reference camera's frame."""
         return replace(self, world_to_camera=self.world_to_camera @ reference.camera_to_world)
 
     def scale_world(self, factor: Float[Tensor, "*#batch"]) -> "Cameras":
-        """The same cameras after all world coordinates are multiplied by `factor`."""
+        """Return the cameras after all world coordinates are multiplied by `factor`."""
         matrix = self.world_to_camera.clone()
         matrix[..., :3, 3] = matrix[..., :3, 3] * factor[..., None]
         return replace(self, world_to_camera=matrix)
 
 
 def invert_rigid(matrix: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Inverse of a rotation and translation: (R, t) -> (R^T, -R^T t)."""
+    """Invert a rotation and translation: (R, t) -> (R^T, -R^T t)."""
     rotation = matrix[..., :3, :3].mT
     return _rigid(rotation, -(rotation @ matrix[..., :3, 3:]))
 
@@ -68,7 +68,7 @@ def transform_points(
 def project(
     cameras: Cameras, points: Float[Tensor, "*#batch n 3"]
 ) -> tuple[Float[Tensor, "*batch n 2"], Float[Tensor, "*batch n"]]:
-    """World points to pixel coordinates (u, v) and depth along the optical axis."""
+    """Project world points to pixel coordinates (u, v) and depth along the optical axis."""
     camera_points = transform_points(cameras.world_to_camera, points)
     homogeneous = camera_points @ cameras.intrinsics.mT
     return homogeneous[..., :2] / homogeneous[..., 2:], camera_points[..., 2]
@@ -77,7 +77,7 @@ def project(
 def unproject(
     cameras: Cameras, pixels: Float[Tensor, "*#batch n 2"], depth: Float[Tensor, "*#batch n"]
 ) -> Float[Tensor, "*batch n 3"]:
-    """Pixel coordinates with depth along the optical axis to world points; the inverse of `project`."""
+    """Convert pixel coordinates with depth along the optical axis to world points; the inverse of `project`."""
     camera_points = rays_through(cameras.intrinsics, pixels) * depth[..., None]
     return transform_points(cameras.camera_to_world, camera_points)
 
@@ -85,7 +85,7 @@ def unproject(
 def rays_through(
     intrinsics: Float[Tensor, "*#batch 3 3"], pixels: Float[Tensor, "*#batch n 2"]
 ) -> Float[Tensor, "*batch n 3"]:
-    """Camera-frame rays ((u - cx) / fx, (v - cy) / fy, 1): not of unit length, so that ray * depth is a point."""
+    """Return camera-frame rays ((u - cx) / fx, (v - cy) / fy, 1), not normalised, so that ray * depth is a point."""
     focal = torch.diagonal(intrinsics, dim1=-2, dim2=-1)[..., None, :2]
     xy = (pixels - intrinsics[..., None, :2, 2]) / focal
     return torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
@@ -94,27 +94,27 @@ def rays_through(
 def pixel_centers(
     height: int, width: int, device: torch.device | None = None, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "height width 2"]:
-    """Coordinates (u, v) of all pixel centres."""
+    """Return the coordinates (u, v) of all pixel centres."""
     v = torch.arange(height, device=device, dtype=dtype) + 0.5
     u = torch.arange(width, device=device, dtype=dtype) + 0.5
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
 def pixel_rays(cameras: Cameras) -> Float[Tensor, "*batch height width 3"]:
-    """Camera-frame rays through all pixel centres, scaled so that z = 1."""
+    """Return camera-frame rays through all pixel centres, scaled so that z = 1."""
     k = cameras.intrinsics
     pixels = pixel_centers(*cameras.image_size, k.device, k.dtype).flatten(0, 1)
     return rays_through(k, pixels).reshape(*k.shape[:-2], *cameras.image_size, 3)
 
 
 def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
-    """Intrinsics of a square image with the given horizontal field of view and a central principal point."""
+    """Return the intrinsics of a square image with the given horizontal field of view and a central principal point."""
     focal = 0.5 * size / torch.tensor(fov_degrees).deg2rad().div(2).tan().item()
     return torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
 
 
 def nearest_to_axes(cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """The world point with the least sum of squared distances to all optical axes; None where they are parallel."""
+    """Return the point with the least sum of squared distances to all optical axes; None if they are parallel."""
     axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
     total = across.sum(0)
@@ -125,7 +125,7 @@ def nearest_to_axes(cameras: Cameras) -> Float[Tensor, "3"] | None:
 
 
 def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: int) -> Cameras:
-    """Cameras of the image that is cut to a square (in pixels, fractions allowed) and resized to `size`."""
+    """Return the cameras of images cut to a square (in pixels, fractions allowed) and resized to `size`."""
     intrinsics = cameras.intrinsics.clone()
     intrinsics[..., 0, 2] -= left
     intrinsics[..., 1, 2] -= top
@@ -134,10 +134,10 @@ def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: in
 
 
 def mirror(cameras: Cameras) -> Cameras:
-    """Cameras of the horizontally mirrored pictures, in the world that is mirrored at its plane x = 0.
+    """Return the cameras of horizontally mirrored images, in the world mirrored at its plane x = 0.
 
-    With M = diag(-1, 1, 1, 1), `world_to_camera` becomes M W M, a rotation and translation again: what was seen at
-    (u, v) is seen at (width - u, v), at the same depth.
+    With M = diag(-1, 1, 1, 1), `world_to_camera` becomes M W M, a rotation and translation again. A point at (u, v)
+    moves to (width - u, v), at the same depth.
     """
     signs = cameras.world_to_camera.new_tensor([-1, 1, 1, 1])
     intrinsics = cameras.intrinsics.clone()
@@ -148,7 +148,7 @@ def mirror(cameras: Cameras) -> Cameras:
 def look_at(
     eye: Float[Tensor, "*#batch 3"], target: Float[Tensor, "*#batch 3"], up: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
-    """`world_to_camera` of a camera at `eye` that sees `target` in its centre and `up` pointing up in the image."""
+    """Return `world_to_camera` of a camera at `eye` with `target` in the image's centre and `up` pointing up."""
     eye, target, up = torch.broadcast_tensors(eye, target, up)  # type: ignore[no-untyped-call]
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)

@@ -1,7 +1,7 @@
 """Unit quaternions (w, x, y, z) and rotation matrices.
 
-A zero quaternion stands for the identity rotation, with a zero gradient, everywhere in this project. This is
-gsplat's reading as well: it divides by the norm clamped from below, and the zero vector gives R = I.
+A zero quaternion stands for the identity rotation, with a zero gradient, everywhere in this project. So does
+gsplat: it divides by the norm clamped from below, and the zero vector gives R = I.
 """
 
 import torch
@@ -12,7 +12,7 @@ SMALLEST_NORM = 1e-12
 
 
 def normalize_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Scale to unit length; a zero quaternion becomes (1, 0, 0, 0) with zero gradient."""
+    """Scale a quaternion to unit length; a zero quaternion becomes (1, 0, 0, 0) with zero gradient."""
     squared = quaternion.square().sum(-1, keepdim=True)
     usable = squared > SMALLEST_NORM**2
     # The norm is taken of a sanitised value, so that the unused branch of `where` has a finite gradient too.
@@ -23,7 +23,7 @@ def normalize_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor,
 
 
 def quaternion_to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrix of a quaternion of any length (it is normalised first)."""
+    """Return the rotation matrix of a quaternion of any length (it is normalised first)."""
     w, x, y, z = normalize_quaternion(quaternion).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -34,7 +34,7 @@ def quaternion_to_matrix(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor,
 
 
 def matrix_to_quaternion(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion of a rotation matrix, with w >= 0.
+    """Return the unit quaternion, with w >= 0, of a rotation matrix.
 
     The largest of the four components is found first and the others are divided by it, which keeps full
     precision for every rotation (Shepperd, "Quaternion from rotation matrix", 1978).
@@ -56,7 +56,7 @@ def matrix_to_quaternion(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "
 def quaternion_multiply(
     left: Float[Tensor, "*#batch 4"], right: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Hamilton product: the rotation `right` followed by the rotation `left`."""
+    """Return the Hamilton product: the rotation `right` followed by the rotation `left`."""
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     w, x = w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2, w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2

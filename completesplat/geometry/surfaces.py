@@ -1,4 +1,4 @@
-"""Surfaces by their depth: normals, and which of those that one camera sees another camera sees too."""
+"""Surfaces given by depth images: their normals, and which of them another camera does not see."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,18 +10,18 @@ from completesplat.geometry.cameras import Cameras, pixel_centers, pixel_rays, p
 def normals_from_depth(
     depth: Float[Tensor, "*batch 1 height width"], cameras: Cameras
 ) -> Float[Tensor, "*batch 3 height width"]:
-    """Unit normals in the camera's frame (+x right, +y down, +z forward) that face the camera.
+    """Return unit normals in the camera's frame (+x right, +y down, +z forward) that face the camera.
 
-    A pixel's normal is orthogonal to the two lines through its neighbours' points: left and right, above and below. It
-    is exact on planes, and of second order in the pixels' distance on smooth surfaces. Where one of two neighbours is
-    missing, the pixel's own point stands in.
+    A pixel's normal is orthogonal to two lines: through the points of its left and right neighbours, and through those
+    above and below. It is exact on planes, and of second order in the pixels' distance on smooth surfaces. The pixel's
+    own point replaces a missing neighbour.
 
     Args:
-        depth: along the optical axis, through the pixels' centres. What is not finite or not positive is missing.
+        depth: along the optical axis, at the pixels' centres. Values that are not finite or not positive are missing.
         cameras: of the depth's size, [*batch] or one for all. Only their intrinsics matter.
 
     Returns:
-        Normals, 0 where the depth is missing, or both neighbours are along a row or a column.
+        Normals, 0 where the depth is missing, or where both neighbours in a row or a column are.
     """
     known = depth.isfinite() & (depth > 0)
     points = torch.where(known, depth, 0) * pixel_rays(cameras).movedim(-1, -3)
@@ -34,7 +34,7 @@ def normals_from_depth(
 def _difference(
     points: Float[Tensor, "*batch 3 height width"], known: Bool[Tensor, "*batch 1 height width"], axis: int
 ) -> Float[Tensor, "*batch 3 height width"]:
-    """The next point minus the one before; the point itself in place of a missing one."""
+    """Subtract the point before from the next one; the point itself replaces a missing one."""
     size = points.shape[axis]
     following = torch.arange(1, size + 1, device=points.device).clamp(max=size - 1)
     before = torch.arange(-1, size - 1, device=points.device).clamp(min=0)
@@ -46,7 +46,7 @@ def _difference(
 
 
 TOLERANCE = 0.03
-"""Of the depth: more is another surface. A pixel of a slanted surface spans less."""
+"""Relative difference in depth from which on surfaces differ; a pixel of one slanted surface spans less."""
 
 
 def hidden_from(
@@ -55,10 +55,10 @@ def hidden_from(
     cameras: Cameras,
     depths: Float[Tensor, "view 1 height width"],
 ) -> tuple[Bool[Tensor, "view height width"], Bool[Tensor, "view height width"]]:
-    """Pixels of the cameras' pictures whose surface the reference does not show, and those of which this is known.
+    """Return masks of the pixels whose surface the reference view hides, and of those for which this is known.
 
-    A surface is hidden outside of the reference picture, behind its camera, and behind what it shows there. Unknown is
-    what has no depth (0), in its own picture or in the reference's.
+    A surface is hidden if it lies outside the reference image, behind the reference camera, or behind the surface that
+    the reference shows there. This is unknown if the depth is missing (0) in the view itself or in the reference.
     """
     height, width = reference.image_size
     pixels = pixel_centers(height, width, depths.device, depths.dtype).flatten(0, 1)
@@ -69,7 +69,7 @@ def hidden_from(
     corners = places.new_tensor([[0, 0], [0, 1], [1, 0], [1, 1]])
     around = (places - 0.5 + corners[:, None, None]).floor()
     columns, rows = around.nan_to_num().long().unbind(-1)
-    shown = reference_depth[0][rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
-    hidden = ~inside | (ahead > (1 + TOLERANCE) * shown.amax(0))
-    known = (depths.flatten(1) > 0) & (~inside | (shown > 0).all(0))
+    front = reference_depth[0][rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    hidden = ~inside | (ahead > (1 + TOLERANCE) * front.amax(0))
+    known = (depths.flatten(1) > 0) & (~inside | (front > 0).all(0))
     return (hidden & known).view(-1, height, width), known.view(-1, height, width)

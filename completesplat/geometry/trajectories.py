@@ -13,7 +13,7 @@ Vector = Float[Tensor, "3"]
 
 
 def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: float = 360.0) -> Cameras:
-    """Cameras that circle the axis through `pivot` along `up`, starting at the reference camera.
+    """Return cameras that circle the axis through `pivot` along `up`, starting at the reference camera.
 
     The reference camera (unbatched) keeps its distance and height; every camera looks at `pivot`. The last frame
     stops one step short of `degrees`, so that a full turn loops smoothly.
@@ -32,13 +32,13 @@ def orbit(reference: Cameras, pivot: Vector, up: Vector, frames: int, degrees: f
 
 
 def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: float = 0.3) -> Cameras:
-    """Cameras that go to the left, to the right and back on a level straight line, looking at `pivot`.
+    """Return cameras that go left, right and back on a level straight line, looking at `pivot`.
 
     They start at the reference camera (unbatched), slow down towards both ends, and stop one step before the start, so
     that the video loops smoothly.
 
     Args:
-        up: the line is at right angles to it and to the direction of `pivot`.
+        up: the line is orthogonal to it and to the direction of `pivot`.
         reach: greatest distance to either side, as a share of the distance of `pivot`.
     """
     angles = _full_turn(frames, up)
@@ -47,13 +47,13 @@ def swipe(reference: Cameras, pivot: Vector, up: Vector, frames: int, reach: flo
 
 
 def wobble(reference: Cameras, pivot: Vector, up: Vector, frames: int, radius: float = 0.1) -> Cameras:
-    """Cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
+    """Return cameras on a small circle around the reference camera (unbatched), looking at `pivot`.
 
-    The circle lies across the direction of `pivot`, begins on the right and goes up first; the last frame stops one
-    step before the start.
+    The circle is orthogonal to the direction of `pivot`, begins on the right and goes up first. The last frame stops
+    one step before the start.
 
     Args:
-        radius: of the circle, as a share of the distance of `pivot`.
+        radius: radius of the circle, as a share of the distance of `pivot`.
     """
     angles = _full_turn(frames, up)
     right, above = _sideways(reference, pivot, up)
@@ -69,7 +69,7 @@ def _full_turn(frames: int, like: Tensor) -> Float[Tensor, " frame"]:
 
 
 def _sideways(reference: Cameras, pivot: Vector, up: Vector) -> tuple[Vector, Vector]:
-    """Right and up across the direction of the pivot, as long as the pivot is away."""
+    """Return vectors to the right and up, orthogonal to the pivot's direction and as long as its distance."""
     forward = pivot - reference.centers
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     return right * forward.norm(), torch.linalg.cross(right, forward)

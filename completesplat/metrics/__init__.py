@@ -1,1 +1,1 @@
-"""What is measured, and how it is averaged."""
+"""Metrics of images, of image sets and of samples, and their averages over scenes."""

@@ -1,4 +1,4 @@
-"""Distances between the set of predicted and the set of true images: FID, KID, sliced Wasserstein."""
+"""Distances between the sets of predicted and true images: FID, KID, sliced Wasserstein."""
 
 import warnings
 from collections import defaultdict
@@ -16,31 +16,31 @@ from completesplat.weights import weights_file
 
 URL = "https://nvlabs-fi-cdn.nvidia.com/stylegan2-ada-pytorch/pretrained/metrics/inception-2015-12-05.pt"
 SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
-"""Of the file behind `URL`, as k-diffusion (`k_diffusion/evaluation.py`) states it too."""
+"""Digest of the file at `URL`; k-diffusion (`k_diffusion/evaluation.py`) states the same."""
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
-Descriptors = list[Tensor]  # of some images, kinds of descriptors: each [images * n features]
+Descriptors = list[Tensor]  # of several images; one tensor [images * n features] for each kind of descriptor
 
 
 @runtime_checkable
 class SetMetric(Protocol):
-    """Describes images one by one, and compares what it knows of two sets."""
+    """Metric that describes images one by one and then compares the descriptors of two sets."""
 
-    regions: tuple[str, ...]  # of the pixels that it looks at: "full", "object"
+    regions: tuple[str, ...]  # the pixels that it measures: "full", "object"
 
     def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
-        """What is kept of images with values in [0, 1]; whatever it draws for an image depends on its seed only."""
+        """Return descriptors of images with values in [0, 1]; random choices for an image depend on its seed only."""
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
-        """Figures by name, lower is better."""
+        """Return figures by name; lower is better."""
 
     def settings(self) -> dict[str, dict[str, Any]]:
-        """What figures depend on, by their names."""
+        """Return the settings that figures depend on, by the figures' names."""
 
 
 class ImageSets:
-    """Keeps what set metrics need of the images of each predictor, region and scene."""
+    """Descriptors that set metrics compare, by predictor, region and scene."""
 
     TRUE = "true"
 
@@ -49,30 +49,30 @@ class ImageSets:
         self.kept: dict[tuple[str, str, int], dict[str, Descriptors]] = defaultdict(dict)
 
     def add(self, owner: str, region: str, scene: str, images: Images, seeds: Sequence[int]) -> None:
-        """Images of a scene that belong to a predictor, or are `TRUE`; those of a scene are kept once."""
+        """Describe images of a scene, by a predictor or `TRUE`, unless that scene has been described already."""
         for index, metric in enumerate(self.metrics):
             scenes = self.kept[owner, region, index]
             if region in metric.regions and scene not in scenes:
                 scenes[scene] = [kind.float().cpu() for kind in metric.describe(images, seeds)]
 
     def results(self, owner: str, region: str) -> dict[str, float]:
-        """The distances of a predictor's images from the true ones of the same scenes."""
-        found: dict[str, float] = {}
+        """Return the distances of a predictor's images from the true images of the same scenes."""
+        figures: dict[str, float] = {}
         for index, metric in enumerate(self.metrics):
-            own, true = self.kept[owner, region, index], self.kept[self.TRUE, region, index]
-            if own:
-                parts = ([scenes[name] for name in sorted(own)] for scenes in (true, own))
-                found |= metric.distances(*([torch.cat(kind) for kind in zip(*part, strict=True)] for part in parts))
-        return found
+            predicted, true = self.kept[owner, region, index], self.kept[self.TRUE, region, index]
+            if predicted:
+                parts = ([scenes[name] for name in sorted(predicted)] for scenes in (true, predicted))
+                figures |= metric.distances(*([torch.cat(kind) for kind in zip(*part, strict=True)] for part in parts))
+        return figures
 
     def merge(self, kept: dict[tuple[str, str, int], dict[str, Descriptors]]) -> None:
-        """Add what another process kept."""
+        """Add the descriptors of another process."""
         for key, scenes in kept.items():
             self.kept[key] |= scenes
 
 
 class Patches:
-    """The sliced Wasserstein distance of `patches` patches an image and level, all pixels, as "swd"."""
+    """Sliced Wasserstein distance of `patches` patches per image and level, over all pixels, as "swd"."""
 
     regions = ("full",)
 
@@ -93,9 +93,9 @@ class Patches:
 
 
 class InceptionFeatures(nn.Module):
-    """Pool features of images, by a frozen TorchScript Inception that takes bytes and resizes them itself.
+    """Frozen TorchScript Inception, which takes 8-bit images, resizes them itself and returns pool features.
 
-    `network` is called as NVlabs' `stylegan2-ada-pytorch/metrics` do: `network(bytes, return_features=True)`.
+    `network` is called as in NVlabs' `stylegan2-ada-pytorch/metrics`: `network(bytes, return_features=True)`.
     """
 
     def __init__(self, network: torch.jit.ScriptModule) -> None:
@@ -105,7 +105,7 @@ class InceptionFeatures(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Images) -> Float[Tensor, "image feature"]:
-        """Features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
+        """Return features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
         pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
         with torch.autocast(images.device.type, enabled=False):
             features: Tensor = self.network(pixels, return_features=True).float()
@@ -113,7 +113,7 @@ class InceptionFeatures(nn.Module):
 
 
 class Inception:
-    """FID and KID (of subsets of at most `subset_size` items), as "fid" and "kid", for all and for object pixels."""
+    """FID and KID (over subsets of at most `subset_size` items), as "fid" and "kid", for all and for object pixels."""
 
     regions = ("full", "object")
 
@@ -121,13 +121,13 @@ class Inception:
         self.features, self.subset_size = features, subset_size
 
     def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
-        """See `SetMetric`; nothing is drawn."""
+        """See `SetMetric`; nothing is random here."""
         return [self.features.to(images.device)(images)]
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """See `SetMetric`."""
-        (one,), (other,) = true, predicted
-        return {"fid": frechet_distance(one, other), "kid": kernel_distance(one, other, self.subset_size)}
+        (a,), (b,) = true, predicted
+        return {"fid": frechet_distance(a, b), "kid": kernel_distance(a, b, self.subset_size)}
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """See `SetMetric`."""
@@ -136,21 +136,23 @@ class Inception:
 
 
 def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | Missing:
-    """FID and KID, or why there are none; see `load_inception` for the weights."""
-    load = lambda given: Inception(load_inception(given, sha256), subset_size)  # noqa: E731
+    """Return FID and KID, or why they are missing; see `load_inception` for the weights."""
+    load = lambda source: Inception(load_inception(source, sha256), subset_size)  # noqa: E731
     return unless_missing(weights, load, ADVICE, ("fid", "kid"))
 
 
 def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
-    """NVlabs' translation of the network that FID is defined with (Heusel et al. 2017; `inception-2015-12-05`).
+    """Load NVlabs' translation of the network that defines FID (Heusel et al. 2017; `inception-2015-12-05`).
 
-    A TorchScript file is a program: only the one with this SHA-256 (or these first digits of it) is run; with None, any
-    file. `WeightsError`: the file is missing, cannot be downloaded, is another one, or is no such network.
+    A TorchScript file is a program. Only one with this SHA-256 (or these first digits) is run; with None, any file.
+
+    Raises:
+        WeightsError: the file is missing, cannot be downloaded, is another one, or holds no such network.
     """
     path = weights_file(weights, sha256, DOWNLOAD_ADVICE, "evaluation.scoring.sets.inception.sha256")
     try:
         with warnings.catch_warnings():
-            # torch would have new programs exported; this one is published as TorchScript only.
+            # torch recommends torch.export for new programs; this one is published as TorchScript only.
             warnings.simplefilter("ignore", DeprecationWarning)
             load: Callable[..., Any] = torch.jit.load
             network = load(str(path), map_location="cpu")
@@ -162,18 +164,17 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256) -> Inception
 
 
 def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
-    """Squared Frechet distance of the normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6), in float64.
+    """Return the squared Frechet distance of normal distributions fitted to two sets (Heusel et al. 2017, Eq. 6).
 
-    Needs far more items than features for a trustworthy value; sets of different sizes must not be compared.
-    `ValueError`: a set of less than two.
+    It is computed in float64 and needs far more items than features. Values for sets of different sizes do not compare.
     """
     from torchmetrics.image.fid import FrechetInceptionDistance
 
     _check_sizes(first, second)
-    given = nn.Identity()
-    given.num_features = first.shape[1]  # type: ignore[assignment]
-    # The sets are complete: among several processes torchmetrics would wait for the others' and add them.
-    metric = FrechetInceptionDistance(given, sync_on_compute=False).to(first.device)
+    identity = nn.Identity()
+    identity.num_features = first.shape[1]  # type: ignore[assignment]
+    # The sets are complete; among several processes torchmetrics would wait for the others' sets and add them.
+    metric = FrechetInceptionDistance(identity, sync_on_compute=False).to(first.device)
     metric.update(first.double(), real=True)
     metric.update(second.double(), real=False)
     return metric.compute().item()
@@ -186,11 +187,10 @@ def kernel_distance(
     subsets: int = 100,
     seed: int = 0,
 ) -> float:
-    """Squared maximum mean discrepancy, unbiased, hence at times below zero (Binkowski et al. 2018, Section 4).
+    """Return the squared maximum mean discrepancy, unbiased, so at times below 0 (Binkowski et al. 2018, Section 4).
 
-    The kernel is (x.y / features + 1)^3. The mean over random subsets of at most `subset_size` items, in float64 and
-    not multiplied by 1000; where a set is larger than a subset, it depends on the order of the items. `ValueError`: a
-    set of less than two.
+    The kernel is (x.y / features + 1)^3. The value is a mean over random subsets of at most `subset_size` items, in
+    float64, not times 1000. It depends on the order of the items if a set is larger than a subset.
     """
     from torchmetrics.image.kid import poly_mmd
 
@@ -199,8 +199,8 @@ def kernel_distance(
     generator = torch.Generator().manual_seed(seed)
     values = []
     for _ in range(subsets):
-        one, other = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
-        values.append(poly_mmd(one.double(), other.double()))
+        a, b = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
+        values.append(poly_mmd(a.double(), b.double()))
     return torch.stack(values).mean().item()
 
 

@@ -1,4 +1,4 @@
-"""Image metrics, one value per image: PSNR, SSIM, LPIPS where its weights are at hand."""
+"""Image metrics with one value per image: PSNR, SSIM, and LPIPS if its weights are available."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ Images = Float[Tensor, "image 3 height width"]
 PerImage = Float[Tensor, " image"]
 
 PSNR_LIMIT = 100.0
-"""Identical images have an infinite PSNR; reported values stop here (dB), so that averages stay finite."""
+"""Largest reported PSNR (dB); identical images have an infinite one, and averages must stay finite."""
 ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=FILE_OR_URL"
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Why metrics cannot be measured here, and their names in results; nothing stands in for them."""
+    """Reason why metrics cannot be measured here, and their names in results; nothing replaces them."""
 
     reason: str
     names: tuple[str, ...]
@@ -34,7 +34,7 @@ class Missing:
 def unless_missing(
     weights: str | None, load: Callable[[str], Metric], advice: str, names: tuple[str, ...]
 ) -> Metric | Missing:
-    """What `load` makes of the weights; without them (`advice`), or where they cannot be used, why `names` miss."""
+    """Load the weights; without weights (reason: `advice`) or with unusable ones, return why `names` are missing."""
     if weights is None:
         return Missing(advice, names)
     try:
@@ -44,7 +44,7 @@ def unless_missing(
 
 
 def psnr(predicted: Images, true: Images) -> PerImage:
-    """Peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
+    """Return the peak signal-to-noise ratio in dB, for values in [0, 1]; at most `PSNR_LIMIT`."""
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
     values: Tensor = peak_signal_noise_ratio(predicted, true, data_range=1.0, reduction="none", dim=(1, 2, 3))
@@ -52,7 +52,7 @@ def psnr(predicted: Images, true: Images) -> PerImage:
 
 
 def ssim(predicted: Images, true: Images) -> PerImage:
-    """Structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
+    """Return the structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
 
     The mean is over all pixels; the window sees the image mirrored beyond its border, as in torchmetrics.
     """
@@ -66,7 +66,7 @@ def ssim(predicted: Images, true: Images) -> PerImage:
 def object_only(
     images: Float[Tensor, "*batch 3 height width"], masks: Float[Tensor, "*batch 1 height width"]
 ) -> Float[Tensor, "*batch 3 height width"]:
-    """The image with a black background, by the true mask binarised at 0.5 (supplement, "Objects only").
+    """Make the background of images black, by the true mask binarised at 0.5 (supplement, "Objects only").
 
     The paper does not say whether its masks are soft; CO3D's own challenge binarises at 0.5.
     """
@@ -74,6 +74,6 @@ def object_only(
 
 
 def perceptual_metric(vgg_weights: str | None, vgg_sha256: str | None = None) -> PerceptualDistance | Missing:
-    """LPIPS with VGG16, the paper's (Tables 2 to 5), or why there is none; see `load_vgg16` for the weights."""
+    """Return LPIPS with VGG16 as in the paper (Tables 2 to 5), or why it is missing; see `load_vgg16`."""
     load = lambda weights: PerceptualDistance(load_vgg16(weights, vgg_sha256), load_heads())  # noqa: E731
     return unless_missing(vgg_weights, load, ADVICE, ("lpips",))

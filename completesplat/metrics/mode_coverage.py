@@ -1,4 +1,4 @@
-"""How well samples cover what could be there, where all of it is known: modes, calibration."""
+"""Mode coverage and calibration of samples, for scenes in which every possible mode is known."""
 
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
@@ -13,19 +13,19 @@ Modes = Float[Tensor, "mode pixel 3"]
 Probabilities = Float[Tensor, " mode"]
 PerPixel = Float[Tensor, "*view height width"]
 REJECTED = -1
-# Of variances of colours in [0, 1]: all below a deviation of 0.001, then two bins in each decade.
+# Variances of colours in [0, 1]: one bin below a standard deviation of 0.001, then two bins in each decade.
 EDGES = torch.tensor([1e-6 * 10 ** (i / 2) for i in range(11)], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class HiddenModeScores:
-    """Scores of one scene's samples, or means of several scenes'.
+    """Scores of one scene's samples, or their means over scenes.
 
-    `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`: of
-    the samples' shares from the modes' probabilities, half the sum of absolute differences; rejected samples are a
-    class of probability 0, so that 1 is the worst. A perfect sampler of few samples does not reach 0; compare with
-    draws of the true distribution. `sharpness`: distance of a sample to its nearest mode, over that of the modes' mean
-    to its nearest mode; mean over all samples (0: exactly modes). `rejected`: share of the samples.
+    `coverage`: share of the modes (of positive probability) that at least one sample belongs to. `total_variation`:
+    half the sum of absolute differences between the samples' shares and the modes' probabilities. Rejected samples are
+    a class of probability 0, so 1 is the worst. A perfect sampler with few samples does not reach 0, so compare with
+    draws from the true distribution. `sharpness`: mean distance of a sample to its nearest mode, divided by that of
+    the modes' mean to its nearest mode (0: exactly modes). `rejected`: share of rejected samples.
     """
 
     coverage: float
@@ -35,12 +35,16 @@ class HiddenModeScores:
 
 
 def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
-    """Root mean square difference of every sample and every mode."""
+    """Return the root mean square difference of every sample and every mode."""
     return torch.stack([(samples - mode).square().mean((1, 2)).sqrt() for mode in modes], dim=1)
 
 
 def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
-    """The mode of each sample, or `REJECTED`. `ValueError`: fewer than two modes, equal ones, or no pixels."""
+    """Return the mode of each sample, or `REJECTED` if it is not near enough to one.
+
+    Raises:
+        ValueError: fewer than two modes, equal modes, or no pixels.
+    """
     if len(modes) < 2 or not modes.shape[1]:
         raise ValueError("needs two modes and a pixel")
     between = distances(modes, modes).fill_diagonal_(torch.inf)
@@ -55,16 +59,13 @@ def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> In
 def mean_of(
     modes: Float[Tensor, "mode *picture _"], probabilities: Float[Tensor, " mode"]
 ) -> Float[Tensor, "*picture _"]:
-    """The modes' mean, weighted by their probabilities."""
+    """Return the modes' mean, weighted by their probabilities."""
     mean: Tensor = torch.tensordot(probabilities, modes, dims=1)
     return mean
 
 
 def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
-    """Scores of one scene; samples and modes are the region's pixels, those of all its views in one row.
-
-    `ValueError`: no samples, or what `classify` refuses.
-    """
+    """Score one scene; samples and modes are the region's pixels of all views in one row."""
     if not len(samples):
         raise ValueError("needs a sample")
     classes = classify(samples, modes, probabilities)
@@ -81,7 +82,7 @@ def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> Hidd
 
 
 def mean_scores(of_scenes: Sequence[HiddenModeScores]) -> HiddenModeScores:
-    """Every scene, of at least one, counts the same."""
+    """Average the scores of at least one scene; every scene has the same weight."""
     means = (sum(values) / len(of_scenes) for values in zip(*map(astuple, of_scenes), strict=True))
     return HiddenModeScores(*means)
 
@@ -89,7 +90,7 @@ def mean_scores(of_scenes: Sequence[HiddenModeScores]) -> HiddenModeScores:
 def draw_modes(
     modes: Float[Tensor, "mode *picture _"], probabilities: Float[Tensor, " mode"], samples: int, seed: int
 ) -> Float[Tensor, "sample *picture _"]:
-    """What a perfect model would draw: modes by their probabilities."""
+    """Draw modes by their probabilities, as a perfect model would."""
     generator = torch.Generator().manual_seed(seed)
     return modes[torch.multinomial(probabilities.cpu(), samples, replacement=True, generator=generator)]
 
@@ -97,10 +98,7 @@ def draw_modes(
 def spread_and_error(
     samples: Float[Tensor, "sample *view 3 height width"], truth: Float[Tensor, "*view 3 height width"]
 ) -> tuple[PerPixel, PerPixel]:
-    """Variance over the samples (unbiased) and squared error of their mean, each a mean over the three channels.
-
-    `ValueError`: fewer than two samples.
-    """
+    """Return the samples' variance (unbiased) and the squared error of their mean, averaged over the channels."""
     if len(samples) < 2:
         raise ValueError("needs two samples")
     return samples.var(dim=0).mean(-3), (samples.mean(dim=0) - truth).square().mean(-3)
@@ -109,7 +107,7 @@ def spread_and_error(
 def bin_sums(
     variance: PerPixel, squared_error: PerPixel, region: Bool[Tensor, "*view height width"]
 ) -> Float[Tensor, "bin 3"]:
-    """Number of pixels, sum of variances and sum of squared errors of the region's pixels, by bin of variance.
+    """Return number of pixels, sum of variances and sum of squared errors of the region's pixels, by bin of variance.
 
     Sums of several scenes may be added. The bins are bounded by `EDGES`, open at both ends.
     """
@@ -120,7 +118,7 @@ def bin_sums(
 
 
 def curve(sums: Float[Tensor, "bin 3"]) -> dict[str, Any]:
-    """Means over all pixels and over those of each bin that has any; None where there are no pixels at all."""
+    """Return the means over all pixels and over those of each non-empty bin; None if there are no pixels at all."""
     count, variance, error = sums.sum(0).tolist()
     return {
         "pixels": int(count),

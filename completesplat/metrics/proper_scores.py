@@ -1,9 +1,9 @@
-"""Scores that nobody improves by adding noise, and that only the true distribution minimises.
+"""Proper scores of samples: only the true distribution minimises them, so adding noise does not help.
 
-Best of k rewards spread of any kind. The energy score and the CRPS are strictly proper (Gneiting and Raftery 2007); the
-fair forms here (Ferro 2014) are unbiased in the number of samples, so that results with different numbers compare. Of
-K equally probable forms at mutual distance D, draws of the truth score (1 - 1/K) D / 2, their mean
-sqrt((K - 1) / 2K) D, and one of them always (1 - 1/K) D.
+Best of k rewards any spread. The energy score and the CRPS are strictly proper (Gneiting and Raftery 2007). The fair
+forms here (Ferro 2014) are unbiased in the number of samples, so results with different numbers compare. For K equally
+probable modes at mutual distance D, draws from the truth score (1 - 1/K) D / 2, the modes' mean scores
+sqrt((K - 1) / 2K) D, and one mode drawn every time scores (1 - 1/K) D.
 """
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 
 def energy_score(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
-    """E |x - y| - E |x - x'| / 2 for two samples x, x', with distances as root mean squares over the values."""
+    """Return E |x - y| - E |x - x'| / 2 for samples x, x' and truth y; distances are root mean squares of values."""
     count, size = samples.shape
     spread = torch.pdist(samples.double()).sum() * 2 / (count * (count - 1))
     error = torch.linalg.vector_norm(samples.double() - truth.double(), dim=1).mean()
@@ -20,18 +20,18 @@ def energy_score(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " 
 
 
 def crps(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> float:
-    """Continuous ranked probability score of each value by itself, averaged over the values."""
+    """Return the continuous ranked probability score of each single value, averaged over the values."""
     count = len(samples)
-    # The sum of |x - x'| over all pairs, from the values in order.
+    # The sum of |x - x'| over all pairs, from the sorted values.
     weights = 2 * torch.arange(count, device=samples.device) - count + 1
     pairs = (samples.double().sort(0).values * weights[:, None]).sum(0) / (count * (count - 1))
     return float(((samples.double() - truth.double()).abs().mean(0) - pairs).mean())
 
 
 def rank_histogram(samples: Float[Tensor, "sample value"], truth: Float[Tensor, " value"]) -> Float[Tensor, " rank"]:
-    """Shares of values whose truth has 0, 1, ... of the samples below it: flat if they are of one distribution.
+    """Return the shares of values whose truth exceeds 0, 1, ... samples; flat if both have one distribution.
 
-    A truth that equals some samples is shared among the ranks that it could have.
+    A truth that equals some samples counts in equal parts for all ranks that it could have.
     """
     ranks = torch.arange(len(samples) + 1, device=samples.device)[:, None]
     below = (samples < truth).sum(0)

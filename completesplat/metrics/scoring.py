@@ -1,4 +1,4 @@
-"""The protocol: per image, averaged over the views of a scene, then over scenes; several samples; errors of depth."""
+"""Evaluation protocol: scores per image, averaged over a scene's views, then over scenes; samples; depth errors."""
 
 import zlib
 from collections import defaultdict
@@ -29,21 +29,21 @@ BEST_RULES = {
     BEST: "of each region one sample for all metrics: that with the best `criterion` there, in novel views",
     BEST_BY_METRIC: "of each region and metric another sample: the best by it, in novel views; no metrics of sets",
 }
-"""Which sample the scores of a row are of; the paper does not say which one is the best."""
+"""Rules by which rows choose the best sample; the paper states none."""
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips": False}
 
 
 class Evaluation:
-    """Collects the scores of several predictors over a test set.
+    """Scores of several predictors over a test set.
 
-    For each predictor: all pixels (`full`) and true object pixels (`object`), for the reference view and the novel
-    views apart, by every metric (CO3D protocol, paper Section 4 and supplement). A scene counts once, whichever
-    process of several scored it.
+    Every metric scores each predictor on all pixels (`full`) and on true object pixels (`object`), for the reference
+    view and the novel views apart (CO3D protocol, paper Section 4 and supplement). A scene counts once, even if
+    several processes scored it.
 
     Args:
-        samples: drawn of each scene. With more than one there are further rows: `model` (the first sample), two oracles
+        samples: number of samples per scene. With more than one, the rows are `model` (the first sample), two oracles
             (`best_of_k`, `best_of_k_by_metric`; see `BEST_RULES`) and `mean_of_k`.
-        seed: of what is drawn; each scene has its own, which depends on its name only besides.
+        seed: seed of the samples; a scene's seed depends on this one and on the scene's name only.
         perceptual: LPIPS, or why it is missing.
         sets: metrics of whole sets of novel views by name, or why they are missing.
     """
@@ -59,16 +59,16 @@ class Evaluation:
         self.metrics: dict[str, ImageMetric] = {"psnr": psnr, "ssim": ssim}
         if perceptual is not None and not isinstance(perceptual, Missing):
             self.metrics["lpips"] = perceptual
-        given = list((sets or {}).values())
-        absent = [metric for metric in (perceptual, *given) if isinstance(metric, Missing)]
+        candidates = list((sets or {}).values())
+        absent = [metric for metric in (perceptual, *candidates) if isinstance(metric, Missing)]
         self.missing = {name: str(metric) for metric in absent for name in metric.names}
         if samples < 1:
             raise CompleteSplatError(f"evaluation.scoring.samples={samples}: must be at least 1")
         if criterion not in self.metrics:
-            said = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
-            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {said}")
+            message = self.missing.get(criterion, f"choose one of {', '.join(self.metrics)}")
+            raise CompleteSplatError(f"evaluation.scoring.criterion={criterion}: {message}")
         self.samples, self.criterion, self.seed = samples, criterion, seed
-        self.set_metrics = [one for one in given if one is not None and not isinstance(one, Missing)]
+        self.set_metrics = [metric for metric in candidates if metric is not None and not isinstance(metric, Missing)]
         self.reset()
 
     def reset(self) -> None:
@@ -80,7 +80,7 @@ class Evaluation:
         self.skipped: set[str] = set()  # names of scenes that could not be read
 
     def scene_seed(self, name: str) -> int:
-        """What is drawn for a scene: the same whichever scenes come before it."""
+        """Return the seed of a scene's samples, which does not depend on the scenes before it."""
         return zlib.crc32(f"{self.seed} {name}".encode())
 
     @torch.no_grad()
@@ -88,12 +88,12 @@ class Evaluation:
         """Score images predicted for the reference (first view) and all targets; they are clipped to [0, 1]."""
         truth = scenes.all_views()
         for b, name in enumerate(scenes.names):
-            shown = images[b].clamp(0, 1)
-            self._add(predictor, name, self.score(shown, truth[b]), dict.fromkeys(REGIONS, shown), truth[b])
+            clipped = images[b].clamp(0, 1)
+            self._add(predictor, name, self.score(clipped, truth[b]), dict.fromkeys(REGIONS, clipped), truth[b])
 
     @torch.no_grad()
     def update_samples(self, name: str, images: Float[Tensor, "sample view 3 height width"], truth: Views) -> None:
-        """Score all samples of one scene: their first, the best ones (`BEST_RULES`) and their mean."""
+        """Add the scores of one scene's samples: of the first, of the best ones (`BEST_RULES`), and their mean."""
         images = images.clamp(0, 1)
         each = [self.score(sample, truth) for sample in images]
         self._add(MODEL, name, each[0], dict.fromkeys(REGIONS, images[0]), truth)
@@ -113,18 +113,18 @@ class Evaluation:
         self.scores[MODEL][name] |= proper
         with torch.autocast(images.device.type, enabled=False):
             noisy = noisy_mean(images.float(), self.scene_seed(name))[:, 1:]
-            by_noise = [self.metrics[self.criterion](one, truth.images[1:]).mean().item() for one in noisy]
+            by_noise = [self.metrics[self.criterion](noise, truth.images[1:]).mean().item() for noise in noisy]
         by, higher = [scores["full", "novel", self.criterion] for scores in each], HIGHER_IS_BETTER[self.criterion]
         curves = {"curve": expected_best_curve(by, higher), "curve_noisy_mean": expected_best_curve(by_noise, higher)}
         self.drawn[name] = {**curves, "diversity": diversity(images[:, 1:]), "ranks": ranks}
 
     def score(self, images: Float[Tensor, "view 3 height width"], truth: Views) -> Scores:
-        """One prediction of one scene, values in [0, 1]: means over the novel views."""
+        """Score one prediction (values in [0, 1]) of one scene, with means over the novel views."""
         scores: Scores = {}
         for region in REGIONS:
             predicted, true = _region(images, truth, region), _region(truth.images, truth, region)
             for name, metric in self.metrics.items():
-                with torch.autocast(images.device.type, enabled=False):  # whatever networks compute in
+                with torch.autocast(images.device.type, enabled=False):  # metrics compute in float32
                     values = metric(predicted.float(), true)
                 scores[region, "reference", name] = values[0].item()
                 scores[region, "novel", name] = values[1:].mean().item()
@@ -132,22 +132,22 @@ class Evaluation:
 
     @torch.no_grad()
     def update_depth(self, name: str, predicted: Float[Tensor, "view 1 height width"], true: Views) -> None:
-        """Errors of the model's depth (its first sample's): `depth_abs_rel` and the others of `depth_errors`."""
+        """Add errors of the depth of the model's first sample: `depth_abs_rel` and the others of `depth_errors`."""
         assert true.depths is not None
         for region in REGIONS:
             counted = true.masks > 0.5 if region == "object" else torch.ones_like(true.masks, dtype=torch.bool)
             errors = depth_errors(predicted, true.depths.to(predicted), counted)
             for kind, views in (("reference", errors[:1]), ("novel", errors[1:])):
-                known = [found for found in views if found is not None]
+                known = [view for view in views if view is not None]
                 for metric in known[0] if known else ():
-                    mean = sum(found[metric] for found in known) / len(known)
+                    mean = sum(view[metric] for view in known) / len(known)
                     self.scores[MODEL][name][region, kind, f"depth_{metric}"] = mean
 
     def _add(self, predictor: str, name: str, scores: Scores, images: Mapping[str, Tensor], truth: Views) -> None:
-        """Keep the scores of a scene, and what set metrics need of the images [view 3 height width] of each region."""
+        """Keep a scene's scores, and describe its images [view 3 height width] in each region for set metrics."""
         self.scores[predictor][name] = scores
         self.views[name] = len(truth.images) - 1
-        # Where metrics look is no matter of chance: pictures alone have the same scores in every run.
+        # Seeds depend on names only, so that the same images have the same scores in every run.
         seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(truth.images))]
         for region in REGIONS:
             for owner, pictures in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
@@ -155,10 +155,10 @@ class Evaluation:
                     self.sets.add(owner, region, name, _region(pictures.float(), truth, region)[1:], seeds)
 
     def gather(self) -> None:
-        """Know what all processes scored; each of them must call it."""
-        own = self.scores, self.views, self.drawn, self.sets.kept, self.skipped
+        """Merge the scores of all processes; each of them must call this."""
+        local = self.scores, self.views, self.drawn, self.sets.kept, self.skipped
         self.reset()
-        for scores, views, drawn, sets, skipped in gathered(own):
+        for scores, views, drawn, sets, skipped in gathered(local):
             for predictor, scenes in scores.items():
                 self.scores[predictor] |= scenes
             self.views |= views
@@ -167,7 +167,7 @@ class Evaluation:
             self.skipped |= skipped
 
     def results(self) -> dict[str, Any]:
-        """{predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": novel views in all}}."""
+        """Return {predictor: {region: {view: {metric: mean over scenes}}, "scenes": n, "views": n of novel views}}."""
         results: dict[str, Any] = {}
         for predictor, scenes in self.scores.items():
             names = sorted(scenes)
@@ -197,9 +197,9 @@ def _means(rows: Sequence[Sequence[float]]) -> list[float]:
 def noisy_mean(
     images: Float[Tensor, "sample view 3 height width"], seed: int
 ) -> Float[Tensor, "sample view 3 height width"]:
-    """As many pictures that differ as much from each other, but by white noise: the samples' mean with noise on it.
+    """Return as many images: the samples' mean plus white noise of the same variance as the samples.
 
-    What the best of k gains by this is no merit of what was drawn.
+    Best of k gains from this noise too, so a gain of that size does not speak for the samples.
     """
     noise = torch.randn(images.shape, generator=torch.Generator().manual_seed(seed)).to(images)
     return (images.mean(0) + images.var(0).mean().sqrt() * noise).clamp(0, 1)
@@ -208,9 +208,9 @@ def noisy_mean(
 def proper_scores(
     images: Float[Tensor, "sample view 3 height width"], truth: Views
 ) -> tuple[Scores, dict[str, list[float]]]:
-    """`energy` and `crps` of the novel views, and their rank histograms by region.
+    """Return `energy` and `crps` of the novel views, and their rank histograms by region.
 
-    Of all pixels (`full`), and of those whose surface the reference does not show (`hidden`), where true depth tells.
+    Regions are all pixels (`full`) and, if true depth is known, those whose surface the reference hides (`hidden`).
 
     Args:
         truth: all views, the reference first.
@@ -237,15 +237,15 @@ def _region(images: Tensor, truth: Views, region: str) -> Tensor:
 def depth_errors(
     predicted: Depths, true: Depths, valid: Bool[Tensor, "image 1 height width"]
 ) -> list[dict[str, float] | None]:
-    """For each image, over its valid pixels whose true depth is finite and above 0, without alignment of scale.
+    """Return each image's errors over valid pixels with finite, positive true depth, without aligning the scale.
 
     `abs_rel`: mean of |predicted - true| / true; `rmse`: in the depth's unit; `delta1`: share of pixels where
     predicted / true and true / predicted are less than 1.25 (Eigen et al. 2014, Section 4.2). None for an image
-    without such a pixel. `predicted` is 0 where nothing is predicted.
+    without any of these pixels. `predicted` is 0 where nothing is predicted.
     """
     errors: list[dict[str, float] | None] = []
-    for own, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
-        p, t = own[counted], depth[counted]
+    for estimate, depth, counted in zip(predicted, true, valid & true.isfinite() & (true > 0), strict=True):
+        p, t = estimate[counted], depth[counted]
         ratio, difference = torch.maximum(p / t, t / p), p - t
         measured = {
             "abs_rel": (difference.abs() / t).mean().item(),
@@ -257,15 +257,17 @@ def depth_errors(
 
 
 def best(scores: Sequence[float], higher_is_better: bool = True) -> int:
-    """The index of the best sample, the first of equals. `ValueError`: there is no score, or one is no number."""
+    """Return the index of the best sample, the first of equals."""
     return scores.index(_worst_first(scores, higher_is_better)[-1])
 
 
 def expected_best_curve(scores: Sequence[float], higher_is_better: bool = True) -> list[float]:
-    """Entry j - 1 is the mean, over all choices of j of the k samples, of the best score among the j.
+    """Return a list whose entry j - 1 is the mean, over all choices of j of the k samples, of the best score.
 
-    Of k scores from worst to best, the i-th is the best of C(i - 1, j - 1) of the C(k, j) choices. `ValueError`: there
-    is no score, or one is no number.
+    Of k scores from worst to best, the i-th is the best of C(i - 1, j - 1) of the C(k, j) choices.
+
+    Raises:
+        ValueError: there are no scores, or one is not a number.
     """
     worst_first, k = _worst_first(scores, higher_is_better), len(scores)
     return [sum(comb(i, j) * score for i, score in enumerate(worst_first)) / comb(k, j + 1) for j in range(k)]
@@ -278,11 +280,8 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
 
 
 def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
-    """Root mean square difference of two samples' renders, mean over all pairs of samples and all views.
-
-    `ValueError`: less than two samples.
-    """
+    """Return the root mean square difference of two samples' renders, averaged over all pairs and views."""
     if len(images) < 2:
         raise ValueError("needs two samples")
-    differences = [(one - other).square().mean((1, 2, 3)).sqrt() for one, other in combinations(images, 2)]
+    differences = [(a - b).square().mean((1, 2, 3)).sqrt() for a, b in combinations(images, 2)]
     return torch.stack(differences).mean().item()

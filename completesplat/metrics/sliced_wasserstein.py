@@ -1,8 +1,8 @@
-"""Sliced Wasserstein distance between two sets of images, level by level of a Laplacian pyramid; needs no weights.
+"""Sliced Wasserstein distance of two image sets on the levels of a Laplacian pyramid; it needs no weights.
 
 Karras et al. 2018, "Progressive Growing of GANs", Section 5: patches of 7 x 7 pixels from every level down to 16
-pixels, 128 an image and level, each channel normalised to mean 0 and deviation 1 over its set, 512 projections (four
-times 128 in their `metrics/sliced_wasserstein.py`).
+pixels, 128 per image and level, each channel normalised to mean 0 and standard deviation 1 over its set, 512
+projections (four times 128 in their `metrics/sliced_wasserstein.py`).
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,11 @@ Items = Float[Tensor, "item feature"]
 PATCH = 7
 SMALLEST_SIDE = 16
 PROJECTIONS, REPEATS = 128, 4
-SMALLEST_DEVIATION = 1e-4  # A fortieth of a step of 8 bits: less is rounding, and is not scaled up
+SMALLEST_DEVIATION = 1e-4  # 1/40 of an 8-bit step: less is rounding and is not scaled up
 
 
 def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image 3 _ _"]]:
-    """Burt and Adelson's pyramid, full resolution first, each level half the one before, the last a small image.
-
-    `ValueError`: the images are smaller than 16 pixels.
-    """
+    """Return Burt and Adelson's pyramid: full resolution first, then halved levels, a small image last."""
     if min(images.shape[-2:]) < SMALLEST_SIDE:
         raise ValueError(f"needs images of at least {SMALLEST_SIDE} pixels")
     levels = []
@@ -35,7 +32,7 @@ def laplacian_pyramid(images: Float[Tensor, "image 3 height width"]) -> list[Flo
 
 
 def expand(images: Float[Tensor, "image 3 _ _"], size: Sequence[int]) -> Float[Tensor, "image 3 _ _"]:
-    """Images of twice the size (height and width, given because either may be odd)."""
+    """Double images to `size` (height and width, which must be stated because either may be odd)."""
     spread = images.new_zeros(*images.shape[:2], *size)
     spread[..., ::2, ::2] = images
     return 4 * _blur(spread)
@@ -50,11 +47,13 @@ def _blur(images: Float[Tensor, "image 3 height width"]) -> Float[Tensor, "image
 def descriptors(
     images: Float[Tensor, "image 3 height width"], seeds: Sequence[int], patches: int = 128
 ) -> list[Float[Tensor, "descriptor 147"]]:
-    """Patches of each level of the pyramid, not yet normalised; those of all images of a set are concatenated.
+    """Return patches of each pyramid level, not yet normalised; a level's patches of all images are one tensor.
 
-    An image's patches depend on itself and its seed only, so a set may be described in parts, by several processes. A
-    prediction and its truth share their seeds. `ValueError`: the images are smaller than 16 pixels, or another number
-    of seeds.
+    An image's patches depend on the image and its seed only, so several processes may describe parts of a set. A
+    prediction and its truth share their seeds.
+
+    Raises:
+        ValueError: the images are smaller than 16 pixels, or there is not one seed per image.
     """
     if len(seeds) != len(images):
         raise ValueError(f"{len(images)} images need as many seeds, not {len(seeds)}")
@@ -65,37 +64,36 @@ def descriptors(
         windows = level.unfold(2, PATCH, 1).unfold(3, PATCH, 1)
         # Top and left of each patch: [2 image patch].
         places = [[torch.randint(n, (patches,), generator=g) for g in generators] for n in windows.shape[2:4]]
-        top, left = (torch.stack(one).to(images.device) for one in places)
+        top, left = (torch.stack(offsets).to(images.device) for offsets in places)
         described.append(windows[rows, :, top, left].flatten(0, 1).flatten(1))
     return described
 
 
 def sliced_wasserstein(first: Sequence[Float[Tensor, "_ 147"]], second: Sequence[Float[Tensor, "_ 147"]]) -> float:
-    """Mean over the levels of two sets' descriptors, multiplied by 1000 as in the paper's tables.
+    """Return the mean distance over the levels of two sets' descriptors, times 1000 as in the paper's tables.
 
-    Blind to brightness and contrast, which the normalisation of each set removes. The projections are always the same.
-    `ValueError`: sets of different sizes.
+    It ignores brightness and contrast, because each set is normalised. The projections are always the same.
     """
     if [len(level) for level in first] != [len(level) for level in second]:
         raise ValueError("needs two sets of one size")
     generator = torch.Generator().manual_seed(0)
     distances = []
-    for one, other in zip(first, second, strict=True):
-        sets = _normalized(one), _normalized(other)
+    for a, b in zip(first, second, strict=True):
+        sets = _normalized(a), _normalized(b)
         distances += [projected_distance(*sets, PROJECTIONS, generator) for _ in range(REPEATS)]
     return 1000 * torch.stack(distances).mean().item()
 
 
 def projected_distance(first: Items, second: Items, projections: int, generator: torch.Generator) -> Float[Tensor, ""]:
-    """1-Wasserstein distance of two sets of one size on a line, mean over random directions (Rabin et al. 2011)."""
+    """Return the 1-Wasserstein distance of equal-sized sets on a line, mean over directions (Rabin et al. 2011)."""
     directions = torch.randn(projections, first.shape[1], generator=generator)
     directions = (directions / directions.norm(dim=1, keepdim=True)).to(first)
-    one, other = ((directions @ x.T).sort(1).values for x in (first, second))
-    return torch.mean((one - other).abs())
+    a, b = ((directions @ x.T).sort(1).values for x in (first, second))
+    return torch.mean((a - b).abs())
 
 
 def _normalized(patches: Float[Tensor, "descriptor 147"]) -> Float[Tensor, "descriptor 147"]:
-    """Each channel less its mean, over its deviation."""
+    """Subtract each channel's mean and divide by its standard deviation."""
     channels = patches.reshape(-1, 3, PATCH * PATCH)
     deviation, mean = torch.std_mean(channels, dim=(0, 2), correction=0, keepdim=True)
     return torch.flatten((channels - mean) / deviation.clamp(min=SMALLEST_DEVIATION), 1)

@@ -1,4 +1,4 @@
-"""Swappable rasterizers: what every one takes and gives, and one file per backend.
+"""Swappable rasterizers: their interface and shared constants; each backend has a file.
 
 Every backend computes the same function, with gsplat's conventions: alpha = min(max_alpha, opacity * exp(-sigma)),
 composited from front to back, with the constants of one shared config.
@@ -20,11 +20,11 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class RenderingConstants:
-    """The constants on which all backends agree; by default those of the installed gsplat (`gsplat_constants`).
+    """Constants on which all backends agree; by default those of the installed gsplat (`gsplat_constants`).
 
     Attributes:
         blur: added to the diagonal of the projected covariance, in px^2.
-        near_plane: Gaussians whose centre is not further than this are culled, in world units.
+        near_plane: Gaussians whose centre is at this depth or nearer are culled, in world units.
         max_alpha: clamp on a Gaussian's alpha at a pixel (0.999 in gsplat 1.5.3, 0.99 in 1.6).
         min_alpha: contributions below it are skipped.
         min_transmittance: a pixel stops before the Gaussian that would bring its transmittance to this or less.
@@ -42,7 +42,7 @@ class RenderingConstants:
 
 @dataclass(frozen=True)
 class Rendering(TensorDataclass):
-    """Rendered views [batch view] before a background: sums weighted by each Gaussian's contribution.
+    """Rendered views [batch view] without a background: sums weighted by each Gaussian's contribution.
 
     `depth` is the accumulated depth (gsplat's "D"): divide by alpha for the expected depth.
     """
@@ -54,26 +54,26 @@ class Rendering(TensorDataclass):
     def over(
         self, background: Float[Tensor, "*#batch 3 #height #width"] | float
     ) -> Float[Tensor, "*batch 3 height width"]:
-        """The image in front of a background colour or picture."""
+        """Composite the rendering over a background colour or image."""
         return self.color + (1 - self.alpha) * background
 
     def expected_depth(self) -> Float[Tensor, "*batch 1 height width"]:
-        """Mean depth of what is seen at a pixel; 0 where nothing is."""
+        """Return the mean depth of what a pixel shows; 0 where it shows nothing."""
         return self.depth / self.alpha.clamp(min=1e-10)
 
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """Renders a batch of scenes, each from several cameras."""
+    """Function that renders a batch of scenes, each from several cameras."""
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Gaussians of batch shape [batch], cameras of batch shape [batch view]."""
+        """Render Gaussians of batch shape [batch] from cameras of batch shape [batch view]."""
 
 
 def require_float32(name: str, gaussians: Gaussians, cameras: Cameras, device: torch.device) -> None:
-    """Refuse, for the rasterizer of this name, tensors of another dtype or device with a `CompleteSplatError`."""
+    """Check that all tensors are float32 and on this device; the error names the rasterizer."""
     tensors = vars(gaussians) | {"world_to_camera": cameras.world_to_camera, "intrinsics": cameras.intrinsics}
     for key, tensor in tensors.items():
         if tensor.dtype != torch.float32 or tensor.device != device:
-            found = f"{key} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
-            raise CompleteSplatError(f"the {name} rasterizer takes float32 tensors on {device}, but {found}")
+            message = f"{key} is {str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
+            raise CompleteSplatError(f"the {name} rasterizer takes float32 tensors on {device}, but {message}")

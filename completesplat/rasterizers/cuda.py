@@ -1,4 +1,4 @@
-"""The GPU backend: an adapter onto gsplat, imported only when a rasterizer is made."""
+"""GPU backend: an adapter for gsplat, which is imported only when a rasterizer is made."""
 
 import math
 from dataclasses import replace
@@ -19,29 +19,29 @@ from completesplat.rasterizers.reference import LARGEST_PROJECTION
 
 DEVICE = "cuda"
 WARP = 32
-# Further away the reciprocal of the cubed depth, a factor of gsplat's gradients, is below float32; further still, at
-# 1e17, gradients become NaN where the depth image has one, because coordinates are multiplied before they are divided.
+# Beyond this depth, the reciprocal of the cubed depth, a factor of gsplat's gradients, underflows float32. At 1e17,
+# gradients through the depth image become NaN, because gsplat multiplies coordinates before it divides them.
 FARTHEST = 1e12
 SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
 FRUSTUM_MARGIN = 0.3  # in gsplat's `Utils.cuh`
 
 
 class CudaRasterizer:
-    """The same function as `ReferenceRasterizer`, by gsplat's kernels, for float32 tensors.
+    """GPU rasterizer that computes the function of `ReferenceRasterizer` by gsplat's kernels, for float32 tensors.
 
     Gradients reach all parameters of the Gaussians and the poses of the cameras, not the intrinsics. Their last bits
-    change from run to run (sums in no fixed order). Four things differ from the reference:
+    change from run to run, because sums have no fixed order. Four things differ from the reference:
 
-    - gsplat takes one opacity for all views of a scene. A Gaussian whose projection may overflow in a view before
-      whose near plane it lies is therefore left out of all views of that scene.
+    - gsplat takes one opacity for all views of a scene. If a Gaussian's projection may overflow in a view that does
+      not cull it at the near plane, the Gaussian is therefore left out of all views of that scene.
     - Gaussians further away than 1e12 are not drawn.
     - An opacity above 1 is cut off at 3.33 standard deviations.
-    - gsplat takes the determinant of the projected covariance as a difference in float32. It is lost to rounding for
-      thin Gaussians with a standard deviation over 1000 px, which can then be missing, too thin or too wide.
+    - gsplat takes the determinant of the projected covariance as a difference in float32. Rounding
+      loses it for thin Gaussians with a standard deviation over 1000 px, which can be missing, too thin or too wide.
 
     Raises:
         CompleteSplatError: no gsplat, no CUDA device, or constants other than those compiled into gsplat; on a call,
-            tensors of another dtype or on several devices, intrinsics that require a gradient.
+            tensors of another dtype or on several devices, or intrinsics that require a gradient.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -62,7 +62,7 @@ class CudaRasterizer:
         if not (self.constants.blur >= SMALLEST_BLUR and self.constants.near_plane >= SMALLEST_NEAR_PLANE):
             least = f"a blur of at least {SMALLEST_BLUR} px^2 and a near_plane of at least {SMALLEST_NEAR_PLANE}"
             raise CompleteSplatError(f"the cuda rasterizer needs {least}")
-        # gsplat culls what is nearer than its near plane, the reference what is not further.
+        # gsplat culls depths below its near plane, the reference also those equal to it.
         self._near_plane = float(np.nextafter(np.float32(self.constants.near_plane), np.float32(np.inf)))
         self._rasterization = gsplat.rasterization
 
@@ -83,8 +83,8 @@ class CudaRasterizer:
             near_plane=self._near_plane,
             far_plane=FARTHEST,
             eps2d=self.constants.blur,
-            # Nearly every Gaussian is seen in every view, so that there is little to gain; and the packed kernels can
-            # add the gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
+            # Packing gains little, because views see nearly every Gaussian; and gsplat's packed kernels can add
+            # the gradients of one scene to another's (https://github.com/nerfstudio-project/gsplat/pull/1059).
             packed=False,
             render_mode="RGB+D",
             rasterize_mode="classic",
@@ -95,9 +95,9 @@ class CudaRasterizer:
 
 @torch.no_grad()
 def drawable(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> Bool[Tensor, "batch gaussian"]:
-    """Which Gaussians gsplat may see: finite ones whose extent overflows in no view that can show them.
+    """Return a mask of the Gaussians that gsplat may see: finite ones that overflow in no view that can show them.
 
-    It culls by itself what is too transparent, or so far aside that only its centre overflows. Up to
+    gsplat itself culls those that are too transparent, or so far aside that only their centre overflows. Up to
     LARGEST_PROJECTION, radii fit its int32, and products of two variances have a reciprocal in fast arithmetic.
     """
     depths = transform_points(cameras.world_to_camera, gaussians.means[:, None])[..., 2]
@@ -108,7 +108,7 @@ def drawable(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstan
 
 
 def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Tensor, "batch view"]:
-    """Upper bound of the standard deviation (px) of a Gaussian of unit scale at unit depth, in x and y.
+    """Return an upper bound of the standard deviation (px, in x and y) of a Gaussian of unit scale at unit depth.
 
     A row of the Jacobian is (f, -f * slope) / depth, and the slope is limited to the frustum with its margin.
     """
@@ -121,12 +121,12 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
 
 
 def prepare(gaussians: Gaussians, kept: Bool[Tensor, "batch gaussian"]) -> Gaussians:
-    """Gaussians with which gsplat can do no harm: unit quaternions, and zeros for those that are not kept.
+    """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those that are not kept.
 
-    Zero opacity keeps a Gaussian out of the image; zeros instead of its values keep NaN out of the gradients.
-    Their number is filled up to a multiple of 32, and at least to that, because gsplat fails (a division by zero in
-    `ProjectionEWA3DGSFused.cu`) when there is none, and because the backward pass there sums over the lanes of a warp
-    that agree in the index of the Gaussian or the view, whatever their scene: no warp may reach into a second scene.
+    Zero opacity keeps a Gaussian out of the image; zeros for its other values keep NaN out of the gradients. The
+    number of Gaussians is padded to a multiple of 32, at least 32, for two reasons. gsplat fails without Gaussians (a
+    division by zero in `ProjectionEWA3DGSFused.cu`). And its backward pass sums over the lanes of a warp that agree in
+    the index of the Gaussian or the view, whatever their scene, so no warp may reach into a second scene.
     """
     missing = max(WARP - gaussians.count, -gaussians.count % WARP)
 
@@ -135,6 +135,6 @@ def prepare(gaussians: Gaussians, kept: Bool[Tensor, "batch gaussian"]) -> Gauss
         return pad(values, (*[0, 0] * (tensor.ndim - kept.ndim), 0, missing))
 
     cleaned = gaussians.map(clean)
-    # Brought to at most unit size first: the square of a long quaternion overflows.
+    # Scale components to at most 1 first, because the square of a long quaternion overflows.
     size = cleaned.quaternions.detach().abs().amax(-1, keepdim=True).clamp(min=1)
     return replace(cleaned, quaternions=normalize_quaternion(cleaned.quaternions / size))

@@ -1,4 +1,4 @@
-"""Gaussians whose colours change with the direction from which they are seen, and how any rasterizer draws them."""
+"""Gaussians whose colours change with the viewing direction, and a wrapper by which any rasterizer draws them."""
 
 from dataclasses import dataclass
 
@@ -13,30 +13,30 @@ from completesplat.rasterizers import Rasterizer, Rendering
 
 @dataclass(frozen=True)
 class DirectionalGaussians(Gaussians):
-    """Gaussians with spherical harmonics of degree 1, for what others publish: this package's own have one colour.
+    """Gaussians with spherical harmonics of degree 1, for models by others; this package's have one colour.
 
-    Seen along a unit vector d, in the Gaussians' frame, the colour is max(0, mean_colors + d @ slopes). Whoever knows
-    one colour only (files, viewers) takes `colors`.
+    Seen along a unit vector d in the Gaussians' frame, their colour is max(0, mean_colors + d @ slopes).
+    Files and viewers, which hold one colour only, use `colors`.
     """
 
     mean_colors: Float[Tensor, "*batch gaussian 3"]
     slopes: Float[Tensor, "*batch gaussian 3 3"]
 
     def seen_from(self, centers: Float[Tensor, "*batch 3"]) -> Gaussians:
-        """With the colours that these points see."""
+        """Return the Gaussians with the colours that these points see."""
         directions = torch.nn.functional.normalize(self.means - centers[..., None, :], dim=-1)
         colors = self.mean_colors + (directions[..., None, :] @ self.slopes).squeeze(-2)
         return Gaussians(self.means, self.quaternions, self.scales, self.opacities, colors.clamp(min=0))
 
     def transform(self, matrix: Float[Tensor, "*#batch 4 4"]) -> "DirectionalGaussians":
-        """As `Gaussians.transform`; what changes the colours is turned, too."""
+        """Move the Gaussians as `Gaussians.transform` does, and rotate the slopes of their colours."""
         moved = super().transform(matrix)
         slopes = matrix[..., None, :3, :3] @ self.slopes
         return DirectionalGaussians(**{**vars(moved), "slopes": slopes})
 
 
 class DirectionalRasterizer:
-    """Another rasterizer, which is given `DirectionalGaussians` in the colours that each camera sees."""
+    """Wrapper that gives another rasterizer `DirectionalGaussians` in the colours that each camera sees."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self.rasterizer = rasterizer

@@ -1,4 +1,4 @@
-"""The definition: dense, differentiable, in plain torch and in any floating dtype."""
+"""Reference backend, which defines the others: dense, differentiable, in plain torch and any floating dtype."""
 
 import torch
 from jaxtyping import Float
@@ -12,15 +12,15 @@ from completesplat.tensors import stack
 
 # In px and px^2. Products of two such numbers are still finite in float32.
 LARGEST_PROJECTION = 1e15
-PAIRS_AT_ONCE = 2**20  # of a Gaussian and a pixel; a few MB for each intermediate result, which stays in the cache
+PAIRS_AT_ONCE = 2**20  # Gaussian-pixel pairs; intermediate results of a few MB each stay in the cache
 
 
 class ReferenceRasterizer:
-    """Every Gaussian against every pixel. Time grows with their product: for tests and small scenes.
+    """Rasterizer that evaluates every Gaussian at every pixel, which suits tests and small scenes only.
 
     Gradients reach all parameters of the Gaussians and the cameras. Gaussians that are culled, not finite, or so
-    large or far aside that their projection overflows take no part at all: they are left out before anything is
-    computed, so their gradients are zero, never NaN.
+    large or far aside that their projection overflows are left out before anything is computed, so their
+    gradients are zero, never NaN.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -40,10 +40,10 @@ class ReferenceRasterizer:
     def at_pixels(
         self, gaussians: Gaussians, camera: Cameras, pixels: Float[Tensor, "pixel 2"]
     ) -> Float[Tensor, "pixel 5"]:
-        """Red, green, blue, depth and alpha of one scene seen by one camera, at these pixel coordinates.
+        """Return red, green, blue, depth and alpha of one scene seen by one camera, at these pixel coordinates.
 
-        Intermediate results are computed again in the backward pass rather than kept: memory does not grow with the
-        number of pixels, and what fits into the cache is computed twice sooner than read from memory once.
+        The backward pass computes intermediate results again. Memory thus does not grow with the number of pixels, and
+        computing results twice in the cache is faster than reading them from memory once.
         """
         visible, depth_order = visible_in_depth_order(gaussians, camera, self.constants)
         chosen = gaussians[visible][depth_order]
@@ -61,10 +61,10 @@ class ReferenceRasterizer:
 def visible_in_depth_order(
     gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
 ) -> tuple[Tensor, Tensor]:
-    """Mask of the Gaussians that can be drawn, and the order of those by depth (ties keep their order)."""
+    """Return a mask of the Gaussians that can be drawn, and the order of those by depth (ties keep their order)."""
     with torch.no_grad():
         centers, depths, covariances = project_gaussians(gaussians, camera, constants)
-    # Comparisons with NaN are false, so that whatever the projection made of bad values is left out here.
+    # Comparisons with NaN are false, so Gaussians whose bad values the projection turned into NaN are left out.
     drawable = (depths > constants.near_plane) & depths.isfinite() & (gaussians.opacities >= constants.min_alpha)
     bounded = torch.cat([centers, covariances.flatten(-2)], dim=-1).abs().le(LARGEST_PROJECTION).all(-1)
     visible = gaussians.finite() & drawable & bounded
@@ -74,7 +74,7 @@ def visible_in_depth_order(
 def project_gaussians(
     gaussians: Gaussians, camera: Cameras, constants: RenderingConstants
 ) -> tuple[Float[Tensor, "gaussian 2"], Float[Tensor, " gaussian"], Float[Tensor, "gaussian 2 2"]]:
-    """Centres (px), depths and 2D covariances (px^2) of Gaussians in front of one camera.
+    """Return centres (px), depths and 2D covariances (px^2) of Gaussians in front of one camera.
 
     The covariance is J W Sigma W^T J^T (Zwicker et al., "EWA splatting", 2001, Eq. 31) plus the blur.
     """
@@ -105,7 +105,7 @@ def alphas_at(
     pixels: Float[Tensor, "pixel 2"], centers: Float[Tensor, "gaussian 2"],
     covariances: Float[Tensor, "gaussian 2 2"], opacities: Float[Tensor, " gaussian"], constants: RenderingConstants,
 ) -> Float[Tensor, "gaussian pixel"]:  # fmt: skip
-    """min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
+    """Return min(max_alpha, opacity * exp(-d^T Sigma^-1 d / 2)) for every pair, zero below min_alpha."""
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     # The determinant of M + blur * 1 is at least blur * (trace of M + blur) for a covariance M; the difference of
     # products loses that to rounding when a Gaussian is large and flat.
@@ -120,9 +120,9 @@ def alphas_at(
 def composite(
     alphas: Float[Tensor, "gaussian pixel"], constants: RenderingConstants
 ) -> Float[Tensor, "gaussian pixel"]:
-    """Weights alpha_i * prod_{j<i} (1 - alpha_j), front to back, until the transmittance would be used up.
+    """Return the weights alpha_i * prod_{j<i} (1 - alpha_j), front to back, until the transmittance is used up.
 
-    The Gaussian that would bring it to min_transmittance or below takes no part, nor does any behind it.
+    The Gaussian that would bring it to min_transmittance or below has weight 0, as has every one behind it.
     """
     after = torch.cumprod(1 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])

@@ -1,4 +1,4 @@
-"""Which backends work on this machine, and the choice among them."""
+"""Choice of a backend that works on this machine."""
 
 import logging
 from collections.abc import Callable
@@ -30,10 +30,10 @@ FASTER: dict[str, Callable[[RenderingConstants | None], Rasterizer]] = {"cuda": 
 
 
 def auto(constants: RenderingConstants | None = None) -> Rasterizer:
-    """The fastest backend that works here and honours the constants; the choice and its reasons are logged.
+    """Return the fastest backend that works here with these constants; log the choice and its reasons.
 
-    Every backend takes tensors of any device, so that the choice does not depend on where a model runs: beside a GPU,
-    a model on the CPU is drawn on the GPU as well.
+    Every backend takes tensors of any device, so the choice does not depend on where a model runs: if there is a GPU,
+    the Gaussians of a model on the CPU are drawn on it, too.
     """
     for name, make in FASTER.items():
         reason = failure(name, constants)
@@ -47,7 +47,7 @@ def auto(constants: RenderingConstants | None = None) -> Rasterizer:
 
 
 def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
-    """The `cuda` backend, without which training takes far too long. `CompleteSplatError`: it does not work here."""
+    """Return the `cuda` backend, without which training takes far too long; fail if it does not work here."""
     try:
         return CudaRasterizer(constants)
     except CompleteSplatError as error:
@@ -56,24 +56,24 @@ def cuda(constants: RenderingConstants | None = None) -> Rasterizer:
 
 @cache
 def failure(name: str, constants: RenderingConstants | None) -> str | None:
-    """Why a backend cannot be used, or None if a tiny scene comes out as it should, with its gradient.
+    """Return why a backend cannot be used, or None if it renders a tiny scene and its gradient correctly.
 
-    Any exception counts: a missing package, kernels that do not compile (gsplat's are compiled on first use), a
+    Any exception is a reason: a missing package, kernels that do not compile (gsplat's are compiled on first use), a
     processor that numba does not know, a broken cache, refused constants.
     """
     try:
-        found, expected = map(_image_and_gradient, (FASTER[name](constants), ReferenceRasterizer(constants)))
+        actual, expected = map(_image_and_gradient, (FASTER[name](constants), ReferenceRasterizer(constants)))
     except CompleteSplatError as error:
         return str(error)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    difference = torch.cat([(a - b).flatten() for a, b in zip(found, expected, strict=True)]).abs().max().item()
+    difference = torch.cat([(a - b).flatten() for a, b in zip(actual, expected, strict=True)]).abs().max().item()
     return None if difference <= TOLERANCE else f"its test rendering is wrong by {difference:.2g}"
 
 
 @torch.enable_grad()
 def _image_and_gradient(rasterizer: Rasterizer) -> tuple[torch.Tensor, torch.Tensor]:
-    """One Gaussian off the centre of a 6 x 5 image."""
+    """Render a Gaussian off the centre of a 6 x 5 image; return the image and a gradient of the mean."""
     mean = torch.tensor([[[0.05, -0.02, 2.0]]], requires_grad=True)
     quaternion, scale = torch.tensor([[[1.0, 0.2, -0.1, 0.3]]]), torch.tensor([[[0.3, 0.2, 0.1]]])
     gaussians = Gaussians(mean, quaternion, scale, torch.tensor([[0.8]]), torch.tensor([[[0.9, 0.5, 0.1]]]))

@@ -1,4 +1,4 @@
-"""The fast CPU backend: compiled kernels with a hand-written backward pass, float32."""
+"""Fast CPU backend: compiled kernels with a hand-written backward pass, float32."""
 
 from typing import Any
 
@@ -14,19 +14,18 @@ from completesplat.rasterizers.kernels import array_layout as layout
 from completesplat.rasterizers.kernels.drawing import Drawing, Images, Parameters
 
 WIDTHS: dict[str, list[int]] = {"means": [3], "quaternions": [4], "scales": [3], "opacities": [], "colors": [3]}
-SMALLEST_BLUR = 1e-5  # px^2; it keeps the reference's clamp on the determinant (1e-10) out of reach
+SMALLEST_BLUR = 1e-5  # px^2; with it, the reference's clamp on the determinant (1e-10) never applies
 
 
 class TiledRasterizer:
-    """The same function as `ReferenceRasterizer`, for float32 tensors in main memory, hundreds of times faster.
+    """CPU rasterizer that computes the function of `ReferenceRasterizer` in float32, hundreds of times faster.
 
     Gradients reach all parameters of the Gaussians and the cameras (of the intrinsics, focal lengths and principal
     point). Results do not depend on the number of threads (`torch.set_num_threads`). The kernels are compiled on
     first use, which takes some seconds once per machine.
 
     Raises:
-        CompleteSplatError: constants that it cannot honour; on a call, tensors of another dtype, device or number of
-            scenes.
+        CompleteSplatError: constants that it does not support; on a call, tensors of another dtype, device or shape.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -48,14 +47,14 @@ class TiledRasterizer:
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
     # The kernels do not check bounds: an array that is too small would be read beyond its end.
     for name, widths in WIDTHS.items():
-        shape, found = [len(cameras.world_to_camera), gaussians.count, *widths], list(getattr(gaussians, name).shape)
-        if found != shape:
-            raise CompleteSplatError(f"{name} should have the shape {shape}, not {found}")
+        shape, actual = [len(cameras.world_to_camera), gaussians.count, *widths], list(getattr(gaussians, name).shape)
+        if actual != shape:
+            raise CompleteSplatError(f"{name} should have the shape {shape}, not {actual}")
     require_float32("tiled", gaussians, cameras, torch.device("cpu"))
 
 
 def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
-    """Cameras as the kernels take them, [batch view 20] float64 (see `kernels/array_layout.py`)."""
+    """Return cameras in the layout of the kernels, [batch view 20] float64 (see `kernels/array_layout.py`)."""
     matrices = cameras.world_to_camera.detach().double().numpy()
     intrinsics = cameras.intrinsics.detach().double().numpy()
     packed = np.empty((*matrices.shape[:2], layout.CAMERA_WIDTH))
@@ -73,7 +72,7 @@ def pack_cameras(cameras: Cameras, frustum_margin: float) -> np.ndarray:
 
 
 def unpack_camera_gradients(packed: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Gradients [batch view 16] from the kernels as those of `world_to_camera` and `intrinsics`."""
+    """Return gradients of `world_to_camera` and `intrinsics` from those of the kernels, [batch view 16]."""
     shape = packed.shape[:2]
     world_to_camera, intrinsics = np.zeros((*shape, 4, 4), np.float32), np.zeros((*shape, 3, 3), np.float32)
     rotation = packed[..., layout.ROTATION : layout.ROTATION + 9]
@@ -86,7 +85,7 @@ def unpack_camera_gradients(packed: np.ndarray) -> tuple[Tensor, Tensor]:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(means, quaternions, scales, opacities, colors, world_to_camera, intrinsics, image size, constants) to images."""
+    """Map (means, quaternions, scales, opacities, colors, world_to_camera, intrinsics, size, constants) to images."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
@@ -105,13 +104,13 @@ class _Rasterize(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *image_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         images = ctx.saved_tensors[7:]
-        given = [
-            # Zeros by NumPy: torch would wake its own threads, which then spin for a while on the kernels' cores.
+        filled = [
+            # Zeros from NumPy, because torch would wake its threads, which then spin for a while on the kernels' cores.
             torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
         to_cameras = any(ctx.needs_input_grad[5:7])
-        gradients, of_cameras = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, given), to_cameras)
+        gradients, of_cameras = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, filled), to_cameras)
         matrices = (None, None) if of_cameras is None else unpack_camera_gradients(of_cameras)
         return *(torch.from_numpy(gradient) for gradient in gradients), *matrices, None, None
 

@@ -1,4 +1,4 @@
-"""One page of HTML that needs nothing else: tables, figures, and samples that turn under the mouse."""
+"""A self-contained HTML page: tables, figures, and samples that turn under the mouse."""
 
 import io
 from base64 import b64encode
@@ -22,63 +22,63 @@ from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table, Tab
 EMPTY = {"img", "meta", "link", "br"}  # elements that have no end tag
 
 WIDEST, MOST_PIXELS = 1600, 50_000_000
-"""Pixels of the widest picture shown, wider ones are made smaller; and of the largest read."""
+"""Width to which wider images are reduced; and pixels of the largest image that is read."""
 AS_THEY_ARE, QUALITY = 300_000, 85
-"""Bytes up to which a picture of that width is not encoded again; and quality of JPEG."""
+"""Bytes up to which a PNG of at most that width is not encoded again; and quality of JPEG."""
 SIDE, LONGEST = 256, 60_000
-"""Pixels of a frame's longer side; and of the widest strip of frames (JPEG ends at 65,535)."""
+"""Pixels of a frame's longer side; and of the widest strip of frames (JPEG's limit is 65,535)."""
 
 
 class Html(str):
-    """Text that is HTML. Everything else is plain text, whatever characters it holds."""
+    """Text that is HTML; any other string is plain text and will be escaped."""
 
 
 def element(name: str, /, *children: str, **attributes: str | int | bool) -> Html:
-    """`<name attribute="value">children</name>`; children are elements, or plain text.
+    """Return `<name attribute="value">children</name>`; children are elements or plain text.
 
-    Attributes are `class_` for `class`, `aria_label` for `aria-label`; True for one without a value, False for none.
+    Write `class_` for `class`, `aria_label` for `aria-label`, True for an attribute without a value, False for none.
     """
-    given = [(key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not False]
-    opened = "".join(f" {key}" if value is True else f' {key}="{escape(str(value))}"' for key, value in given)
+    pairs = [(key.rstrip("_").replace("_", "-"), value) for key, value in attributes.items() if value is not False]
+    opened = "".join(f" {key}" if value is True else f' {key}="{escape(str(value))}"' for key, value in pairs)
     if name in EMPTY:
         return Html(f"<{name}{opened}>")
     return Html(f"<{name}{opened}>{joined(*children)}</{name}>")
 
 
 def joined(*children: str) -> Html:
-    """Elements and plain text, one after the other."""
+    """Join elements and plain text."""
     return Html("".join(child if isinstance(child, Html) else escape(child) for child in children))
 
 
 def scrollable(name: str, *children: str) -> Html:
-    """A box that scrolls sideways by itself, also by keyboard; `name` says what it holds to those who do not see it."""
+    """Return a box that scrolls sideways, also by keyboard; `name` describes it to screen readers."""
     return element("div", *children, class_="scroll", tabindex="0", role="region", aria_label=name)
 
 
 def folded(summary: str, *children: str, open_: bool = False) -> Html:
-    """A part that is shown when its summary is clicked."""
+    """Return a part that opens when its summary is clicked."""
     return element("details", element("summary", summary), *children, open=open_)
 
 
 def described(pairs: dict[str, str]) -> Html:
-    """Names and values, as a list; what is empty is left out."""
+    """Return a list of names and values, without empty values."""
     parts = [element("div", element("dt", name), element("dd", value)) for name, value in pairs.items() if value]
     return element("dl", *parts)
 
 
 def left_out(text: str) -> Html:
-    """A line on what is not shown."""
+    """Return a line about something that is not shown."""
     return element("p", text, class_="left-out")
 
 
 class ByteBudget:
-    """The bytes that pictures may take in one page; data URIs take four characters for three bytes."""
+    """Bytes that images may still take in one page; data URIs take four characters for three bytes."""
 
     def __init__(self, megabytes: float) -> None:
         self.left = megabytes * 1e6
 
     def uri(self, data: bytes, kind: str) -> str | None:
-        """The data URI of a picture, or None where it does not fit any more."""
+        """Return the data URI of an image, or None if it does not fit any more."""
         uri = f"data:image/{kind};base64,{b64encode(data).decode()}"
         if len(uri) > self.left:
             return None
@@ -87,7 +87,7 @@ class ByteBudget:
 
 
 def picture(path: Path, caption: str, budget: ByteBudget) -> Html:
-    """A figure with its caption, which is also what is read out; or why it is not shown."""
+    """Return a figure with its caption, which screen readers read too; or why it is not shown."""
     try:
         data, kind, width, height = _encoded(path)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
@@ -99,7 +99,7 @@ def picture(path: Path, caption: str, budget: ByteBudget) -> Html:
 
 
 def _encoded(path: Path) -> tuple[bytes, str, int, int]:
-    """The file as it is if it is a small PNG, else a JPEG of it: bytes, kind, width and height."""
+    """Return bytes, kind, width and height: of the file itself if it is a small PNG, else of a JPEG of it."""
     data = path.read_bytes()
     with Image.open(io.BytesIO(data)) as image:
         width, height = image.size
@@ -116,14 +116,14 @@ def _encoded(path: Path) -> tuple[bytes, str, int, int]:
 
 
 def as_jpeg(image: Image.Image) -> bytes:
-    """A JPEG file."""
+    """Encode an image as a JPEG file."""
     file = io.BytesIO()
     image.save(file, "JPEG", quality=QUALITY, optimize=True)
     return file.getvalue()
 
 
 def strip(video: Path, count: int) -> tuple[Image.Image, int]:
-    """At most `count` frames from left to right, evenly spread over all of a video, and how many they are.
+    """Join at most `count` frames, evenly spread over a video, from left to right; return also their number.
 
     Raises:
         OSError, RuntimeError, ValueError, IndexError: no readable video (imageio's; it depends on what is wrong).
@@ -142,12 +142,12 @@ def strip(video: Path, count: int) -> tuple[Image.Image, int]:
                 frames.append(image)
     if not frames:
         raise ValueError("it has no frames")
-    shown = [np.asarray(image) for image in frames[: LONGEST // frames[0].width]]
-    return Image.fromarray(np.concatenate(shown, axis=1)), len(shown)
+    strip_frames = [np.asarray(image) for image in frames[: LONGEST // frames[0].width]]
+    return Image.fromarray(np.concatenate(strip_frames, axis=1)), len(strip_frames)
 
 
 def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudget) -> Html:
-    """A figure of an orbit of one sample; without scripts the strip can be scrolled. Or why it is not shown."""
+    """Return a turning figure of one sample's orbit, a scrolling strip without scripts; or why it is not shown."""
     try:
         joined, frames = strip(video, count)
     except (OSError, RuntimeError, ValueError, IndexError) as error:
@@ -174,20 +174,20 @@ def turntable(video: Path, image: str, sample: str, count: int, budget: ByteBudg
 
 MARKED = {BEST: "strong", SECOND: "u"}
 PLAIN = (type(None), str, int, float)
-PUBLISHED = "paper"  # the source of rows that are no results of ours
+PUBLISHED = "paper"  # the source of rows that are not our results
 
-FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}  # subfolders of a run, and the pictures in each
+FIGURES = {"": "*.png", "pictures": "step_*.png", "samples": "*.png"}  # subfolders of a run, and the images in each
 CAPTIONS = {
     "pictures": ": fixed scenes while training: input, target, render, error, depth, opacity, each layer",
     "samples": ": samples of fixed scenes while training",
 }
-MOST_CHARACTERS = 20_000  # characters of a configuration that are shown
+MOST_CHARACTERS = 20_000  # characters of a config that are shown
 NAMED = {"image": "photograph", "mask": "mask", "box": "box", "fov_degrees": "degrees of view", "seed": "seed"}
 NAMED |= {"skip_weight": "skip weight", "guidance_weight": "guidance", "sampler": "sampler", "steps": "steps"}
-"""Settings of a prediction, and what they are called here."""
+"""Settings of a prediction, and their names on the page."""
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
-"""What the browser enforces: this page asks for nothing, whatever is in it."""
-UNFOLDED = 3  # up to this number of runs all are unfolded; of more, only those with a report's figure
+"""Content policy, by which the browser keeps the page from loading anything, whatever is in it."""
+UNFOLDED = 3  # up to this number, all runs are unfolded; beyond it, only runs with a report's figure
 HINT = (
     "Move the mouse over a sample, drag a finger across it, or give it the focus and use the arrow keys: all samples "
     "of the photograph turn together. What the photograph does not show is made up, differently in each sample."
@@ -195,19 +195,19 @@ HINT = (
 
 
 def comparison(table: Table) -> Html:
-    """A table with what stands below it; without a result of ours it is folded."""
+    """Return a table with its remarks and notes, folded if it has no result of ours."""
     below = element("ul", *(element("li", line) for line in table.below()), class_="notes")
     whole = element("div", _grid(table), folded("What this table says, and how it was measured", below))
     return folded(f"{table.title}: the published figures, none of ours", whole) if is_published(table) else whole
 
 
 def is_published(table: Table) -> bool:
-    """Whether it has the paper's figures only."""
+    """Return whether a table has the paper's figures only."""
     return all(row.source == PUBLISHED for row in table.rows)
 
 
 def rows_of(title: str, rows: Sequence[Any]) -> Html:
-    """Records with the same keys, such as `completesplat report samplers` writes."""
+    """Return a table of records with the same keys, such as those that `completesplat report samplers` writes."""
     records = [row for row in rows if isinstance(row, Mapping)]
     keys = list(dict.fromkeys(str(key) for row in records for key, x in row.items() if isinstance(x, PLAIN)))
     body = [TableRow("", [Cell(_said(row.get(key))) for key in keys]) for row in records]
@@ -219,8 +219,8 @@ def _grid(table: Table) -> Html:
     for row, ruled_below in table.ruled_rows():
         body.append(element("tr", *map(_cell, table.headings, row.cells), class_="rule" if ruled else False))
         ruled = ruled_below
-    shown = element("table", element("caption", table.title), element("thead", *_head(table)), element("tbody", *body))
-    return scrollable(table.title, shown)
+    grid = element("table", element("caption", table.title), element("thead", *_head(table)), element("tbody", *body))
+    return scrollable(table.title, grid)
 
 
 def _head(table: Table) -> list[Html]:
@@ -241,7 +241,7 @@ def _said(value: Any) -> str:
 
 @dataclass(frozen=True)
 class ShownRun:
-    """A run's folder, its name on the page, its figures by subfolder, and the tables of its scores."""
+    """Folder of a run, its name on the page, its figures by subfolder, and the tables of its scores."""
 
     path: Path
     name: str
@@ -250,9 +250,9 @@ class ShownRun:
 
 
 def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bool) -> Html:
-    """A section of one run, unfolded at first if `open_`.
+    """Return a section on one run, unfolded at first if `open_`.
 
-    Of each subfolder `most_pictures` are shown, the latest; the section says how many others there are.
+    It shows at most `most_pictures` images of each subfolder and says how many others there are.
     """
     parts = [described(origin(run.path, levels=0)), *map(comparison, run.tables)]
     for name in ROWS:
@@ -260,7 +260,7 @@ def run_section(run: ShownRun, most_pictures: int, budget: ByteBudget, open_: bo
         if isinstance(rows, list):
             parts.append(rows_of(Path(name).stem, rows))
     for part, paths in run.figures.items():
-        # Of a run's progress the end, of a report's figures the first.
+        # The last images of a run's progress, the first of a report's figures.
         for path in paths[-most_pictures:] if part else paths[:most_pictures]:
             parts.append(picture(path, f"{run.name}, {path.relative_to(run.path)}{CAPTIONS.get(part, '')}", budget))
         parts += _more(len(paths) - most_pictures, f"more in {run.name}/{part}".rstrip("/"))
@@ -276,7 +276,7 @@ def _more(count: int, what: str) -> list[Html]:
 
 
 def prediction_section(path: Path, name: str, most: Mapping[str, Any], budget: ByteBudget) -> Html:
-    """A section of one photograph: how its samples were made, each of them turning, and the sheet."""
+    """Return a section on one photo: the settings of its samples, each sample turning, and the contact sheet."""
     settings = mapping_or_empty(path / SCENE).get("settings")
     settings = settings if isinstance(settings, dict) else {}
     image = str(settings.get("image") or name)
@@ -285,8 +285,8 @@ def prediction_section(path: Path, name: str, most: Mapping[str, Any], budget: B
         turntable(video, image, video.stem.replace("orbit_", "sample "), most["frames"], budget)
         for video in videos[: most["samples"]]
     ]
-    said = [f"{told} {_said(settings[key])}" for key, told in NAMED.items() if settings.get(key) is not None]
-    parts = [element("h3", name), described({"settings": ", ".join(said), **origin(path)})]
+    values = [f"{label} {_said(settings[key])}" for key, label in NAMED.items() if settings.get(key) is not None]
+    parts = [element("h3", name), described({"settings": ", ".join(values), **origin(path)})]
     if turning:
         parts.append(element("div", *turning, class_="samples"))
     parts += _more(len(videos) - most["samples"], "more samples")
@@ -297,25 +297,29 @@ def prediction_section(path: Path, name: str, most: Mapping[str, Any], budget: B
 
 
 def page(folder: Path, out: Path, most: Mapping[str, Any], made: Mapping[str, str]) -> tuple[str, list[str]]:
-    """The page on all below a folder but what lies in `out`, and a line for each file of results that is of no use.
+    """Return the page on everything below a folder except `out`, and a line for each unusable file of results.
 
-    `most` are the numbers of `frames` of a turn, `samples` of a photograph, `predictions`, `runs` and `pictures` of a
-    run's folder that are shown, and `megabytes` of all pictures; `made` are command, date and commit of the page.
-    `CompleteSplatError`: there is no such folder, or nothing to show in it.
+    Args:
+        most: limits: `frames` of a turn, `samples` of a photo, `predictions`, `runs`, `pictures` of a run's subfolder,
+            and `megabytes` of all images.
+        made: command, date and commit of the page.
+
+    Raises:
+        CompleteSplatError: there is no such folder, or it has nothing to show.
     """
     tree, budget = find(folder), ByteBudget(most["megabytes"])
-    found, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]
-    if not found and not predicted:
+    all_runs, predicted = _shown_runs(tree, out), [path for path in tree.predictions if path.resolve() != out.resolve()]
+    if not all_runs and not predicted:
         raise CompleteSplatError(
             f"runs={folder}: nothing to show in it or below it; `completesplat fit`, `test`, `predict` and `report` "
             "write what a page is made of"
         )
-    shown = predicted[: most["predictions"]]
-    predictions = [prediction_section(path, _name(path, folder), most, budget) for path in shown]
-    few = len(found) <= UNFOLDED
-    runs = [run_section(run, most["pictures"], budget, few or "" in run.figures) for run in found[: most["runs"]]]
-    predictions += _more(len(predicted) - len(shown), "more predictions")
-    runs += _more(len(found) - len(runs), "more runs")
+    listed = predicted[: most["predictions"]]
+    predictions = [prediction_section(path, _name(path, folder), most, budget) for path in listed]
+    few = len(all_runs) <= UNFOLDED
+    runs = [run_section(run, most["pictures"], budget, few or "" in run.figures) for run in all_runs[: most["runs"]]]
+    predictions += _more(len(predicted) - len(listed), "more predictions")
+    runs += _more(len(all_runs) - len(runs), "more runs")
     tables = compared(tree) if tree.scores or tree.modes or tree.warnings else []
     sections = {
         "Predictions": [element("p", HINT), *predictions] if predictions else [],
@@ -332,18 +336,18 @@ def _name(path: Path, root: Path) -> str:
 
 
 def _shown_runs(tree: RunTree, out: Path) -> list[ShownRun]:
-    """The runs with figures, scores or rows."""
+    """Return the runs with figures, scores or rows."""
     tables: dict[Path, list[Table]] = {run.folder: own_tables(entries([run])) for run in tree.scores}
     for run in tree.modes:
         tables[run.folder] = [*tables.get(run.folder, []), *mode_tables([run])]
-    shown = []
+    selected = []
     for path in tree.runs:
-        found = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
-        figures = {part: paths for part, paths in found.items() if paths}
+        by_part = {part: sorted((path / part).glob(pattern)) for part, pattern in FIGURES.items()}
+        figures = {part: paths for part, paths in by_part.items() if paths}
         shows = figures or any((path / name).is_file() for name in (SCORES, MODES, *ROWS))
         if shows and path.resolve() != out.resolve():
-            shown.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
-    return shown
+            selected.append(ShownRun(path, _name(path, tree.folder), figures, tables.get(path, [])))
+    return selected
 
 
 def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str, str]) -> str:
@@ -359,7 +363,7 @@ def _document(title: str, sections: Mapping[str, list[Html]], made: Mapping[str,
         element("section", element("h2", name, id=identities[name]), *parts, aria_labelledby=identities[name])
         for name, parts in sections.items()
     ]
-    said = [f"{key} {value}" for key, value in made.items() if value]
-    footer = element("footer", f"Made by completesplat {__version__}: {'; '.join(said)}")
+    facts = [f"{key} {value}" for key, value in made.items() if value]
+    footer = element("footer", f"Made by completesplat {__version__}: {'; '.join(facts)}")
     whole = element("body", top, element("main", *body), footer, element("script", Html(script)))
     return joined(Html("<!DOCTYPE html>\n"), element("html", head, whole, lang="en"), "\n")

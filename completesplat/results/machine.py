@@ -1,4 +1,4 @@
-"""The machine that figures were taken on."""
+"""Description of the machine on which figures were measured."""
 
 import os
 import platform
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def machine() -> dict[str, Any]:
-    """Processor, GPU, versions and date, as JSON can hold them."""
+    """Return processor, GPU, versions and date as values that JSON can hold."""
     import torch
 
     described = {

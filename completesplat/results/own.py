@@ -1,4 +1,4 @@
-"""Tables of our own scores: one for each way of measuring, so that all rows of a table compare."""
+"""Tables of our own scores, one for each protocol, so that all rows of a table compare."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -33,13 +33,13 @@ ALIKE = [
     "scene_list",
 ]
 ALIKE += ["crop", "background", "precision", "data_fingerprint", "metrics"]
-"""What the protocols of a table's rows have in common."""
+"""Entries that are equal in the protocols of all rows of a table."""
 SAID = ["subset", "split", "resolution", "scenes", "scenes_listed", "skipped", "views", "protocol_views", "scene_list"]
 SAID += ["crop", "background", "precision"]
-"""What a table says of its protocol."""
+"""Entries of the protocol that a table states."""
 COLUMNS = [f"full_novel_{name}" for name in METRICS]
 COLUMNS += [f"object_novel_{name}" for name in ("psnr", "ssim", "lpips")] + ["full_reference_psnr"]
-"""The scores that a table shows where a run has them."""
+"""Scores that a table shows if a run has them."""
 IDENTITY = [key for key in LEADING if key != "speed"]
 
 SCORES = {"coverage": "coverage ↑", "total_variation": "total variation ↓", "sharpness": "sharpness ↓"}
@@ -55,60 +55,60 @@ Measured = TypeVar("Measured")
 
 
 def alike(found: Iterable[tuple[Measured, dict[str, Any]]], *more: str) -> dict[str, list[Measured]]:
-    """Those whose protocols say the same, by a key of it: scores compare within a group only."""
+    """Group measurements by equal protocols (a key of them): scores compare within a group only."""
     groups: dict[str, list[Measured]] = {}
-    for one, protocol in found:
+    for measured, protocol in found:
         key = json.dumps([protocol.get(name) for name in (*ALIKE, *more)], sort_keys=True, default=str)
-        groups.setdefault(key, []).append(one)
+        groups.setdefault(key, []).append(measured)
     return groups
 
 
 def own_tables(entries: Sequence[Entry]) -> list[Table]:
-    """The tables, in the order of data sets and protocols."""
+    """Return the tables, in the order of data sets and protocols."""
     groups = alike((entry, entry.run.protocol) for entry in entries)
     return [_table(f"own_{index}", groups[key]) for index, key in enumerate(sorted(groups), 1)]
 
 
 def protocol_said(protocol: dict[str, Any]) -> str:
-    """What is common to a table's rows, in sentences."""
-    said = [f"{key} {protocol[key]}" for key in SAID if protocol.get(key) is not None]
+    """Return sentences on what is common to a table's rows."""
+    parts = [f"{key} {protocol[key]}" for key in SAID if protocol.get(key) is not None]
     fingerprint = protocol.get("data_fingerprint")
-    said += [f"data fingerprint {str(fingerprint)[:12]}"] if fingerprint else []
-    return f"Measured alike in all rows: {', '.join(said)}. {SSIM_NOTE}"
+    parts += [f"data fingerprint {str(fingerprint)[:12]}"] if fingerprint else []
+    return f"Measured alike in all rows: {', '.join(parts)}. {SSIM_NOTE}"
 
 
 def _table(name: str, entries: Sequence[Entry]) -> Table:
     protocol, notes = entries[0].run.protocol, Notes()
-    # Own models first; a naive predictor, which scores the same in all runs of a protocol, once.
+    # Our models first; a naive predictor has the same scores in all runs of a protocol, so it is shown once.
     naive: dict[str, Entry] = {}
     for entry in entries:
         if not entry.own:
             naive.setdefault(entry.predictor + json.dumps(entry.scores | {"seconds": None}, sort_keys=True), entry)
-    kept = [*(entry for entry in entries if entry.own), *naive.values()]
-    shown = [column for column in COLUMNS if any(_known(entry, column) for entry in kept)]
-    competing = [entry.own and not entry.upper_bound for entry in kept]
-    marked = {name: marks([entry.value(name) for entry in kept], competing, name) for name in shown}
+    kept_entries = [*(entry for entry in entries if entry.own), *naive.values()]
+    columns = [column for column in COLUMNS if any(_known(entry, column) for entry in kept_entries)]
+    competing = [entry.own and not entry.upper_bound for entry in kept_entries]
+    marked = {name: marks([entry.value(name) for entry in kept_entries], competing, name) for name in columns}
     rows = []
-    for index, entry in enumerate(kept):
+    for index, entry in enumerate(kept_entries):
         leading = entry.leading(notes)
         cells = [leading[key] for key in IDENTITY]
-        cells += [replace(entry.cell(name, notes), mark=marked[name][index]) for name in shown]
+        cells += [replace(entry.cell(name, notes), mark=marked[name][index]) for name in columns]
         rows.append(TableRow("ours" if entry.own else "naive", cells))
     title = f"{protocol['data_set']}, {protocol.get('name', 'scores')}, {protocol['resolution']} pixels"
     remarks = ["Ours, best in bold and second best underlined; not by the protocol of any published table."]
     remarks += [protocol_said(protocol), LEGEND]
-    return Table(name, title, [*leading_headings(IDENTITY), *map(score_heading, shown)], rows, remarks, notes)
+    return Table(name, title, [*leading_headings(IDENTITY), *map(score_heading, columns)], rows, remarks, notes)
 
 
 def _known(entry: Entry, column: str) -> bool:
-    """Whether a column has something to say: a figure, or why there is none."""
+    """Return whether a column has a figure, or a reason why it has none."""
     region, _, name = column.split("_")
     stated = name in (entry.run.protocol.get("missing") or {}) and region in entry.scores
     return stated or entry.value(column) is not None
 
 
 def mode_tables(runs: Sequence[Result]) -> list[Table]:
-    """One for each protocol and number of samples."""
+    """Return a table for each protocol and number of samples."""
     groups = alike(((run, run.protocol) for run in runs), "samples")
     return [_modes_table(f"hidden_modes_{index}", groups[key]) for index, key in enumerate(sorted(groups), 1)]
 
@@ -117,7 +117,7 @@ def _modes_table(name: str, runs: Sequence[Result]) -> Table:
     notes, seen = Notes(), []
     rows: dict[str, list[TableRow]] = {"ours": [], "known": []}
 
-    def shown(scores: dict[str, Any], key: str, form: str) -> Cell:
+    def to_cell(scores: dict[str, Any], key: str, form: str) -> Cell:
         value = scores.get(key)
         if not isinstance(value, int | float):
             return notes.missing(f"{key.replace('_', ' ')}: the file of results holds none")
@@ -126,8 +126,8 @@ def _modes_table(name: str, runs: Sequence[Result]) -> Table:
     for run in runs:
         for method, scores in run.entries.items():
             label = str(run.protocol.get("method", "model")) if method == MODEL else method.replace("_", " ")
-            cells = [shown(scores, key, ".3f") for key in SCORES] + [shown(scores, key, "") for key in COUNTS]
-            if method == MODEL or (label, cells) not in seen:  # what is no model is the same in all runs
+            cells = [to_cell(scores, key, ".3f") for key in SCORES] + [to_cell(scores, key, "") for key in COUNTS]
+            if method == MODEL or (label, cells) not in seen:  # other methods are the same in all runs
                 seen.append((label, cells))
                 source = "ours" if method == MODEL else "known"
                 rows[source].append(TableRow(source, [Cell(f"{label} [{notes.number(described(run))}]"), *cells]))

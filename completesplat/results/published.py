@@ -1,4 +1,4 @@
-"""The paper's tables, and our runs beside them where they were measured alike."""
+"""Tables of the paper, with our runs beside them if they were measured by the same protocol."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -57,7 +57,7 @@ APART = (
 
 @dataclass(frozen=True)
 class PrintedCell:
-    """A cell as printed, with its marks, which are among `MARKS`."""
+    """Cell as printed, with its marks (of `MARKS`)."""
 
     text: str
     marks: frozenset[str]
@@ -65,7 +65,7 @@ class PrintedCell:
 
 @dataclass(frozen=True)
 class PrintedColumn:
-    """A column as printed: all levels of its heading joined; a key of `LEADING` or `METRICS`; the data set, if one."""
+    """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; the data set, if any."""
 
     heading: str
     key: str
@@ -74,7 +74,7 @@ class PrintedColumn:
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """A table of the paper, and the protocol of its figures; the head of `figures.yaml` says what each entry is."""
+    """Table of the paper and the protocol of its figures; the head of `figures.yaml` explains each entry."""
 
     name: str
     place: str
@@ -95,17 +95,17 @@ class PublishedTable:
 
 
 def published() -> list[PublishedTable]:
-    """All tables, in the paper's order."""
+    """Return all tables, in the paper's order."""
     return [_table(entry) for entry in _content()["tables"]]
 
 
 def _source(table: PublishedTable) -> str:
-    said = "best in bold and second best underlined as printed"
-    return f"Published figures: {_content()['source']}, {table.place}; {said}."
+    marking = "best in bold and second best underlined as printed"
+    return f"Published figures: {_content()['source']}, {table.place}; {marking}."
 
 
 def parse(cell: str) -> PrintedCell:
-    """`17.93 best` is the text `17.93` with the mark `best`."""
+    """Split a cell: `17.93 best` is the text `17.93` with the mark `best`."""
     words = cell.split()
     return PrintedCell(" ".join(word for word in words if word not in MARKS), frozenset(words) & set(MARKS))
 
@@ -117,15 +117,15 @@ def _content() -> dict[str, Any]:
 
 
 def _table(entry: Mapping[str, Any]) -> PublishedTable:
-    given = {key: value for key, value in entry.items() if key not in ("data_set", *MARKS)}
+    fields = {key: value for key, value in entry.items() if key not in ("data_set", *MARKS)}
     data_set = {"data_set": entry.get("data_set", "")}
-    given["columns"] = [PrintedColumn(**data_set | column) for column in entry["columns"]]
-    given["rows"] = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
-    return PublishedTable(**given, legend={mark: entry[mark] for mark in MARKS if mark in entry})
+    fields["columns"] = [PrintedColumn(**data_set | column) for column in entry["columns"]]
+    fields["rows"] = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
+    return PublishedTable(**fields, legend={mark: entry[mark] for mark in MARKS if mark in entry})
 
 
 def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
-    """The published rows, then those of our runs that `belongs` lets in.
+    """Return the published rows, followed by those of our runs for which `belongs` is true.
 
     Times are of one sequence, warm, for the complete pipeline.
     """
@@ -148,12 +148,12 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
 
 
 def belongs(table: PublishedTable, entry: Entry) -> bool:
-    """Whether an entry was measured as the table's figures were.
+    """Return whether an entry was measured like the table's figures.
 
     The run followed one of the table's evaluations: the same views, resolution and number of scenes (all scenes of the
     list where the table states no number), on one of the table's data sets and on its list of sequences, with no scene
-    skipped, with skip connections at full weight, and on all pixels. A best of k belongs where the paper has one of
-    equally many samples. A model that has seen the views that it is scored on belongs nowhere.
+    skipped, with skip connections at full weight, and on all pixels. A best of k belongs to a table whose best of k has
+    the same k. A model that has seen the views that it is scored on belongs to no table.
     """
     protocol = entry.run.protocol
     wanted = table.evaluations.get(str(protocol.get("name")))
@@ -172,7 +172,7 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
 
 
 def _size(table: PublishedTable, row: Sequence[PrintedCell]) -> dict[str, str]:
-    """What the paper states of a row's scenes and resolution; empty where it does not."""
+    """Return a row's scenes and resolution as the paper states them; empty where it does not."""
     printed = {column.key: cell.text for column, cell in zip(table.columns, row, strict=True)}
     return {"scenes": printed.get("scenes", ""), "resolution": printed.get("resolution", table.resolution)}
 
@@ -185,23 +185,23 @@ def _published(table: PublishedTable, row: Sequence[PrintedCell], keys: Sequence
 
 
 def shown(printed: PrintedCell) -> Cell:
-    """A published cell, its marks as signs and as best or second."""
+    """Return the cell of a table for a published cell, its marks as signs and as best or second."""
     signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in printed.marks)
     mark = next((mark for mark in (BEST, SECOND) if mark in printed.marks), UNMARKED)
     return Cell((printed.text or BLANK) + signs, mark)
 
 
 def published_ablations(table: PublishedTable) -> Table:
-    """The paper's figures alone."""
+    """Return a table of the paper's figures alone."""
     headings = [Heading("setting", figures=False), *(Heading(c.heading, "published") for c in table.columns[1:])]
     body = [TableRow("paper", [shown(cell) for cell in row]) for row in table.rows]
     return Table(table.name, f"{table.place}: {table.title}", headings, body, [_source(table), LEGEND])
 
 
 def sweep_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> list[Table]:
-    """For each protocol by which jobs of a sweep were tested: mean and deviation over seeds beside the paper's rows.
+    """Return, for each protocol of a sweep's tests, mean and standard deviation over seeds beside the paper's rows.
 
-    Empty where no tested job is a row of the paper's table.
+    The list is empty if no tested job is a row of the paper's table.
     """
     tested = [job for job in jobs if job.protocol]
     if not any(_option(job.label, table) for job in tested):
@@ -214,10 +214,10 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
     protocol, notes = jobs[0].protocol, Notes()
     printed = {row[0].text: [shown(cell) for cell in row] for row in table.rows}
     order = [*printed, ""]
-    own = sorted(rows(jobs), key=lambda row: order.index(_option(row["ablation"], table)))
+    our_rows = sorted(rows(jobs), key=lambda row: order.index(_option(row["ablation"], table)))
     reasons = protocol.get("missing") or {}
     body = []
-    for row, scores in zip(own, figures(own, COLUMNS), strict=True):
+    for row, scores in zip(our_rows, figures(our_rows, COLUMNS), strict=True):
         published = printed.get(_option(row["ablation"], table), [Cell(ABSENT)] * len(table.columns))
         counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
         cells = [Cell(row["ablation"]), *published, *counts, *_mean_times(jobs, row["ablation"])]
@@ -226,7 +226,7 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
             reason = f"{score}: {reasons.get(score, 'not measured in all jobs of this row')}"
             cells.append(cell if cell.text else notes.missing(reason))
         body.append(TableRow("naive" if row["seeds"] is None else "ours", cells))
-    ours = {_option(row["ablation"], table) for row in own}
+    ours = {_option(row["ablation"], table) for row in our_rows}
     absent = [Cell(ABSENT)] * (4 + len(COLUMNS))
     body += [TableRow("paper", [Cell(ABSENT), *row, *absent]) for method, row in printed.items() if method not in ours]
     headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False)]
@@ -240,20 +240,23 @@ def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> 
 
 def _mean_times(jobs: Sequence[Job], label: str) -> list[Cell]:
     seconds = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs if job.label == label]
-    measured = [[found[part] for found in seconds if found.get(part) is not None] for part in COST]
+    measured = [[parts[part] for parts in seconds if parts.get(part) is not None] for part in COST]
     return [time_cell(sum(times) / len(times) if times else None) for times in measured]
 
 
 def _option(label: str, table: PublishedTable) -> str:
-    """The paper's row that a row of ours stands for; empty if there is none."""
+    """Return the paper's row that corresponds to a row of ours; empty if there is none."""
     return next((table.options[part] for part in label.split(", ") if part in table.options), "")
 
 
 def tables(tree: RunTree | None) -> list[Table]:
-    """The published tables with the runs that were found below a folder; the published figures alone for None.
+    """Return the published tables with the runs below a folder, or the published figures alone for None.
 
-    A run stands below published rows only if it was measured like them, else in a table of its own protocol. The jobs
-    of a sweep over ablations stand in the ablation tables alone. `CompleteSplatError`: there are no results.
+    A run is listed below published rows only if it was measured like them, else in a table for its protocol. The jobs
+    of a sweep over ablations are listed in the ablation tables alone.
+
+    Raises:
+        CompleteSplatError: there are no results.
     """
     if tree is None:
         return [published_ablations(table) if table.options else beside(table, []) for table in published()]
@@ -267,7 +270,7 @@ def tables(tree: RunTree | None) -> list[Table]:
     single = entries([run for run in tree.scores if not compared.get(run.folder.parent)])
     for table in published():
         if table.options:
-            made += [one for found in compared.values() for one in found] or [published_ablations(table)]
+            made += [ablation for group in compared.values() for ablation in group] or [published_ablations(table)]
         else:
             made.append(beside(table, single))
     elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]

@@ -1,4 +1,4 @@
-"""What lies in the folders of runs: results of tests, the jobs of sweeps, predictions."""
+"""Content of the folders of runs: results of tests, the jobs of sweeps, predictions."""
 
 import json
 import os
@@ -19,16 +19,20 @@ from completesplat.errors import CompleteSplatError
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
 ROWS = ("samplers.json", "controls.json", "depth.json", "views.json")
-"""What `completesplat report NAME` leaves beside its figure: settings and rows."""
-PROTOCOL = "protocol"  # where results say how they were measured, beside the entries of the predictors
+"""Files that `completesplat report NAME` writes beside its figure: settings and rows."""
+PROTOCOL = "protocol"  # the key of how results were measured, beside the entries of the predictors
 NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
-"""What a protocol must say, by the name of the file of results."""
+"""Entries that a protocol must have, by the name of the file of results."""
 REGIONS = ("full", "object")
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; `ValueError`: there is no such file, it is not JSON, or it holds something else."""
+    """Read the mapping in a JSON file.
+
+    Raises:
+        ValueError: there is no such file, it is not JSON, or it holds something else.
+    """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -41,7 +45,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def mapping_or_empty(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; an empty one where it cannot be read, as when its writer was killed."""
+    """Read the mapping in a JSON file; return an empty one if that fails, as when its writer was killed."""
     try:
         return read_mapping(path)
     except ValueError:
@@ -50,7 +54,7 @@ def mapping_or_empty(path: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Result:
-    """One file of results: its folder, the folder's name, how it was measured, and its entries by predictor."""
+    """File of results: its folder, the folder's name, how it was measured, and its entries by predictor."""
 
     folder: Path
     name: str
@@ -60,7 +64,7 @@ class Result:
 
 @dataclass(frozen=True)
 class RunTree:
-    """What one walk finds below a folder, in the order of names, and a line for each file that cannot be used."""
+    """Runs and results below a folder, in the order of names, and a line for each file that cannot be used."""
 
     folder: Path
     runs: list[Path] = field(default_factory=list)
@@ -72,30 +76,30 @@ class RunTree:
 
 
 def find(folder: Path) -> RunTree:
-    """Search a folder and all below it, hidden folders apart; `CompleteSplatError` where there is no such folder."""
+    """Search a folder and everything below it, except hidden folders."""
     if not folder.is_dir():
         raise CompleteSplatError(f"runs={folder}: no such folder")
-    found, results = RunTree(folder), []
+    tree, results = RunTree(folder), []
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         path, files = Path(place), set(names)
         if SCENE in files:
-            found.predictions.append(path)
+            tree.predictions.append(path)
         elif files & {RECORD, PLAN, SCORES, MODES, *ROWS}:
-            found.runs.append(path)
+            tree.runs.append(path)
         if PLAN in files:
-            found.sweeps.append(path)
+            tree.sweeps.append(path)
         results += [path / name for name in (SCORES, MODES) if name in files]
     for path in sorted(results):
         try:
-            (found.scores if path.name == SCORES else found.modes).append(_result(path, folder))
+            (tree.scores if path.name == SCORES else tree.modes).append(_result(path, folder))
         except ValueError as error:
-            found.warnings.append(f"{path}: left out, {error}")
-    return found
+            tree.warnings.append(f"{path}: left out, {error}")
+    return tree
 
 
 def _result(path: Path, root: Path) -> Result:
-    """Raises ValueError with the reason if the file is not what it should be."""
+    """Read a file of results; raise ValueError with the reason if it is unusable."""
     content = read_mapping(path)
     if path.name == MODES:
         protocol, entries = read_mapping(path.with_name("protocol.json")), content
@@ -104,7 +108,7 @@ def _result(path: Path, root: Path) -> Result:
         if not isinstance(test, dict) or PROTOCOL not in test:
             raise ValueError(f"it does not say how it was measured; {HOW}")
         protocol, entries = test[PROTOCOL], test
-        if content.get("upper_bound") and isinstance(test.get("model"), dict):  # which a fit says of its model
+        if content.get("upper_bound") and isinstance(test.get("model"), dict):  # stated by a fit about its model
             entries = test | {"model": test["model"] | {"upper_bound": True}}
     if not isinstance(protocol, dict):
         raise ValueError("its protocol is no mapping")
@@ -117,30 +121,30 @@ def _result(path: Path, root: Path) -> Result:
 
 
 def _is_entry(entry: dict[str, Any]) -> bool:
-    """Whether regions hold views, and views hold metrics, as far as there are any."""
+    """Return whether all regions hold views, and all views hold metrics."""
     views = [entry.get(region, {}) for region in REGIONS]
     parts = [part for view in views if isinstance(view, dict) for part in view.values()]
     return all(isinstance(part, dict) for part in [*views, *parts, entry.get("seconds") or {}])
 
 
 def origin(path: Path, levels: int = 1) -> dict[str, str]:
-    """Command, date and commit of what lies in a folder, as its `run.json` or that of one of `levels` parents says."""
+    """Return command, date and commit from the `run.json` of a folder or of one of its `levels` parents."""
     records = (mapping_or_empty(place / RECORD) for place in [path, *path.parents[:levels]])
     record: dict[str, Any] = next(filter(None, records), {})
     command = record.get("command")
-    said = {"command": typed(command) if isinstance(command, list) else ""}
-    return said | {key: str(record.get(key) or "") for key in ("started", "commit")}
+    values = {"command": typed(command) if isinstance(command, list) else ""}
+    return values | {key: str(record.get(key) or "") for key in ("started", "commit")}
 
 
 def typed(command: Sequence[Any]) -> str:
-    """A command as it could be typed; its first part is the program and its verb."""
+    """Return a command as it could be typed; its first part is the program and its verb."""
     program, *arguments = map(str, command) if command else [""]
     return " ".join([program, *map(shlex.quote, arguments)])
 
 
 @dataclass(frozen=True)
 class Job:
-    """A job of a sweep: its folder's name (empty before its start), `run.json`, `metrics.json` (None until it is done).
+    """Job of a sweep: its folder's name (empty before its start), `run.json`, `metrics.json` (None until it is done).
 
     `test` (`Evaluation.results` by predictor) and `protocol` are empty where nothing was tested.
     """
@@ -152,33 +156,33 @@ class Job:
     metrics: dict[str, Any] | None = None
     test: dict[str, Any] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
-    label: str = ""  # what the job is called among those of its sweep
+    label: str = ""  # name of the job among those of its sweep
 
 
 SEED = "seed"
 
 
 def collect(*folders: Path) -> list[Job]:
-    """All jobs of a sweep's folder; those without a folder of their own, which have not started, at the end.
+    """Return all jobs of a sweep's folder, at the end those that have not started and have no folder yet.
 
-    Several folders are parts of one sweep, of several machines: settings that only say where a machine has its files
-    do not count, and of a job that is in several parts the one is taken that came furthest.
+    Several folders are parts of one sweep on several machines. Settings that only locate a machine's files are then
+    ignored, and if a job is in several parts, the one with the most progress is taken.
     """
     parts = [_jobs(folder) for folder in folders]
     return _labelled(parts[0] if len(parts) == 1 else _joined(parts))
 
 
 def _joined(parts: Sequence[list[Job]]) -> list[Job]:
-    """The jobs of several machines, each once."""
+    """Join the jobs of several machines, each once."""
     values: dict[str, list[set[str]]] = {}
     for number, jobs in enumerate(parts):
         for key, value in (pair for job in jobs for pair in job.overrides.items()):
             values.setdefault(key, [set() for _ in parts])[number].add(value)
-    # The same path everywhere in a part, and others in other parts.
+    # Settings with the same path everywhere in a part, and other paths in other parts.
     local = {
         key
-        for key, found in values.items()
-        if max(map(len, found)) == 1 and len(set.union(*found)) > 1 and all("/" in v for v in set.union(*found))
+        for key, by_part in values.items()
+        if max(map(len, by_part)) == 1 and len(set.union(*by_part)) > 1 and all("/" in v for v in set.union(*by_part))
     }
     best: dict[Any, Job] = {}
     for job in (job for jobs in parts for job in jobs):
@@ -195,41 +199,41 @@ def _progress(job: Job) -> tuple[bool, bool]:
 
 def _jobs(folder: Path) -> list[Job]:
     folders = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    # `seed=10` stands behind `seed=9`.
+    # `seed=10` comes after `seed=9`.
     split = {path: re.split(r"(\d+)", path.name) for path in folders}
     natural = {path: [int(part) if part.isdecimal() else part for part in parts] for path, parts in split.items()}
-    found = [_job(path) for path in sorted(folders, key=natural.__getitem__)]
-    recorded = [job for job in found if job.record]
+    jobs = [_job(path) for path in sorted(folders, key=natural.__getitem__)]
+    recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
-    # A job that ended before it could write its record is one of those that the plan misses.
-    silent = [job for job in found if not job.record][len(waiting) :]
+    # `waiting` includes jobs that ended before they wrote a record, so as many folders without one are left out.
+    silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
 
 
 def planned(folder: Path) -> list[list[str]]:
-    """The overrides of all jobs by number, of which hydra's sweeper makes the product.
+    """Return the overrides of all jobs by number, as the product that hydra's sweeper makes.
 
-    Empty without the `multirun.yaml` that hydra leaves in the folder when a sweep starts, or where it takes more than
-    that file to know the jobs: `glob(...)` depends on the files of the configuration.
+    The list is empty without the `multirun.yaml` that hydra writes when a sweep starts, or if that file does not
+    determine the jobs: `glob(...)` depends on the config files.
     """
     if not (folder / PLAN).is_file():
         return []
-    given: Any = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
-    overrides = OverridesParser.create().parse_overrides(given)
+    arguments: Any = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
+    overrides = OverridesParser.create().parse_overrides(arguments)
     if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
         return []
     values = {
         o.get_key_element(): o.sweep_string_iterator() if o.is_discrete_sweep() else [o.get_value_element_as_str()]
         for o in overrides
     }
-    return [list(job) for job in product(*([f"{key}={value}" for value in of] for key, of in values.items()))]
+    return [list(job) for job in product(*([f"{key}={value}" for value in choices] for key, choices in values.items()))]
 
 
 def _pairs(overrides: Sequence[str]) -> dict[str, str]:
-    """`["ablation=full", "+a.b=1"]` as `{"ablation": "full", "a.b": "1"}`.
+    """Convert `["ablation=full", "+a.b=1"]` to `{"ablation": "full", "a.b": "1"}`.
 
-    Without those that only say where a job goes and that it may go on from there: `out=DIR` and `ckpt_path=last`.
+    Leave out `out=DIR` and `ckpt_path=last`, which only say where a job writes and that it may resume there.
     """
     split = (override.lstrip("+").partition("=") for override in overrides)
     return {key: value for key, _, value in split if key != "out" and (key, value) != ("ckpt_path", "last")}
@@ -247,15 +251,15 @@ def _job(folder: Path) -> Job:
 
 
 def _labelled(jobs: Sequence[Job]) -> list[Job]:
-    """The jobs, named by the overrides that are not equal in all of them, the seed apart.
+    """Name the jobs by the overrides, except the seed, that differ between them.
 
-    The choice of a config group is named by its value alone (`no_skips`), any other setting as `key=value`. A job that
-    differs in nothing bears the name of its experiment, or `all`.
+    The choice of a config group is named by its value alone (`no_skips`), any other setting as `key=value`. A job
+    without differing overrides takes the name of its experiment, or `all`.
     """
     described = [job.overrides for job in jobs if job.overrides]
     keys = dict.fromkeys(key for overrides in described for key in overrides if key != SEED)
     differing = [key for key in keys if len({overrides.get(key) for overrides in described}) > 1]
-    # A group fills a mapping of the configuration, or acts on all of it and leaves nothing under its own name.
+    # A group fills a mapping of the config, or acts on all of it and leaves nothing under the group's name.
     settings = {key for job in jobs for key, value in job.config.items() if not isinstance(value, dict)}
     named = []
     for job in jobs:

@@ -1,4 +1,4 @@
-"""The summary of a sweep: its settings over seeds as a table, as in the paper, and a chart."""
+"""Summary of a sweep: a table of its settings over seeds, as in the paper, and a chart."""
 
 import logging
 import math
@@ -29,8 +29,8 @@ from completesplat.results.tables import (
     write_csv,
 )
 
-# Hydra imports this file for every run, also to print the help: numpy, torch, rich and matplotlib are imported when a
-# job has ended.
+# Hydra imports this file for every run, even to print the help, so numpy, torch, rich and matplotlib are imported only
+# when a job has ended.
 log = logging.getLogger(__name__)
 
 CAPTION = (
@@ -39,26 +39,26 @@ CAPTION = (
 )
 NOTHING = "No job of this sweep has finished."
 FOLDERS = re.compile(r"""(?<![^=,\[\s'"])/(?:[^/,\]\s'"]+/)+(?=[^/,\]\s'"])""")
-"""An absolute path inside an argument, up to its last part."""
+"""Pattern of an absolute path inside an argument, up to its last part."""
 COLUMN = "full_novel_psnr"
 AXIS = "PSNR of novel views, all pixels (dB)"
 LINES = {"mean_image": "--", "copy_reference": ":"}
 
 
 class SweepSummary(Callback):
-    """Rewrites a sweep's summary after every job and prints it after the last.
+    """Hydra callback that rewrites a sweep's summary after every job and prints it after the last.
 
-    A sweep that is killed, or whose jobs fail, thus has one too; hydra does not call `on_multirun_end` for it. A
-    summary that cannot be written is logged as a warning with the reason, and the sweep goes on.
+    Thus a sweep that is killed, or whose jobs fail, has a summary too, although hydra does not call `on_multirun_end`
+    for it. If a summary cannot be written, a warning states the reason, and the sweep continues.
     """
 
     def on_job_end(self, config: Any, job_return: JobReturn, **kwargs: Any) -> None:
-        """Rewrite the summary, whether the job finished or failed; nothing in a run that is no sweep."""
+        """Rewrite the summary, whether the job finished or failed; do nothing outside a sweep."""
         if config.hydra.mode == RunMode.MULTIRUN:
             _summarize(config, last=False)
 
     def on_multirun_end(self, config: Any, **kwargs: Any) -> None:
-        """Print the summary and where it is; written again, since jobs that end together may miss each other."""
+        """Write the summary again, because jobs that end together may miss each other; print it and its path."""
         _summarize(config, last=True)
 
 
@@ -69,15 +69,15 @@ def _summarize(config: Any, last: bool) -> None:
         if last:
             show_summary(summary)
             print(folder / "summary.md")
-    except Exception as error:  # whatever it is, the jobs that are still to come matter more
+    except Exception as error:  # no error of a summary may stop the remaining jobs
         log.warning("no summary of the sweep: %s: %s", type(error).__name__, error)
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What is said of a sweep: rows with all metrics in all digits, and a table of the headline columns with remarks.
+    """Rows of a sweep with all metrics in all digits, and a table of the headline columns with remarks.
 
-    `commands` started the jobs; usually there is one. Each absolute path is cut to its last part.
+    `commands` started the jobs; usually there is one. Their absolute paths are cut to the last part.
     """
 
     rows: list[dict[str, Any]]
@@ -90,57 +90,57 @@ def summarize(*folders: Path) -> Summary:
     from completesplat.results.scores import rows
 
     jobs = collect(*folders)
-    found = rows([job for job in jobs if job.metrics is not None])
+    results = rows([job for job in jobs if job.metrics is not None])
     commands = dict.fromkeys(FOLDERS.sub(".../", typed(job.record["command"])) for job in jobs if job.record)
-    return Summary(found, _table(found, _remarks(jobs, found)), list(commands))
+    return Summary(results, _table(results, _remarks(jobs, results)), list(commands))
 
 
 def _table(rows: Sequence[dict[str, Any]], remarks: list[str]) -> Table:
     from completesplat.results.scores import figures, headline
 
-    shown, identity = headline(rows), ("ablation", "seeds", "scenes")
+    names, identity = headline(rows), ("ablation", "seeds", "scenes")
     body = [
         TableRow(
             "naive" if row["seeds"] is None else "ours",
             [*(Cell("" if row[key] is None else str(row[key])) for key in identity), *cells],
         )
-        for row, cells in zip(rows, figures(rows, shown), strict=True)
+        for row, cells in zip(rows, figures(rows, names), strict=True)
     ]
-    headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, shown)]
+    headings = [Heading("ablation", figures=False), Heading("seeds"), Heading("scenes"), *map(score_heading, names)]
     return Table("summary", "Test scenes, mean ± deviation over seeds", headings, body, remarks)
 
 
 def _remarks(jobs: Sequence[Job], rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Sentences: how many jobs have finished, which have not, what must not be compared, commit, machine and date."""
+    """Return sentences on finished and missing jobs, on rows that do not compare, on commit, machine and date."""
     from completesplat.results.scores import disagreeing
 
     finished = [job for job in jobs if job.metrics is not None]
-    said = [f"{len(finished)} of {len(jobs)} jobs have finished."]
+    remarks = [f"{len(finished)} of {len(jobs)} jobs have finished."]
     missing = []
     for job in (job for job in jobs if job.metrics is None):
         seed = [f"seed={job.overrides[SEED]}"] if SEED in job.overrides else []
-        missing.append(job.name or ", ".join([job.label, *seed]))  # there is no folder before a job starts
+        missing.append(job.name or ", ".join([job.label, *seed]))  # a job has no folder before it starts
     if missing:
-        said.append(f"Not finished: {'; '.join(missing)}.")
+        remarks.append(f"Not finished: {'; '.join(missing)}.")
     mixed = [row for row in rows if isinstance(row["scenes"], str) and row["seeds"] is not None]
-    said += [f"{row['ablation']} has seen the views that it is scored on." for row in rows if row["upper_bound"]]
-    said += [f"{row['ablation']}: its jobs were tested on different scenes ({row['scenes']})." for row in mixed]
+    remarks += [f"{row['ablation']} has seen the views that it is scored on." for row in rows if row["upper_bound"]]
+    remarks += [f"{row['ablation']}: its jobs were tested on different scenes ({row['scenes']})." for row in mixed]
     if len({row["scenes"] for row in rows if row["seeds"] is not None}) > 1:
-        said.append("The rows were not tested on equally many scenes and do not compare.")
+        remarks.append("The rows were not tested on equally many scenes and do not compare.")
     for predictor in disagreeing(finished):
-        said.append(f"{predictor} does not score the same in all jobs, so they differ in their test data; its mean.")
+        remarks.append(f"{predictor} does not score the same in all jobs, so they differ in their test data; its mean.")
     commits = list(dict.fromkeys(job.record["commit"] or "unknown" for job in jobs if job.record))
-    said.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
+    remarks.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
     here = machine()
     hardware = ", ".join([here["processor"], f"{here['cores']} cores", *([here["gpu"]] if "gpu" in here else [])])
     software = f"{here['system']}, Python {here['python']}, torch {here['torch']}"
-    return [*said, f"Summary of {here['date']}, made on {hardware}, {software}."]
+    return [*remarks, f"Summary of {here['date']}, made on {hardware}, {software}."]
 
 
 def write_summary(folder: Path, *parts: Path) -> Summary:
     """Write `summary.csv` (all metrics), `summary.md`, `summary.tex` and `summary.png` into a sweep's folder.
 
-    With `parts`, the folders of one sweep on several machines, they are of all of these.
+    `parts` are the folders of one sweep on several machines; the files then cover all of them.
     """
     from completesplat.results.scores import IDENTITY
 
@@ -177,7 +177,7 @@ def show_summary(summary: Summary) -> None:
 
 
 def _plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """A bar for each setting with its deviation over seeds, the naive predictors as upright lines."""
+    """Plot a bar for each setting with its standard deviation over seeds, and naive predictors as vertical lines."""
     from matplotlib.figure import Figure
 
     ours = [row for row in rows if row["seeds"] is not None]
@@ -214,6 +214,6 @@ def _draw(axes: Any, ours: list[dict[str, Any]], naive: list[dict[str, Any]]) ->
 
 
 def _finite(row: dict[str, Any], kind: str) -> float:
-    """Not-a-number, which is not drawn, for all that has no place on an axis."""
+    """Return a value, or NaN, which is not drawn, if it is missing or infinite."""
     value = row.get(f"{COLUMN}_{kind}")
     return value if value is not None and math.isfinite(value) else math.nan

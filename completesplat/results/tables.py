@@ -1,4 +1,4 @@
-"""The one type of table, and its writers: Markdown, LaTeX, CSV and the terminal."""
+"""Table type of all results, and its writers for Markdown, LaTeX, CSV and the terminal."""
 
 import csv
 from collections.abc import Iterable, Sequence
@@ -20,7 +20,7 @@ GROUPS = {
 SSIM_NOTE = (
     "SSIM: mean over all pixels, the picture mirrored at its border (skimage leaves 5 pixels out on every side)."
 )
-"""For tables with SSIM: the border is 37 % of the pixels of a picture of 48 x 48, 15 % of one of 128 x 128."""
+"""Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
 
 BEST, SECOND, UNMARKED = "best", "second", ""
 MARKED_MARKDOWN = {BEST: "**{}**", SECOND: "<ins>{}</ins>", UNMARKED: "{}"}
@@ -34,30 +34,30 @@ ESCAPES = str.maketrans(
 ABSENT, BLANK = "-", "(blank)"
 LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK}: left blank in the paper."
 
-Column = tuple[str, str, str]  # A heading, the key of the record, and the format of its values, empty for text
+Column = tuple[str, str, str]  # heading, key of the record, and format of its values (empty for text)
 LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
 EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
-"""Scores in the table of an evaluation."""
+"""Scores in the table of an evaluation, if they were measured."""
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
 
 def metric(name: str) -> str:
-    """A heading for `psnr` or `full_novel_psnr`: the metric with the direction that is better."""
+    """Return a heading for `psnr` or `full_novel_psnr`: the metric and its better direction."""
     name = name.rpartition("_")[2]
     return f"{METRICS[name]} {'↓' if name in LOWER_IS_BETTER else '↑'}"
 
 
 def score_heading(name: str) -> "Heading":
-    """For a score named `REGION_VIEW_METRIC`, below the heading of its region and view."""
+    """Return a heading for a score named `REGION_VIEW_METRIC`, grouped by region and view."""
     return Heading(metric(name), GROUPS[name.rpartition("_")[0]])
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:
-    """For each score of a metric (or `REGION_VIEW_METRIC`) whether it is the best, the second best, or unmarked.
+    """Return for each score of a metric (or `REGION_VIEW_METRIC`) the mark of the best, the second best, or none.
 
-    Scores are compared as they are written, so that those which look equal share a mark; None was not measured. Naive
-    predictors and upper bounds are not `competing`, and have no mark.
+    Scores are compared as they are written, so that scores which look equal share a mark; None was not measured. Naive
+    predictors and upper bounds are not `competing` and have no mark.
     """
     name = name.rpartition("_")[2]
     sign = 1 if name in LOWER_IS_BETTER else -1
@@ -65,14 +65,14 @@ def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) 
         sign * float(format(value, FORMATS[name])) if competes and value is not None else None
         for value, competes in zip(values, competing, strict=True)
     ]
-    ranked = sorted({value for value in written if value is not None and value == value})  # not-a-number is no rank
-    given = dict(zip(ranked, (BEST, SECOND), strict=False))
-    return [UNMARKED if value is None else given.get(value, UNMARKED) for value in written]
+    ranked = sorted({value for value in written if value is not None and value == value})  # without NaN
+    mark_of = dict(zip(ranked, (BEST, SECOND), strict=False))
+    return [UNMARKED if value is None else mark_of.get(value, UNMARKED) for value in written]
 
 
 @dataclass(frozen=True)
 class Cell:
-    """What is shown; `BEST`, `SECOND` or `UNMARKED`; and, of our own figures, all digits."""
+    """Text of a cell, its mark (`BEST`, `SECOND` or `UNMARKED`), and the exact value of figures of ours."""
 
     text: str
     mark: str = UNMARKED
@@ -81,7 +81,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class TableRow:
-    """Rows of different sources, such as the paper and a run, are kept apart by a rule."""
+    """Row of a table; a rule separates rows of different sources, such as the paper and a run."""
 
     source: str
     cells: list[Cell]
@@ -89,14 +89,14 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Heading:
-    """The heading of a column; the columns of a group share the heading above."""
+    """Heading of a column; the columns of a group share the heading above."""
 
     text: str
     group: str = ""
     figures: bool = True  # whether the column is aligned to the right
 
     def joined(self, separator: str = ": ") -> str:
-        """Group and text in one."""
+        """Join group and text."""
         return separator.join(part for part in (self.group, self.text) if part)
 
 
@@ -107,19 +107,19 @@ class Notes:
         self.texts: list[str] = []
 
     def number(self, text: str) -> int:
-        """The number of a text, equal for equal texts."""
+        """Return the number of a text, the same for equal texts."""
         if text not in self.texts:
             self.texts.append(text)
         return self.texts.index(text) + 1
 
     def missing(self, reason: str) -> Cell:
-        """A cell for what was not measured; the reason is a note."""
+        """Return a cell for a missing score, which refers to a note on the reason."""
         return Cell(f"missing: note {self.number(reason.removeprefix('missing: '))}")
 
 
 @dataclass(frozen=True)
 class Table:
-    """All that is shown of one table. Rich prints it as it is."""
+    """Complete content of one table, which rich can print."""
 
     name: str
     title: str
@@ -129,33 +129,33 @@ class Table:
     notes: Notes = field(default_factory=Notes)
 
     def groups(self) -> list[tuple[str, int]]:
-        """The headings above those of the columns, and how many columns each spans; empty where there are none."""
+        """Return the group headings and the number of columns of each; empty if there are none."""
         spans = [(name, len(list(members))) for name, members in groupby(heading.group for heading in self.headings)]
         return spans if any(name for name, _ in spans) else []
 
     def ruled_rows(self) -> list[tuple[TableRow, bool]]:
-        """The rows, each with whether a rule keeps it apart from the next one."""
+        """Return the rows, each with whether a rule separates it from the next one."""
         apart = [row.source != following.source for row, following in pairwise(self.rows)]
         return list(zip(self.rows, [*apart, False], strict=False))
 
     def below(self) -> list[str]:
-        """Remarks, and the notes with their numbers."""
+        """Return the remarks, and the notes with their numbers."""
         return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
 
     def __rich__(self) -> Any:
         from rich.table import Table as Shown
         from rich.text import Text
 
-        shown = Shown(title=self.title, title_justify="left")
+        printed = Shown(title=self.title, title_justify="left")
         for heading in self.headings:
-            shown.add_column(heading.joined("\n"), justify="right" if heading.figures else "left", overflow="fold")
+            printed.add_column(heading.joined("\n"), justify="right" if heading.figures else "left", overflow="fold")
         for row, ruled in self.ruled_rows():
-            shown.add_row(*(Text(cell.text, MARKED_TERMINAL[cell.mark]) for cell in row.cells), end_section=ruled)
-        return shown
+            printed.add_row(*(Text(cell.text, MARKED_TERMINAL[cell.mark]) for cell in row.cells), end_section=ruled)
+        return printed
 
 
 def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any]]) -> Table:
-    """One row for each record; what a record lacks stays empty."""
+    """Return a table with a row for each record; missing values stay empty."""
     rows = []
     for record in records:
         values = [(record.get(key), form) for _, key, form in columns]
@@ -164,12 +164,12 @@ def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any
 
 
 def by_name(entry: dict[str, Any]) -> dict[str, float]:
-    """The scores of a predictor's entry in `Evaluation.results`, by `REGION_VIEW_METRIC`; nulls are left out."""
+    """Return a predictor's scores in `Evaluation.results` by `REGION_VIEW_METRIC`, without nulls."""
     parts = [(region, part) for region, part in entry.items() if isinstance(part, dict)]
-    views = [(f"{region}_{view}", found) for region, part in parts for view, found in part.items()]
-    # The seconds of a sequence hold figures, not metrics by view.
-    named = [(name, found) for name, found in views if isinstance(found, dict)]
-    return {f"{name}_{metric}": x for name, found in named for metric, x in found.items() if x is not None}
+    views = [(f"{region}_{view}", metrics) for region, part in parts for view, metrics in part.items()]
+    # The seconds of a sequence are numbers, not metrics by view.
+    named = [(name, metrics) for name, metrics in views if isinstance(metrics, dict)]
+    return {f"{name}_{metric}": x for name, metrics in named for metric, x in metrics.items() if x is not None}
 
 
 def _record(predictor: str, entry: dict[str, Any]) -> dict[str, Any]:
@@ -178,41 +178,41 @@ def _record(predictor: str, entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluation_table(results: dict[str, Any]) -> Table:
-    """One row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only where there are masks."""
+    """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
     records = [_record(predictor, entry) for predictor, entry in results.items()]
     names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
     pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
     if all(record.get(name) == record.get(whole) for record in records for name, whole in pairs):
-        names = [name for name in names if not name.startswith("object")]  # every pixel is the object's
+        names = [name for name in names if not name.startswith("object")]  # without masks, every pixel is the object's
     columns = [("predictor", "predictor", "")]
     for name in names:
         region, view, kind = name.split("_")
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
     first = next(iter(results.values()))
-    shown = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
-    return replace(shown, remarks=[SSIM_NOTE])
+    result = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
+    return replace(result, remarks=[SSIM_NOTE])
 
 
 def show(*tables: Table, width: int = 120) -> None:
-    """Print tables with what stands below them, `width` characters wide where the output is no terminal."""
+    """Print tables, their remarks and notes, `width` characters wide if the output is not a terminal."""
     from rich.console import Console
 
     console = Console(width=None if Console().is_terminal else width, markup=False, highlight=False)
-    for index, shown in enumerate(tables):
+    for index, table in enumerate(tables):
         if index:
             console.print()
-        console.print(shown)
-        for line in shown.below():
+        console.print(table)
+        for line in table.below():
             console.print(line)
 
 
 def escape(text: str) -> str:
-    """Text as LaTeX prints it literally."""
+    """Escape text so that LaTeX prints it literally."""
     return text.translate(ESCAPES)
 
 
 def markdown_lines(table: Table) -> list[str]:
-    """The table alone."""
+    """Return the lines of the table alone."""
     cells = [
         [MARKED_MARKDOWN[cell.mark].format(cell.text.replace("|", r"\|")) for cell in row.cells] for row in table.rows
     ]
@@ -221,13 +221,13 @@ def markdown_lines(table: Table) -> list[str]:
 
 
 def as_markdown(table: Table) -> str:
-    """A heading, the table, and a list of remarks and notes."""
+    """Return a heading, the table, and a list of remarks and notes."""
     below = [f"- {line}" for line in table.below()]
     return "\n".join([f"## {table.title}", "", *markdown_lines(table), "", *below, ""])
 
 
 def latex_lines(table: Table) -> list[str]:
-    """The `tabular` alone, with booktabs' rules."""
+    """Return the lines of the `tabular` alone, with booktabs' rules."""
     columns = "".join("r" if heading.figures else "l" for heading in table.headings)
     lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
     if groups := table.groups():
@@ -242,7 +242,7 @@ def latex_lines(table: Table) -> list[str]:
 
 
 def as_latex(table: Table) -> str:
-    """A `table*`, shrunk to the text's width (`graphicx`), with remarks and notes below."""
+    """Return a `table*`, shrunk to the text's width (`graphicx`), with remarks and notes below."""
     top = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering", rf"\caption{{{escape(table.title)}}}"]
     *lines, end = latex_lines(table)
     below = [rf"{escape(line)}\par" for line in table.below()]
@@ -251,21 +251,21 @@ def as_latex(table: Table) -> str:
 
 
 def write_tables(tables: Sequence[Table], out: Path) -> None:
-    """Write `tables.md`, `tables.tex` and `tables.csv`, the last with a line for each cell."""
+    """Write `tables.md`, `tables.tex`, and `tables.csv` with a line for each cell."""
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
     write_text(out / "tables.tex", "\n".join(map(as_latex, tables)))
     lines = [
-        [one.name, one.title, row.source, row.cells[0].text, head.group, head.text, cell.text, cell.mark, cell.value]
-        for one in tables
-        for row in one.rows
-        for head, cell in zip(one.headings, row.cells, strict=True)
+        [each.name, each.title, row.source, row.cells[0].text, head.group, head.text, cell.text, cell.mark, cell.value]
+        for each in tables
+        for row in each.rows
+        for head, cell in zip(each.headings, row.cells, strict=True)
     ]
     write_csv(out / "tables.csv", CSV_COLUMNS, lines)
 
 
 def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
-    """Write a CSV file; None is an empty field, a number has all its digits."""
+    """Write a CSV file; None is an empty field, and numbers have all digits."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)

@@ -1,4 +1,4 @@
-"""The results of a test on Weights & Biases: figures, tables, and the scenes that were tested."""
+"""Results of a test on Weights & Biases: figures, tables, and the scenes that were tested."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,10 +30,10 @@ READABLE_SIDE = 128
 
 
 class SceneTable:
-    """Rows of the first `most` scenes that a test scores in this process, each given to `add`.
+    """Rows of the first `most` scenes that a test scores in this process and passes to `add`.
 
-    Pictures are rows of views: the reference's, then targets, evenly spread. Depth and turntable are of the first
-    sample; the turntables are also `folder/00.mp4` and so on.
+    Images are strips of views: the reference, then evenly spread targets. Depth and turntable show the first sample;
+    the turntables are also written to `folder/00.mp4` and so on.
     """
 
     def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
@@ -42,7 +42,7 @@ class SceneTable:
 
     @torch.no_grad()
     def add(self, scene: ScoredScene) -> None:
-        """Keep pictures, video and scores of a scene, up to `most` scenes."""
+        """Keep images, video and scores of a scene, up to `most` scenes."""
         if len(self.rows) >= self.most:
             return
         row: dict[str, Any] = {"scene": scene.name, "input": strip(scene.input[None])}
@@ -66,7 +66,7 @@ class SceneTable:
         return path
 
     def media(self) -> dict[str, Any]:
-        """What is logged: `test/scenes` and `test/turntables`; nothing if no scene was tested here."""
+        """Return `test/scenes` and `test/turntables` for the log; nothing if no scene was tested here."""
         import wandb
 
         if not self.rows:
@@ -77,7 +77,7 @@ class SceneTable:
 
 
 def as_media(value: Any) -> Any:
-    """Pictures and videos as W&B's; all else as it is."""
+    """Convert images and videos to W&B's types; leave other values as they are."""
     import wandb
 
     if isinstance(value, Image.Image):
@@ -86,19 +86,19 @@ def as_media(value: Any) -> Any:
 
 
 def strip(images: Float[Tensor, "view 3 height width"]) -> Image.Image:
-    """Views side by side, each enlarged by a whole factor to about 128 px."""
+    """Join views side by side, each enlarged by a whole factor to about 128 px."""
     factor = max(1, round(READABLE_SIDE / max(images.shape[-2:])))
     return image_grid(images.float().nan_to_num(), factor=factor)
 
 
 def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
-    """The model's scores for a scene, and those of the best of several samples, by `region_view_metric`."""
+    """Return the model's scores for a scene, and those of its best sample, by `region_view_metric`."""
     model, best = (evaluation.scores.get(predictor, {}).get(name, {}) for predictor in (MODEL, BEST))
     return {"_".join(key): x for key, x in model.items()} | {f"{BEST}/{'_'.join(key)}": x for key, x in best.items()}
 
 
 def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
-    """If W&B is among the loggers, begin its run, and collect the scenes of a test for it; None otherwise."""
+    """Begin W&B's run and collect a test's scenes for it; return None if W&B is not among the loggers."""
     runs = wandb_runs(trainer.loggers)
     if not runs or not trainer.is_global_zero:
         return None
@@ -110,7 +110,7 @@ def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> Scen
 
 
 def log_shown(results: dict[str, Any], scenes: SceneTable | None, trainer: Trainer, out: Path) -> None:
-    """For W&B, tables, pictures and videos of a test.
+    """Log tables, images and videos of a test to W&B.
 
     `scenes` is what `begin` returned, `out` the run directory with the results in its `metrics.json`.
     """
@@ -126,8 +126,8 @@ def log_shown(results: dict[str, Any], scenes: SceneTable | None, trainer: Train
 
 
 def log_modes(results: Mapping[str, Mapping[str, float]], figure: Path, config: Any, loggers: Sequence[Logger]) -> None:
-    """Log `hidden_modes/METHOD/FIGURE`; for W&B also the picture."""
-    numbers = {f"hidden_modes/{method}/{name}": x for method, found in results.items() for name, x in found.items()}
+    """Log `hidden_modes/METHOD/FIGURE`; for W&B also the figure."""
+    numbers = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
     for logger in loggers:
         logger.log_metrics(numbers, step=0)
         logger.save()
@@ -139,7 +139,7 @@ def log_modes(results: Mapping[str, Mapping[str, float]], figure: Path, config: 
 
 
 def predictor_table(flat: dict[str, dict[str, float]]) -> Any:
-    """A row for each predictor; what was not measured for one stays empty."""
+    """Return a table with a row for each predictor; scores that were not measured stay empty."""
     import wandb
 
     columns = list(dict.fromkeys(name for scores in flat.values() for name in scores))
@@ -148,7 +148,7 @@ def predictor_table(flat: dict[str, dict[str, float]]) -> Any:
 
 
 def as_wandb(table: Table) -> Any:
-    """A table of a report with its texts, and in its last rows what stands below it."""
+    """Convert a table of a report; its last rows are the remarks and notes."""
     import wandb
 
     columns: list[str | int] = [heading.joined() for heading in table.headings]

@@ -1,1 +1,1 @@
-"""Studies of a trained model's samples, and of data sets, each with its figures and its picture."""
+"""Studies of a trained model's samples and of data sets, each with numbers and a figure."""

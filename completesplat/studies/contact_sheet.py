@@ -1,4 +1,4 @@
-"""One picture of several sequences and their cameras, on which a wrong convention is seen at once."""
+"""Contact sheet of several sequences and their cameras, on which a wrong convention is obvious."""
 
 import math
 import textwrap
@@ -25,10 +25,10 @@ LEGEND = (
 
 
 def show(sequences: Sequence[PosedSequence], path: Path, pictures: int, title: str) -> None:
-    """Write a PNG with a row for each sequence: some pictures, and its cameras from above and from the side.
+    """Write a PNG with a row for each sequence: some images, and its cameras from above and from the side.
 
-    The pictures are evenly spaced, the first and the last frame among them. One that cannot be read is a grey cell
-    with the kind of its `DataError`.
+    The images are evenly spaced from the first to the last frame. An unreadable image becomes a grey cell with the
+    kind of its `DataError`.
     """
     width = _left(pictures + len(DRAWINGS)) - GAP + MARGIN
     legend = [line for text in LEGEND for line in _wrapped(text, width - 2 * MARGIN)]
@@ -45,7 +45,7 @@ def show(sequences: Sequence[PosedSequence], path: Path, pictures: int, title: s
 
 
 def _draw_row(sheet: Image.Image, top: int, sequence: PosedSequence, pictures: int) -> None:
-    """Heading, cells and captions below them."""
+    """Draw a heading, and cells with captions below them."""
     cross = place_cross(sequence.cameras, sequence.depth_ranges[0])
     (near, far), (focal, *_) = sequence.depth_ranges[0].tolist(), sequence.cameras.intrinsics[0, 0].tolist()
     fov = math.degrees(2 * math.atan(sequence.cameras.image_size[1] / 2 / focal))
@@ -65,7 +65,7 @@ def _draw_row(sheet: Image.Image, top: int, sequence: PosedSequence, pictures: i
 
 
 def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Image.Image, str]:
-    """A picture with the cross, and what to say if the cross is not in it."""
+    """Return an image with the cross, and a remark if the cross is not in the image."""
     try:
         picture = sequence.read(index)
     except DataError as error:
@@ -80,16 +80,16 @@ def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Im
     lines = [(ends, "white", 2) for _, ends in sides] + [(ends, CROSS_COLORS[arm], 3) for arm, ends in arms]
     for ends, color, width in lines:
         points = [(x, y) for x, y in (CELL / camera.image_size[1] * ends).tolist()]
-        draw.line(points, INK, width + 2)  # a dark edge keeps it visible on anything
+        draw.line(points, INK, width + 2)  # a dark edge keeps it visible on any image
         draw.line(points, color, width)
     inside = any(((ends > 0) & (ends < camera.image_size[1])).all(dim=-1).any() for _, ends in arms)
     return cell, "" if inside else ": cross outside" if arms else ": cross behind"
 
 
 def _with_outline(picture: Picture) -> Image.Image:
-    """The picture at the size of a cell, with a line where the mask crosses one half."""
+    """Resize an image to a cell, with a line where the mask crosses one half."""
     image = Image.fromarray(np.ascontiguousarray(picture.image.permute(1, 2, 0).numpy()))
-    # Enlarged, this filter repeats pixels; reduced, it averages them.
+    # This filter repeats pixels to enlarge an image, and averages them to reduce it.
     pixels = np.array(image.resize((CELL, CELL), Image.Resampling.BOX))
     if picture.mask is not None:
         mask = Image.fromarray(np.ascontiguousarray(picture.mask[0].numpy()))
@@ -105,17 +105,17 @@ def _left(column: int) -> int:
 
 
 def _text(picture: Image.Image, place: tuple[int, int], text: str, width: int, size: int = TEXT) -> None:
-    """One line, shortened to `width` pixels."""
+    """Write one line, shortened to `width` pixels."""
     font = ImageFont.load_default(size=size)
-    shown, text = text, text.rstrip()
-    while shown and font.getlength(shown) > width:
+    line, text = text, text.rstrip()
+    while line and font.getlength(line) > width:
         text = text[:-1]
-        shown = f"{text}..."
-    ImageDraw.Draw(picture).text(place, shown, INK, font)
+        line = f"{text}..."
+    ImageDraw.Draw(picture).text(place, line, INK, font)
 
 
 def _wrapped(text: str, width: int) -> list[str]:
-    """Lines that fit into `width` pixels."""
+    """Break a text into lines that fit into `width` pixels."""
     font = ImageFont.load_default(size=TEXT)
     wrapped = (textwrap.wrap(text, columns) for columns in range(len(text), 0, -1))
     return next(lines for lines in wrapped if all(font.getlength(line) <= width for line in lines))

@@ -1,4 +1,4 @@
-"""What the controls of a drawing do: skip and guidance weight, and boxes that hide a part of the picture."""
+"""Effects of the controls of sampling: skip and guidance weight, and boxes that hide a part of the image."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
 
 
 def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
-    """All pairs of (skip weight, guidance weight) and the paper's three; `CompleteSplatError` outside of [0, 1]."""
+    """Return all pairs of (skip weight, guidance weight) and the paper's three; check that weights are in [0, 1]."""
     pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
     for skip_weight, guidance_weight in pairs:
         allowed_skip_weight(skip_weight)
@@ -39,10 +39,10 @@ def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> li
 def rows(
     renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], near_degrees: float, tick: Tick
 ) -> list[Row]:
-    """A row for each setting, mean over the scenes.
+    """Return a row for each setting, with means over the scenes.
 
-    `reference_psnr` is of the reference view; `near_object_psnr` of the true object's pixels in the targets that look
-    at most `near_degrees` away from the reference: mostly surface that the input shows. `diversity` is of the targets.
+    `reference_psnr` is of the reference view. `near_object_psnr` is of the true object's pixels in targets at most
+    `near_degrees` from the reference's direction, which mostly show surfaces of the input. `diversity` is of targets.
     """
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
@@ -59,23 +59,22 @@ def rows(
 
 
 def over_settings(settings: Settings, scenes: Sequence[SceneBatch], measure: Measure, tick: Tick) -> list[Row]:
-    """A row for each setting: the mean over the scenes of what is measured with its skip and guidance weight."""
-    found: list[Row] = []
+    """Return a row for each setting: means over the scenes, measured with its skip and guidance weight."""
+    results: list[Row] = []
     for skip_weight, guidance_weight in settings:
         tick(f"skip weight {skip_weight:g}, guidance weight {guidance_weight:g}")
         means = mean_over_scenes([measure(scene, skip_weight, guidance_weight) for scene in scenes])
         paper = (skip_weight, guidance_weight) in PAPER
-        found.append({"skip_weight": skip_weight, "guidance_weight": guidance_weight, "paper": paper, **means})
-    return found
+        results.append({"skip_weight": skip_weight, "guidance_weight": guidance_weight, "paper": paper, **means})
+    return results
 
 
 def strips(
     renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int
 ) -> tuple[list[list[Strip | None]], list[str]]:
-    """Rows by skip weight, columns by guidance weight: one sample's reference view, and several from far away.
+    """Return rows by skip weight and columns by guidance weight: one sample's reference view, several far views.
 
-    The far view is the target that looks in the direction most different from the reference's. The first row is the
-    truth.
+    The far view is the target whose direction differs most from the reference's. The first row is the truth.
     """
     far = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0])
     skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
@@ -86,8 +85,8 @@ def strips(
         for column, weight in enumerate(weights):
             if (skip, weight) in settings:
                 images = renderer(scene, skip_weight=skip, guidance_weight=weight)
-                shown = torch.cat([images[:1, 0], images[:samples, far]])
-                rows[-1][column] = Strip(shown, f"guidance {weight:g}", (skip, weight) in PAPER)
+                parts = torch.cat([images[:1, 0], images[:samples, far]])
+                rows[-1][column] = Strip(parts, f"guidance {weight:g}", (skip, weight) in PAPER)
     return rows, ["", *(f"skip {skip:g}" for skip in skips[::-1])]
 
 
@@ -103,10 +102,10 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
         for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS.items(), strict=True):
             drawn = [row for row in rows if row[key] is not None]
             for skip in skips:
-                own = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
+                line = sorted((r["guidance_weight"], r["diversity"], r[key]) for r in drawn if r["skip_weight"] == skip)
                 color = colormaps["viridis"](0.9 * skip)
-                panel.plot([p[1] for p in own], [p[2] for p in own], "o-", color=color, label=f"skip weight {skip:g}")
-                for weight, x, y in own:
+                panel.plot([p[1] for p in line], [p[2] for p in line], "o-", color=color, label=f"skip weight {skip:g}")
+                for weight, x, y in line:
                     panel.annotate(f"{weight:g}", (x, y), (4, -9), textcoords="offset points", fontsize=7, color="0.35")
             for row in drawn:
                 if row["paper"]:
@@ -120,13 +119,13 @@ def plot_controls(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> 
 
 
 def check_box(box: Sequence[float]) -> None:
-    """`CompleteSplatError` for what is no box in shares of a picture, has no pixels, or reaches out of the picture."""
+    """Check that a box in shares of an image is valid, has pixels and lies inside the image."""
     if len(box) != 4 or not (0 <= box[0] < box[2] <= 1 and 0 <= box[1] < box[3] <= 1):
         raise CompleteSplatError(f"boxes: {list(box)} is no [x0,y0,x1,y1] with 0 <= x0 < x1 <= 1 and so on")
 
 
 def box_visibility(box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
-    """1 outside of a box [x0 y0 x1 y1] in shares of the square, 0 in the pixels that it touches."""
+    """Return 1 outside of a box [x0 y0 x1 y1] in shares of the square, 0 in the pixels that it touches."""
     left, upper, right, lower = box
     visible = torch.ones(1, size, size)
     rows, columns = (slice(math.floor(a * size), math.ceil(b * size)) for a, b in ((upper, lower), (left, right)))
@@ -141,10 +140,10 @@ def masked_strips(
     views: int,
     guidance_weight: float,
 ) -> tuple[list[list[Strip | None]], list[str]]:
-    """Rows of three columns for each scene and their names: the truth, then its completions, without skips.
+    """Return named rows for each scene: the truth, then its completions without skips.
 
-    The columns are the input (complete in the truth's row), the reference view, and other views evenly spread over the
-    targets. The boxes take turns.
+    The columns are the input (complete for the truth), the reference view, and other views evenly spread over the
+    targets. The scenes use the boxes in turn.
     """
     rows: list[list[Strip | None]] = []
     names = []
@@ -152,13 +151,13 @@ def masked_strips(
         visible = box_visibility(box, scene.reference.images.shape[-1]).to(scene.reference.images)
         images = renderer(scene, visible=visible[None], guidance_weight=guidance_weight)
         count = images.shape[1] - 1
-        shown = [1 + i * count // views for i in range(min(views, count))]
+        others = [1 + i * count // views for i in range(min(views, count))]
         true = scene.all_views().images[0]
-        rows.append([Strip(true[:1], "input"), Strip(true[:1], "reference view"), Strip(true[shown], "other views")])
+        rows.append([Strip(true[:1], "input"), Strip(true[:1], "reference view"), Strip(true[others], "other views")])
         names.append(f"{scene.names[0]}\ntruth")
         for sample, drawn in enumerate(images):
-            # Grey, as black may be the picture's own.
+            # Grey, because the image itself may be black.
             seen = Strip(true[:1] * visible + 0.5 * (1 - visible), "what is seen") if sample == 0 else None
-            rows.append([seen, Strip(drawn[:1]), Strip(drawn[shown])])
+            rows.append([seen, Strip(drawn[:1]), Strip(drawn[others])])
             names.append(f"sample {sample}")
     return rows, names

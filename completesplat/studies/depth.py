@@ -1,4 +1,4 @@
-"""Where the samples of one input disagree in depth: the paper's figure of diversity in depth, with numbers."""
+"""Disagreement of one input's samples in depth: the paper's figure of diversity in depth, with numbers."""
 
 from collections.abc import Sequence
 
@@ -15,10 +15,10 @@ from completesplat.studies.samples import SampleRenderer, farthest, near
 
 
 def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tensor, "*view 1 height width"]:
-    """Standard deviation of the depth over those samples that have one (more than 0) at a pixel.
+    """Return the standard deviation of the depth over those samples that have one (more than 0) at a pixel.
 
-    Its square is the unbiased estimate of the variance, so that pixels with more and with fewer samples compare. NaN
-    where less than two samples have a depth.
+    Its square is the unbiased variance, so pixels with different numbers of samples compare. It is NaN where fewer
+    than two samples have a depth.
     """
     known = depth > 0
     count = known.sum(0)
@@ -29,13 +29,13 @@ def deviation(depth: Float[Tensor, "sample *view 1 height width"]) -> Float[Tens
 def rows(
     renderer: SampleRenderer, settings: Settings, scenes: Sequence[SceneBatch], far_degrees: float, tick: Tick
 ) -> list[Row]:
-    """A row for each (skip weight, guidance weight), mean over the scenes.
+    """Return a row for each (skip weight, guidance weight), with means over the scenes.
 
-    `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units,
-    `far_deviation` that over the targets that look more than `far_degrees` away from the reference;
+    `reference_deviation` is the mean of `deviation` over the reference view's pixels, in the scene's units;
+    `far_deviation` is that over targets that look more than `far_degrees` away from the reference.
     `reference_object_deviation` and `far_object_deviation` are of the true object's pixels alone. `reference_measured`
-    and `far_measured` are the shares of pixels where two samples or more are more than half opaque: the others have no
-    part in the deviations. What no scene has is None.
+    and `far_measured` are the shares of pixels where at least two samples are more than half opaque; only these count
+    in the deviations. A figure that no scene has is None.
     """
 
     def measure(scene: SceneBatch, skip_weight: float, guidance_weight: float) -> dict[str, float | None]:
@@ -48,15 +48,15 @@ def rows(
 def deviations(
     depth: Float[Tensor, "sample view 1 height width"], scene: SceneBatch, far_degrees: float
 ) -> dict[str, float | None]:
-    """The figures of `rows` for one scene (a batch of one); depth of the reference view and of all targets."""
+    """Return the figures of `rows` for one scene (a batch of one); `depth` is of the reference view and all targets."""
     maps, masks = deviation(depth), scene.all_views().masks[0]
     far = 1 + torch.nonzero(~near(scene.reference.cameras[0], scene.targets.cameras[0], far_degrees))[:, 0]
-    found: dict[str, float | None] = {}
+    figures: dict[str, float | None] = {}
     for name, views in (("reference", far.new_zeros(1)), ("far", far)):
-        found[f"{name}_deviation"] = _mean(maps[views])
-        found[f"{name}_object_deviation"] = _mean(maps[views][masks[views] > 0.5])
-        found[f"{name}_measured"] = maps[views].isfinite().float().mean().item() if len(views) else None
-    return found
+        figures[f"{name}_deviation"] = _mean(maps[views])
+        figures[f"{name}_object_deviation"] = _mean(maps[views][masks[views] > 0.5])
+        figures[f"{name}_measured"] = maps[views].isfinite().float().mean().item() if len(views) else None
+    return figures
 
 
 def _mean(values: Float[Tensor, "..."]) -> float | None:
@@ -67,12 +67,12 @@ def _mean(values: Float[Tensor, "..."]) -> float | None:
 def strips(
     renderer: SampleRenderer, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
 ) -> list[list[Strip]]:
-    """A row for each scene: the truth, some samples from far away, and where all samples disagree.
+    """Return a row for each scene: the truth, some samples in the far view, and where all samples disagree.
 
-    The far view is the target that looks in the direction most different from the reference's. The truth is the input
-    and the far view; a sample's pictures are its render, depth and normals in the far view; the deviation is that of
-    the depth in both views, dark where the samples agree. The depths of a row have one scale, and so have its
-    deviations. Grey: nothing to see, or to compare.
+    The far view is the target whose direction differs most from the reference's. The truth is the input and the far
+    view. A sample's images are its render, depth and normals in the far view. The standard deviation is that of the
+    depth in both views, dark where the samples agree. The depths of a row share one scale, as do its deviations. Grey
+    pixels show nothing, or have nothing to compare.
     """
     rows = []
     for scene in scenes:
@@ -92,7 +92,7 @@ def strips(
 def color_deviation(
     deviation: Float[Tensor, "view 1 height width"],
 ) -> tuple[Float[Tensor, "view 3 height width"], float]:
-    """Dark for 0, on one scale for all views, grey for NaN; and the scale's end, which 2 % of the pixels exceed."""
+    """Return colours (dark for 0, grey for NaN, one scale for all views) and the scale's end, the 98 % quantile."""
     known = deviation.isfinite()
     end = deviation[known].quantile(0.98).item() if known.any() else 0.0
     colors = ramp(torch.where(known, deviation, 0) / max(end, 1e-12))

@@ -1,4 +1,4 @@
-"""How the studies' figures are written, and pictures side by side in rows and columns."""
+"""Writer of the studies' figures, and images side by side in rows and columns."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ from completesplat.export.pictures import to_bytes
 def written_figure(
     path: Path, title: str, size: tuple[float, float], dpi: int = 110, layout: str | None = "constrained"
 ) -> Iterator[Figure]:
-    """A figure of this width and height in inches, which is written as a PNG when the block ends without exception."""
+    """Yield a figure of this width and height in inches; write it as a PNG if the block ends without exception."""
     figure = Figure(figsize=size, layout=layout)  # type: ignore[arg-type]
     figure.suptitle(title)
     yield figure
@@ -26,13 +26,13 @@ def written_figure(
         figure.savefig(temporary, dpi=dpi)
 
 
-READABLE_SIDE = 0.9  # of a picture, in inches
-GAP = 1  # between the pictures of a strip, in pixels
+READABLE_SIDE = 0.9  # of an image, in inches
+GAP = 1  # between the images of a strip, in pixels
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Pictures side by side under a label."""
+    """Images side by side under a label."""
 
     images: Float[Tensor, "picture 3 height width"]
     label: str = ""
@@ -57,7 +57,7 @@ def draw_strips(rows: Sequence[Sequence[Strip | None]], names: Sequence[str], pa
 
 
 def _side_by_side(images: Float[Tensor, "picture 3 height width"], count: int) -> Float[Tensor, "3 height _"]:
-    """One row of `count` pictures; white stands in for those that are missing, so that all rows have one scale."""
+    """Join images to a row of `count`; white replaces missing ones, so that all rows have one scale."""
     white = torch.ones_like(images[0])
     pictures = [*images, *[white] * (count - len(images))]
     return torch.cat([part for image in pictures for part in (image, white[..., :GAP])], dim=-1)[..., :-GAP]

@@ -1,4 +1,4 @@
-"""The cameras of a sequence as drawings, and a cross that must stick to its place in all pictures."""
+"""Drawings of a sequence's cameras, and a cross that must keep its place in the scene in all images."""
 
 import math
 from dataclasses import dataclass
@@ -12,40 +12,40 @@ from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import PosedSequence
 from completesplat.geometry.cameras import Cameras, project, transform_points, unproject
 
-# In units of half the first picture's width, seen from the first camera.
+# In units of half the first image's width, as the first camera sees it.
 ARM = 0.3
-# Root mean squares: image axes must turn by so much (radians) for the horizon to be known from them; optical axes must
-# spread by so much, and pass by their common point within so much of its depth, to look at one thing.
+# Root mean squares. The horizon follows from image axes that turn at least this much (radians). Cameras look at one
+# thing if their optical axes spread at least this much and miss their common point by at most this share of its depth.
 LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
-# Candidates for the place of the cross along an axis; in a picture, it counts as seen so far from the borders (shares).
+# Number of places for the cross along an axis; and share of an image at its borders where the cross counts as unseen.
 DEPTHS, BORDER = 16, 0.1
-# Of the length of an arm: what is nearer to a camera's plane is not drawn.
+# Share of an arm's length; lines nearer to a camera's plane are not drawn.
 NEAREST = 0.05
 
 
 @dataclass(frozen=True)
 class Cross:
-    """Three arms from one place and a level square around it; rows of `arms`: right, up and ahead."""
+    """Three arms from one place, and a level square around it; rows of `arms`: right, up and ahead."""
 
     center: Float[Tensor, "3"]
     arms: Float[Tensor, "3 3"]
 
     def ends(self) -> Float[Tensor, "3 2 3"]:
-        """The two ends of each arm in the world; it begins at the centre."""
+        """Return the two ends of each arm in the world; the first is the centre."""
         return torch.stack([self.center.expand(3, 3), self.center + self.arms], dim=1)
 
     def square(self) -> Float[Tensor, "4 2 3"]:
-        """The two ends of each side in the world."""
+        """Return the two ends of each side of the square in the world."""
         right, _, ahead = self.arms
         corners = self.center + torch.stack([right + ahead, right - ahead, -right - ahead, -right + ahead])
         return torch.stack([corners, corners.roll(-1, 0)], dim=1)
 
 
 def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
-    """A cross for cameras [view] where their optical axes meet, if they do in front of all of them.
+    """Place a cross where the optical axes of cameras [view] meet, if they meet in front of all cameras.
 
-    Otherwise on the axis of the first, the middle or the last camera, where most cameras see it; of the best places
-    the nearest, but none nearer than the middle of the first camera's depth range in terms of 1 / depth.
+    Otherwise place it on the axis of the first, the middle or the last camera, where most cameras see it. Of equally
+    good places take the nearest, beyond the middle of the first camera's depth range in terms of 1 / depth.
     """
     met = _common_point(cameras)
     center = _most_seen_point(cameras, depth_range) if met is None else met
@@ -55,15 +55,14 @@ def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
 
 
 def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
-    """Unit vectors in the world as rows: the first camera's right, up and forward, turned so that up is the world's.
+    """Return unit vectors in the world as rows: the first camera's right, up and ahead, levelled to the world's up.
 
-    Where the cameras [view] hardly turn, no horizon follows from them, and the mean of their own up directions is
-    taken.
+    If the cameras [view] hardly turn, no horizon follows from them, and up is the mean of their up directions.
     """
     right, down, forward = cameras.world_to_camera[:, :3, :3].unbind(dim=1)
     turn = torch.linalg.svdvals(right)[1:2] / len(right) ** 0.5
     up = world_up(cameras) if (turn > LEAST_TURN).any() else torch.nn.functional.normalize(-down.mean(dim=0), dim=0)
-    # In a picture taken straight down, ahead is at its upper edge; in one taken straight up, at its lower.
+    # Ahead is at the upper edge of an image taken straight down, and at the lower edge of one taken straight up.
     ahead = forward[0] if (forward[0] @ up).abs() < 0.99 else down[0] * (forward[0] @ up).sign()
     ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
     return torch.stack([torch.linalg.cross(ahead, up), up, ahead])
@@ -72,7 +71,7 @@ def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
 def visible_segments(
     camera: Cameras, segments: Float[Tensor, "segment 2 3"], nearest: float
 ) -> list[tuple[int, Float[Tensor, "2 2"]]]:
-    """Number and ends in pixels of the segments, cut off where they are less deep than `nearest` before a camera []."""
+    """Return number and ends (pixels) of the segments before a camera [], cut off at the depth `nearest`."""
     _, depths = project(camera, segments.flatten(0, 1))
     result = []
     for index, (ends, depth) in enumerate(zip(segments, depths.reshape(-1, 2), strict=True)):
@@ -85,7 +84,7 @@ def visible_segments(
 
 
 def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """The point nearest to all optical axes, if they pass it closely, from several sides, and it lies before them."""
+    """Return the point nearest to all optical axes, if they pass close to it, from several sides, and face it."""
     forward, centers = cameras.world_to_camera[:, 2, :3], cameras.centers
     across = torch.eye(3).to(forward) - forward[:, :, None] * forward[:, None, :]
     mean = across.mean(dim=0)
@@ -105,7 +104,7 @@ def _most_seen_point(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Float
     count = len(cameras.centers)
     chosen = [0, count // 2, count - 1]
     origins, forward = cameras.centers[chosen], cameras.world_to_camera[chosen, 2, :3]
-    # All three candidates at one depth stand before those at the next: the first of the best is the nearest.
+    # Points are ordered by depth, so the first of the best is the nearest.
     points = (origins + depths[:, None, None] * forward).flatten(0, 1)
     pixels, depth = project(cameras, points)
     height, width = cameras.image_size
@@ -114,10 +113,10 @@ def _most_seen_point(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Float
     return points[seen.sum(dim=0).argmax()]
 
 
-FINE = 4  # drawn this much larger, then reduced
+FINE = 4  # factor by which drawings are made larger before they are reduced
 MARGIN = 0.08
 FRUSTUM = 0.14
-# A far plane is drawn up to this multiple of the extent of everything else; an arrow stands for the rest.
+# The depth range is drawn up to this multiple of the extent of everything else; an arrow replaces the rest.
 REACH = 2.5
 MOST_FRUSTA = 25
 CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
@@ -127,11 +126,11 @@ EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (5, 6)]
 
 @dataclass(frozen=True)
 class Drawings:
-    """A sequence prepared for drawing; both drawings have one scale.
+    """Sequence prepared for two drawings with one scale.
 
-    `axes` are the first camera's right, up and ahead, level, as rows; `frusta` apex, corners of the picture at some
-    depth, and a tick at its upper edge; `depth_range` the ends of the first camera's as far as they are drawn (`cut`:
-    not up to far); `middle` along the axes and `span` in scene units are of all that is drawn.
+    Rows of `axes` are the first camera's right, up and ahead, levelled. `frusta` are apex, corners of the image at some
+    depth, and a tick at its upper edge. `depth_range` has the ends of the first camera's range as drawn (`cut`: far is
+    beyond). `middle` (along the axes) and `span` (scene units) cover everything that is drawn.
     """
 
     axes: Float[Tensor, "3 3"]
@@ -144,15 +143,15 @@ class Drawings:
     span: float
 
     def from_above(self, side: int) -> Image.Image:
-        """A square picture: to the right is the first camera's right, ahead is up."""
+        """Draw a square image whose right is the first camera's right and whose top is ahead."""
         return self._draw(side, self.axes[[0, 2]], self.middle[[0, 2]])
 
     def from_the_side(self, side: int) -> Image.Image:
-        """A square picture, seen from the first camera's right: ahead is to the right."""
+        """Draw a square image seen from the first camera's right, with ahead to the right."""
         return self._draw(side, self.axes[[2, 1]], self.middle[[2, 1]])
 
     def scale_bar(self) -> float:
-        """A round length of about a quarter of the drawings, in scene units."""
+        """Return a round length of about a quarter of the drawings, in scene units."""
         power: float = 10 ** math.floor(math.log10(self.span / 3))
         return max(step * power for step in (1, 2, 5) if step * power <= self.span / 3)
 
@@ -192,7 +191,7 @@ def drawings(sequence: PosedSequence, cross: Cross) -> Drawings:
 
 
 def time_color(share: float) -> tuple[int, int, int]:
-    """Colours run from dark blue at the beginning of a sequence (0) over red to orange at its end (1)."""
+    """Return a colour from dark blue at the beginning of a sequence (0) over red to orange at its end (1)."""
     from matplotlib import colormaps
 
     red, green, blue, _ = colormaps["plasma"](0.85 * share, bytes=True)
@@ -205,7 +204,7 @@ def _extent(points: Float[Tensor, "_ 3"]) -> float:
 
 
 def _frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
-    """Apex, corners of the picture at this depth, and from the middle of its upper edge a tick to above."""
+    """Return apex, corners of the image at this depth, and a tick upwards from the middle of its upper edge."""
     height, width = cameras.image_size
     pixels = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0), (width / 2, -height / 5)]
     places, depths = (torch.tensor(values).to(cameras.intrinsics) for values in (pixels, [depth] * 6))
@@ -214,7 +213,7 @@ def _frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
 
 @dataclass(frozen=True)
 class _Pen:
-    """Draws things of the world on a plane; widths in pixels of the reduced picture."""
+    """Pen that draws world points on a plane; widths are in pixels of the reduced image."""
 
     draw: ImageDraw.ImageDraw
     plane: Float[Tensor, "2 3"]
@@ -226,10 +225,10 @@ class _Pen:
         self.draw.line(self.pixels(points), color, FINE * width)
 
     def ends(self, interval: Float[Tensor, "2 3"], color: tuple[int, int, int], arrow: bool) -> None:
-        """A bar across the near end; another or, for a range that goes on, an arrow at the far end."""
+        """Draw a bar across the near end, and at the far end another, or an arrow if the range continues."""
         (x0, y0), (x1, y1) = self.pixels(interval)
         length = math.hypot(x1 - x0, y1 - y0)
-        if length < 1:  # it points at the spectator
+        if length < 1:  # it points at the viewer
             return
         x, y = 7 * FINE * (x1 - x0) / length, 7 * FINE * (y1 - y0) / length
         first, last = ([(a - y, b + x), (a + y, b - x)] for a, b in ((x0, y0), (x1, y1)))

@@ -1,4 +1,4 @@
-"""The benchmark of what the reference view hides: samples against all that could be there."""
+"""Benchmark of content that the reference view hides: samples against all possible modes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -35,18 +35,17 @@ from completesplat.studies.samples import autoreconstructor_of
 
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
-"""Gives renders of all targets, in [0, 1], for a scene, another scene (batches of one) and a seed."""
+"""Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
 
 def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
-    """`model`: as it is tested; and the rungs below it, which show where modes are lost.
+    """Return `model` as it is tested, and simpler predictors, which show where modes are lost.
 
-    With a variational autoreconstructor: `posterior_mean`, and `posterior_samples`, latents that are drawn from what it
-    encodes of a scene; `other_scene`: latents drawn from another scene's encoding, with the picture and the skips of
-    this one. A posterior that sees views is given all targets (so that it knows the true mode); `reference_only` is its
-    mean without them. If the posterior's samples show the modes and the model's do not, stage 2 is at fault; if they do
-    not, stage 1 is. A model that draws nothing gives `samples` equal ones. Samples are computed and rendered `batch` at
-    a time.
+    A variational autoreconstructor adds `posterior_mean`; `posterior_samples`, with latents drawn from the posterior of
+    a scene; and `other_scene`, with latents of another scene but the image and the skips of this one. A posterior that
+    sees views takes all targets, so it knows the true mode; `reference_only` is its mean without them. If the
+    posterior's samples show the modes and the model's do not, stage 2 is at fault; if neither do, stage 1 is. A
+    deterministic model returns `samples` equal renders. Samples are computed and rendered `batch` at a time.
     """
 
     def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
@@ -56,24 +55,24 @@ def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
         return torch.cat([_render(module, gaussians[i : i + batch], scene) for i in range(0, samples, batch)])
 
-    own = autoreconstructor_of(module)
-    if own is None:
+    network = autoreconstructor_of(module)
+    if network is None:
         return {"model": model}
-    ladder = _Ladder(module, own, samples, batch)
-    found: dict[str, Predictor] = {
+    ladder = _Ladder(module, network, samples, batch)
+    methods: dict[str, Predictor] = {
         "model": model,
-        "posterior_mean": lambda scene, other, seed: ladder.mean(scene, own.sees_views),
+        "posterior_mean": lambda scene, other, seed: ladder.mean(scene, network.sees_views),
         "posterior_samples": lambda scene, other, seed: ladder.drawn(scene, scene, seed),
         "other_scene": lambda scene, other, seed: ladder.drawn(scene, other, seed),
     }
-    if own.sees_views:
-        found["reference_only"] = lambda scene, other, seed: ladder.mean(scene, False)
-    return found
+    if network.sees_views:
+        methods["reference_only"] = lambda scene, other, seed: ladder.mean(scene, False)
+    return methods
 
 
 @dataclass(frozen=True)
 class _Ladder:
-    """Renders of what an autoreconstructor makes of latents."""
+    """Predictors that render an autoreconstructor's output for different latents."""
 
     module: Any
     model: VariationalAutoReconstructor
@@ -117,7 +116,7 @@ REGIONS = ("hidden", "visible")
 
 @dataclass(frozen=True)
 class Shown:
-    """A scene for the figure; samples from the view that shows the modes best, and their classes."""
+    """Scene for the figure, with samples in the view that shows the modes best, and their classes."""
 
     scene: HiddenModes
     samples: Float[Tensor, "sample 3 height width"]
@@ -126,10 +125,10 @@ class Shown:
 
 @dataclass
 class Measured:
-    """The measurements so far: scores by method and scene, sums of the calibration by method and region.
+    """Measurements so far: scores by method and scene, sums of the calibration by method and region.
 
-    `energies` are the energy scores of the views that show the modes, of what the reference hides and of the rest;
-    `classes` those of all samples, by method and the modes' probabilities.
+    `energies` are the energy scores in views that show the modes, of the pixels that the reference hides and of the
+    others; `classes` are those of all samples, by method and the modes' probabilities.
     """
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
@@ -140,7 +139,7 @@ class Measured:
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
-        """Score the renders of the views that show the modes."""
+        """Add the scores of renders of the views that show the modes."""
         pixels, modes = in_region(images, scene.region), in_region(scene.truths, scene.region)
         self.scores.setdefault(method, []).append(scores(pixels, modes, scene.probabilities))
         alike = self.classes.setdefault(method, {}).setdefault(tuple(scene.probabilities.tolist()), [])
@@ -153,36 +152,36 @@ class Measured:
                 energies[name].append(energy_score(in_region(images, region).flatten(1), true))
 
     def add_calibration(self, method: str, renders: Renders, scene: HiddenModes) -> None:
-        """Count the renders of all targets."""
+        """Add the calibration of renders of all targets."""
         variance, error = spread_and_error(renders, scene.scene.targets.images[0])
-        found = self.sums.setdefault(method, {})
+        sums = self.sums.setdefault(method, {})
         for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
-            found[name] = found.get(name, 0) + bin_sums(variance, error, region)
+            sums[name] = sums.get(name, 0) + bin_sums(variance, error, region)
 
     def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
-        """Keep pictures and classes of some samples."""
+        """Keep images and classes of some samples."""
         pixels, modes = in_region(images[:count], scene.region), in_region(scene.truths, scene.region)
         classes = classify(pixels, modes, scene.probabilities)
         self.shown.append(Shown(scene, images[:count, 0], tuple(classes.tolist())))
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
-        """Means over the scenes by method."""
+        """Return means over the scenes by method."""
         counts = {"scenes": len(self.names), "samples": samples}
         return {
-            method: asdict(mean_scores(found))
+            method: asdict(mean_scores(scene_scores))
             | {f"energy_{name}": sum(values) / max(1, len(values)) for name, values in self.energies[method].items()}
             | counts
-            for method, found in self.scores.items()
+            for method, scene_scores in self.scores.items()
         }
 
     def shares(self) -> dict[str, list[dict[str, Any]]]:
-        """By method, of all scenes whose modes are equally probable together: how many samples are of which mode.
+        """Return by method the modes' shares of samples, over all scenes whose modes have the same probabilities.
 
-        `total_variation` is between these shares, of what is not rejected, and the probabilities; by chance alone it is
-        small for so many samples. Where two kinds of scenes have different probabilities, a model that has learned how
-        often modes occur, and not when, is found out.
+        `total_variation` is between the probabilities and these shares (of samples that are not rejected); chance adds
+        little to it, because there are many samples. If kinds of scenes differ in their probabilities, it reveals a
+        model that has learned how often modes occur, but not when.
         """
-        found: dict[str, list[dict[str, Any]]] = {}
+        rows: dict[str, list[dict[str, Any]]] = {}
         for method, kinds in self.classes.items():
             for probabilities, each in kinds.items():
                 classes, p = torch.cat(each), torch.tensor(probabilities)
@@ -191,18 +190,18 @@ class Measured:
                 row = {"probabilities": p.tolist(), "scenes": len(each), "shares": shares.tolist()}
                 row["rejected"] = (classes == REJECTED).float().mean().item()
                 row["total_variation"] = (0.5 * (shares - p).abs().sum()).item() if counts.any() else 1.0
-                found.setdefault(method, []).append(row)
-        return found
+                rows.setdefault(method, []).append(row)
+        return rows
 
     def calibration(self) -> dict[str, dict[str, Any]]:
-        """Curves by method and region."""
-        return {method: {region: curve(sums) for region, sums in found.items()} for method, found in self.sums.items()}
+        """Return calibration curves by method and region."""
+        return {method: {region: curve(sums) for region, sums in parts.items()} for method, parts in self.sums.items()}
 
 
 def in_region(
     images: Float[Tensor, "_ view 3 height width"], region: Bool[Tensor, "view height width"]
 ) -> Float[Tensor, "_ pixel 3"]:
-    """The region's pixels, those of all views in one row."""
+    """Return the region's pixels of all views in one row."""
     return images.movedim(2, -1)[:, region]
 
 
@@ -219,8 +218,8 @@ def measure(
     """Score all predictors on all scenes; the seed of a scene is that of the scene before it plus one.
 
     Two predictors that know all modes are added: `true_sampler` draws by their probabilities, `mean_predictor` repeats
-    their mean. The other scene that a predictor gets is the one before (before the first: the last). Samples of `model`
-    are shown.
+    their mean. The other scene for a predictor is the previous one (for the first, the last). The figure shows samples
+    of `model`.
     """
     measured = Measured()
     for index, scene in enumerate(progress(scenes)):
@@ -229,31 +228,31 @@ def measure(
         measured.add("mean_predictor", mean.expand(samples, *mean.shape), scene)
         for method, predict in predictors.items():
             renders = predict(scene.scene, scenes[index - 1].scene, seed + index)
-            own = renders[:, list(scene.views)]
-            measured.add(method, own, scene)
+            mode_views = renders[:, list(scene.views)]
+            measured.add(method, mode_views, scene)
             measured.add_calibration(method, renders, scene)
             if method == "model" and index < shown_scenes:
-                measured.show(own, scene, shown_samples)
+                measured.show(mode_views, scene, shown_samples)
         measured.names.append(scene.scene.names[0])
     return measured
 
 
 def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenModes], list[str]]:
-    """Of the first scenes (None: all) those that can be used, and why others cannot; `CompleteSplatError` if none."""
-    found, skipped = [], []
+    """Return the usable ones of the first `count` scenes (None: all), and the reasons why others are not."""
+    selected, skipped = [], []
     for index in range(len(scenes) if count is None else min(count, len(scenes))):
         try:
-            found.append(scenes[index])
+            selected.append(scenes[index])
         except DataError as error:
             skipped.append(str(error))
-    if not found:
+    if not selected:
         reason = skipped[0] if skipped else "there are none"
         raise CompleteSplatError(f"no test scene can be used for hidden modes; the first: {reason}")
-    return found, skipped
+    return selected, skipped
 
 
 SIDE, GAP, CHARTS = 1.0, 0.06, 10.0
-"""Side of a picture, space between pictures and width of the charts, in inches."""
+"""Side of an image, space between images and width of the charts, in inches."""
 BEST = {"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0}
 COLORS = {"hidden": "C3", "visible": "C0"}
 STYLES = ("o-", "s--", "^:", "v-.", "d-")
@@ -267,17 +266,17 @@ def draw(
     samples: int,
     path: Path,
 ) -> None:
-    """Write a PNG: a row of pictures for each scene, and beside them the scores and the calibration by method."""
+    """Write a PNG: a row of images for each scene, and beside them the scores and the calibration by method."""
     count = 1 + len(shown[0].scene.modes) + len(shown[0].samples)
     height = max(5.4, (SIDE + 0.3) * len(shown) + 0.8)
     width = (SIDE + GAP) * count + 0.3 + CHARTS
     split, top = 1 - CHARTS / width, 1 - 0.7 / height
     bottom = max(0.1, height - 0.7 - (SIDE + 0.3) * len(shown)) / height
     places = {"left": 0.3 / width, "right": split, "top": top, "bottom": bottom}
-    found = next(iter(results.values()))
-    title = f"Hidden modes: {found['scenes']} scenes, {found['samples']} samples each"
+    first = next(iter(results.values()))
+    title = f"Hidden modes: {first['scenes']} scenes, {first['samples']} samples each"
     title += ". Input; then from behind: every mode, the true one in green; samples with the mode found"
-    # Laid out by hand: matplotlib's constrained layout takes seconds for so many panels.
+    # Laid out by hand, because matplotlib's constrained layout takes seconds for this many panels.
     with written_figure(path, title, (width, height), layout=None) as figure:
         grid = figure.add_gridspec(len(shown), count, **places, wspace=GAP / SIDE, hspace=0.3 / SIDE)
         _draw_pictures(grid.subplots(squeeze=False), shown)
@@ -305,9 +304,9 @@ def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:
 
 def _draw_bars(panel: Any, results: Mapping[str, Mapping[str, float]]) -> None:
     width = 0.8 / len(results)
-    for index, (method, found) in enumerate(results.items()):
+    for index, (method, entry) in enumerate(results.items()):
         places = [place + (index + 0.5) * width - 0.4 for place in range(len(BEST))]
-        bars = panel.bar(places, [found[key] for key in BEST], width, label=method.replace("_", " "), color=f"C{index}")
+        bars = panel.bar(places, [entry[key] for key in BEST], width, label=method.replace("_", " "), color=f"C{index}")
         panel.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
     labels = [f"{key.replace('_', ' ')}\n(best: {best})" for key, best in BEST.items()]
     panel.set_xticks(range(len(BEST)), labels, fontsize=8)
@@ -317,9 +316,9 @@ def _draw_bars(panel: Any, results: Mapping[str, Mapping[str, float]]) -> None:
 
 
 def _draw_calibration(panel: Any, calibration: Mapping[str, Mapping[str, Any]], samples: int) -> None:
-    for style, (method, found) in zip(STYLES, calibration.items(), strict=False):
+    for style, (method, by_region) in zip(STYLES, calibration.items(), strict=False):
         for region in REGIONS:
-            bins = found[region]["bins"]
+            bins = by_region[region]["bins"]
             if bins:
                 points = [(max(row["variance"], LOWEST), max(row["squared_error"], LOWEST)) for row in bins]
                 label = f"{method.replace('_', ' ')}, {region}"

@@ -1,4 +1,4 @@
-"""Samplers and their numbers of steps: quality, diversity, time."""
+"""Study of samplers and their numbers of steps: quality, diversity, time."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -16,8 +16,8 @@ from completesplat.scene import SceneBatch
 from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, mean_over_scenes
 
-REFERENCES = (("ddim", 50), ("flow", 50))  # of a denoiser that predicts noise, and of flow matching
-CLOSE = 0.1  # difference in PSNR, in dB, that does not count
+REFERENCES = (("ddim", 50), ("flow", 50))  # for a denoiser that predicts noise, and for flow matching
+CLOSE = 0.1  # difference in PSNR, in dB, that is ignored
 
 
 def rows(
@@ -28,28 +28,28 @@ def rows(
     settings: Mapping[str, float],
     tick: Callable[[str], None],
 ) -> list[dict[str, Any]]:
-    """A row for each sampler that fits the denoiser and number of steps, the reference (50 steps of one) first.
+    """Return a row for each fitting sampler and number of steps; the first row is one of `REFERENCES`.
 
-    PSNR and SSIM are of novel views, mean over samples, views and scenes; `agreement` is the PSNR against the
-    reference's renders from the same noise. `ms` is the time of a sample with its reconstruction, without rendering,
-    of the fastest scene.
+    PSNR and SSIM are of novel views, averaged over samples, views and scenes; `agreement` is the PSNR against the
+    reference's renders from the same noise. `ms` is the time per sample of the fastest scene, with its reconstruction
+    but without rendering.
     """
     settled: list[Float[Tensor, "sample view 3 height width"]] = []
-    trained, found = renderer.model.architecture["sampler"], []
+    trained, table = renderer.model.architecture["sampler"], []
     fitting = [name for name, sampler in samplers.items() if of_one_kind(sampler, trained)]
-    reference = next(one for one in REFERENCES if one[0] in fitting)
+    reference = next(pair for pair in REFERENCES if pair[0] in fitting)
     wanted = [(name, count) for name in fitting for count in steps.get(name, ())]
-    for name, count in [reference, *(one for one in wanted if one != reference)]:
+    for name, count in [reference, *(pair for pair in wanted if pair != reference)]:
         tick(f"{name}, {count} steps")
         renderer.model.replace_sampler(samplers[name])
-        found.append({"sampler": name, "steps": count} | _row(renderer, scenes, {**settings, "steps": count}, settled))
-    return found
+        table.append({"sampler": name, "steps": count} | _row(renderer, scenes, {**settings, "steps": count}, settled))
+    return table
 
 
 def _row(
     renderer: SampleRenderer, scenes: Sequence[SceneBatch], settings: dict[str, Any], settled: list[Tensor]
 ) -> dict[str, Any]:
-    """Measures of one sampler; its renders are appended to `settled` if they are the first."""
+    """Measure one sampler; its renders are appended to `settled` if they are the first."""
     measured, times, watch = [], [], Watch(renderer.model)
     for index, scene in enumerate(scenes):
         with watch:
@@ -69,7 +69,7 @@ def _row(
 
 
 class Watch:
-    """Within its context, counts calls of the denoiser and times the way from the conditioning to the Gaussians."""
+    """Context that counts denoiser calls and times the computation from the conditioning to the Gaussians."""
 
     def __init__(self, model: Any) -> None:
         self.model = model
@@ -105,7 +105,7 @@ def _now() -> float:
 
 
 def fewest(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """The row with the fewest calls among those whose PSNR is within 0.1 dB of the first row's, the reference's."""
+    """Return the row with the fewest calls among those whose PSNR is within 0.1 dB of the first, the reference's."""
     close = [row for row in rows if abs(row["psnr"] - rows[0]["psnr"]) <= CLOSE]
     return min(close, key=lambda row: (row["calls"], -row["agreement"]))
 
@@ -121,18 +121,18 @@ MARKERS = "osD^v"
 
 
 def plot_samplers(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> None:
-    """Write a PNG with a panel for each measure and a line for each sampler; the grey band is 0.1 dB wide each way."""
+    """Write a PNG with a panel for each measure and a line for each sampler; the grey band is ±0.1 dB."""
     from matplotlib.ticker import ScalarFormatter
 
     with written_figure(path, title, (17, 4)) as figure:
         names = list(dict.fromkeys(row["sampler"] for row in rows))
         for panel, (key, label) in zip(figure.subplots(1, len(PANELS)), PANELS, strict=True):
-            # The reference agrees with itself, at the limit of PSNR.
-            shown = rows[1:] if key == "agreement" else rows
+            # The reference itself is left out, because its agreement is the limit of PSNR.
+            drawn = rows[1:] if key == "agreement" else rows
             for index, name in enumerate(names):
-                own = sorted((row["calls"], row[key]) for row in shown if row["sampler"] == name)
-                if own:
-                    panel.plot(*zip(*own, strict=True), color=f"C{index}", marker=MARKERS[index % 5], label=name)
+                points = sorted((row["calls"], row[key]) for row in drawn if row["sampler"] == name)
+                if points:
+                    panel.plot(*zip(*points, strict=True), color=f"C{index}", marker=MARKERS[index % 5], label=name)
             if key == "psnr":
                 panel.axhspan(rows[0][key] - CLOSE, rows[0][key] + CLOSE, color="0.85", zorder=0)
             panel.set(xscale="log", xlabel="denoiser calls", title=label)

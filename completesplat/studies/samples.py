@@ -21,9 +21,9 @@ from completesplat.scene import SceneBatch
 
 @dataclass(frozen=True)
 class SampleRenderer:
-    """Draws samples, from the same noise whatever the settings, and renders the reference view and then all targets.
+    """Renderer of samples (from the same noise, whatever the settings) in the reference view and then all targets.
 
-    Where a scene leaves a pixel open, there is `background`, a grey value.
+    `background` is the grey value behind the Gaussians.
     """
 
     model: CompleteSplat
@@ -33,36 +33,36 @@ class SampleRenderer:
     seed: int
 
     def __call__(self, scene: SceneBatch, **settings: Any) -> Float[Tensor, "sample view 3 height width"]:
-        """Renders of one scene (a batch of one) over the background, in [0, 1]; see `render`."""
+        """Render one scene (a batch of one) over the background, in [0, 1]; see `render`."""
         return self.over_background(self.render(scene, **settings))
 
     def over_background(self, rendering: Rendering) -> Float[Tensor, "*batch 3 height width"]:
-        """Renders in [0, 1]."""
+        """Composite a rendering over the background and clip it to [0, 1]."""
         return rendering.over(self.background).clamp(0, 1)
 
     @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
-        """Colour, depth and opacity of one scene (a batch of one), [sample view]; settings of `generate`."""
-        given = scene.reference.images, scene.reference.cameras, scene.depth_range
-        gaussians = self.model.generate(*given, samples=self.samples, seed=self.seed, **settings)
+        """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
+        inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
+        gaussians = self.model.generate(*inputs, samples=self.samples, seed=self.seed, **settings)
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 
 
 def autoreconstructor_of(module: Any) -> VariationalAutoReconstructor | None:
-    """The variational autoreconstructor of either stage; None for another model."""
-    own = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
-    return own if isinstance(own, VariationalAutoReconstructor) else None
+    """Return the variational autoreconstructor of either stage; None for another model."""
+    network = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
+    return network if isinstance(network, VariationalAutoReconstructor) else None
 
 
 def first_scenes(data: Any, count: int) -> list[SceneBatch]:
-    """The first test scenes of a data module, each as a batch of one; `DataError` if there are less."""
+    """Return the first test scenes of a data module, each as a batch of one."""
     data.setup("test")
     all_scenes = (batch[i : i + 1] for batch in data.test_dataloader() for i in range(len(batch.names)))
-    found = list(islice(all_scenes, count))
-    if len(found) < count:
-        raise DataError(f"there are {len(found)} test scenes, not scenes={count}", str(data.root))
-    return found
+    scenes = list(islice(all_scenes, count))
+    if len(scenes) < count:
+        raise DataError(f"there are {len(scenes)} test scenes, not scenes={count}", str(data.root))
+    return scenes
 
 
 def object_psnr(
@@ -70,7 +70,7 @@ def object_psnr(
     true: Float[Tensor, "view 3 height width"],
     masks: Float[Tensor, "view 1 height width"],
 ) -> float | None:
-    """PSNR (dB) of the samples over the true object's pixels of all views together; None if there are none."""
+    """Return the samples' PSNR (dB) over the true object's pixels of all views together; None without pixels."""
     inside = (masks > 0.5).expand_as(true)
     if not inside.any():
         return None
@@ -79,22 +79,22 @@ def object_psnr(
 
 
 def near(reference: Cameras, targets: Cameras, degrees: float) -> Bool[Tensor, " view"]:
-    """A mask of the targets [view] whose optical axes are at most this far from the reference's."""
+    """Return a mask of the targets [view] whose optical axes are at most this far from the reference's."""
     return _cosines(reference, targets) >= math.cos(math.radians(degrees))
 
 
 def farthest(reference: Cameras, targets: Cameras) -> int:
-    """The index of the target [view] that looks in the direction most different from the reference's."""
+    """Return the index of the target [view] whose direction differs most from the reference's."""
     return int(_cosines(reference, targets).argmin())
 
 
 def _cosines(reference: Cameras, targets: Cameras) -> Float[Tensor, " view"]:
-    """Cosines of the angles between the reference's optical axis and the targets'."""
+    """Return the cosines of the angles between the reference's optical axis and the targets'."""
     return targets.world_to_camera[:, 2, :3] @ reference.world_to_camera[2, :3]
 
 
 def mean_over_scenes(measured: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
-    """The mean of each figure, over the scenes that have it; None if none has."""
+    """Return the mean of each figure over the scenes that have it; None if none has."""
     means: dict[str, float | None] = {}
     for key in measured[0]:
         values = [value for row in measured if (value := row[key]) is not None]

@@ -1,4 +1,4 @@
-"""What stage 1 knows: how well it reconstructs from one view and from several, and where its layers lie on objects."""
+"""Study of stage 1: quality of its reconstructions from one and several views, and depth of its layers on objects."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -18,37 +18,38 @@ from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import autoreconstructor_of, mean_over_scenes, object_psnr
 
 CLOSE = 0.3
-"""Of the thickness: a layer that is this near to the back counts as on it."""
+"""Share of the thickness; a layer nearer to the back than this counts as on it."""
 
 
 @torch.no_grad()
 def rows_of_views(
     module: Any, counts: Sequence[int], scenes: Sequence[SceneBatch], tick: Callable[[str], None]
 ) -> list[dict[str, float | None]]:
-    """A row for each number of views, the reference counted: mean PSNR (dB) over the scenes (batches of one).
+    """Return a row for each number of views, the reference included: mean PSNR (dB) over scenes (batches of one).
 
-    All rows are scored on the same targets, every other one, which no row has seen; those that are seen are spread
-    evenly over the rest.
+    All rows are scored on every other target, which no row has seen. The views that a row sees are spread evenly over
+    the other targets.
 
-    `CompleteSplatError`: a posterior of one picture, or more views than that.
+    Raises:
+        CompleteSplatError: the posterior sees one image only, or there are too few targets.
     """
-    own = autoreconstructor_of(module)
-    if own is None or not own.sees_views:
+    network = autoreconstructor_of(module)
+    if network is None or not network.sees_views:
         raise CompleteSplatError("this model reconstructs from one picture: it was not trained with posterior=views")
     most = min(scene.targets[:, ::2].images.shape[1] for scene in scenes)
     if max(counts) > most:
         raise CompleteSplatError(f"counts: {max(counts)} views, and half of the targets are {most}")
-    found: list[dict[str, float | None]] = []
+    results: list[dict[str, float | None]] = []
     for count in counts:
         tick(f"{count} views")
-        means = mean_over_scenes([_measure(module, own, scene, count) for scene in scenes])
-        found.append({"views": count, **means})
-    return found
+        means = mean_over_scenes([_measure(module, network, scene, count) for scene in scenes])
+        results.append({"views": count, **means})
+    return results
 
 
 def _measure(module: Any, own: VariationalAutoReconstructor, scene: SceneBatch, count: int) -> dict[str, float | None]:
     candidates, scored = scene.targets[:, ::2], scene.targets[:, 1::2]
-    chosen = torch.arange(1, count) * candidates.images.shape[1] // count  # in the data's order, as around an object
+    chosen = torch.arange(1, count) * candidates.images.shape[1] // count  # evenly in the data's order, as in an orbit
     views = replace(scene, targets=candidates[:, chosen]).all_views()
     posterior, features = own.posterior(scene.reference.images, views, scene.depth_range)
     splatter_image = own.reconstructor(posterior.mode(), features)
@@ -73,16 +74,18 @@ def plot_views(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Non
 def rows_of_layers(
     module: Any, scenes: Sequence[SceneBatch], tick: Callable[[str], None]
 ) -> list[dict[str, float | str]]:
-    """A row for each layer and one for the object's true back: means over the object's pixels of all scenes.
+    """Return a row for the object's true back and each layer: means over the object's pixels of all scenes.
 
     Scenes are batches of one. `behind` is the distance from the true front along the reference's optical axis, in scene
-    units; `ratio` that to the mean thickness; `on_back` the share of pixels where the layer is nearer to the back than
-    `CLOSE` of the thickness. Gaussians are those of the posterior's mode, which sees all views if it can see any.
+    units; `ratio` is its mean over the mean thickness; `on_back` is the share of pixels whose layer is nearer to the
+    back than `CLOSE` of the thickness. Gaussians are of the posterior's mode; a posterior that sees views sees all.
 
-    `CompleteSplatError`: another model than a variational autoreconstructor. `DataError`: no true depth, or no object.
+    Raises:
+        CompleteSplatError: the model is not a variational autoreconstructor.
+        DataError: no true depth, or no object.
     """
-    own = autoreconstructor_of(module)
-    if own is None:
+    network = autoreconstructor_of(module)
+    if network is None:
         raise CompleteSplatError(
             "this model has no layers of its own: take a run of the autoreconstructor, or of stage 2"
         )
@@ -91,9 +94,9 @@ def rows_of_layers(
         tick(f"scene {number + 1} of {len(scenes)}")
         if scene.reference.depths is None:
             raise DataError("the data have no true depth", str(scene.names[0]))
-        views = scene.all_views() if own.sees_views else None
-        posterior, features = own.posterior(scene.reference.images, views, scene.depth_range)
-        splatter_image = own.reconstructor(posterior.mode(), features)
+        views = scene.all_views() if network.sees_views else None
+        posterior, features = network.posterior(scene.reference.images, views, scene.depth_range)
+        splatter_image = network.reconstructor(posterior.mode(), features)
         gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
         size = scene.reference.images.shape[-2:]
         front = scene.reference.depths[0, 0]
@@ -104,9 +107,9 @@ def rows_of_layers(
     behinds, opacities, thicknesses = (torch.cat(values, dim=-1) for values in zip(*measured, strict=True))
     if not len(thicknesses):
         raise DataError("no pixel shows an object whose back another view shows", ", ".join(scenes[0].names))
-    found: list[dict[str, float | str]] = [{"layer": "true back", "behind": thicknesses.mean().item()}]
+    results: list[dict[str, float | str]] = [{"layer": "true back", "behind": thicknesses.mean().item()}]
     for layer, (behind, opacity) in enumerate(zip(behinds, opacities, strict=True)):
-        found.append(
+        results.append(
             {
                 "layer": f"layer {layer + 1}",
                 "opacity": opacity.mean().item(),
@@ -115,16 +118,16 @@ def rows_of_layers(
                 "on_back": ((behind - thicknesses).abs() < CLOSE * thicknesses).float().mean().item(),
             }
         )
-    return found
+    return results
 
 
 def true_thickness(
     reference: Views, others: Views
 ) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
-    """How far behind the front of the object its last surface lies, at the reference's pixels; and where that is known.
+    """Return the distance from the object's front to its last surface at the reference's pixels, and where it is known.
 
     The last surface is the farthest point of the object (mask over 0.5) that another view [view] shows in the pixel, by
-    true depth; in units of the cameras, along the reference's optical axis. Unknown where no view shows one.
+    true depth. Distances are in the cameras' units, along the reference's optical axis; unknown if no view shows one.
     """
     assert reference.depths is not None
     assert others.depths is not None

@@ -1,4 +1,4 @@
-"""How many sequences a data set has, how its cameras see and how far they move."""
+"""Statistics of a data set: number of sequences, fields of view, and motion of the cameras."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from torch import Tensor
 from completesplat.data.sequences import PosedSequence
 from completesplat.studies.figures import written_figure
 
-# Key in the results, name for people, format.
+# Key in the results, label, format.
 MEASURES = [
     ("frames_per_sequence", "frames of a sequence", ",.0f"),
     ("fov_degrees", "horizontal field of view, degrees", ".1f"),
@@ -32,15 +32,14 @@ Row = dict[str, tuple[float, float, float]]
 
 
 def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, Any]:
-    """Figures of each split, with numbers and None only: the content of a JSON file.
+    """Return figures of each split, as numbers and None that JSON can hold.
 
-    Sequences (of at least one frame) are taken one after the other; a few numbers of each are kept. No picture is read.
+    Sequences (of at least one frame) are read one by one and only a few numbers of each are kept. No image is read.
 
     Returns:
-        `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min`, `median` and `max`: the
-        smallest and the largest of all frames, and the median of the sequences' medians; None in a split without
-        sequences. `histograms`: measure -> `edges` and, by split, `counts` of the sequences' medians (for the distance
-        from the first camera: of the largest).
+        `splits`: split -> `sequences` and `frames` (counts) and, for each of `MEASURES`, `min`, `max` of all frames and
+        `median` of the sequences' medians; None in a split without sequences. `histograms`: measure -> `edges` and, by
+        split, `counts` of the sequences' medians (of the maxima for the distance from the first camera).
     """
     rows = {split: [_measure(sequence) for sequence in members] for split, members in sequences.items()}
     return {
@@ -76,7 +75,7 @@ def show_statistics(results: dict[str, Any]) -> None:
 def _measure(sequence: PosedSequence) -> Row:
     cameras, count = sequence.cameras, float(len(sequence.frames))
     extent = _largest_distance(cameras.centers)
-    # Half the angle from the length of the chord: accurate for small angles, as the arc cosine is not.
+    # Half the angle from the length of the chord, because the arc cosine is inaccurate for small angles.
     chord = _largest_distance(cameras.world_to_camera[:, 2, :3])
     angle = float(np.degrees(2 * np.arcsin(min(1.0, chord / 2))))
     return {
@@ -84,7 +83,7 @@ def _measure(sequence: PosedSequence) -> Row:
         "fov_degrees": _range(_fields_of_view(cameras.intrinsics, cameras.image_size[1])),
         "near": _range(sequence.depth_ranges[:, 0]),
         "far": _range(sequence.depth_ranges[:, 1]),
-        # The first camera's own zero counts only where there is no other.
+        # The first camera's distance, zero, counts only if there is no other camera.
         "distance_from_first": _range((cameras.centers - cameras.centers[0]).norm(dim=-1)[min(1, int(count) - 1) :]),
         "path_extent": (extent, extent, extent),
         "largest_angle_degrees": (angle, angle, angle),
@@ -97,7 +96,7 @@ def _range(values: Float[Tensor, " _"]) -> tuple[float, float, float]:
 
 
 def _fields_of_view(intrinsics: Float[Tensor, "view 3 3"], width: int) -> Float[Tensor, " view"]:
-    """Horizontal angles in degrees between the left and the right edge."""
+    """Return the horizontal angles in degrees between the left and the right edge."""
     focal, center = intrinsics[:, 0, 0], intrinsics[:, 0, 2]
     return (torch.atan(center / focal) + torch.atan((width - center) / focal)).rad2deg()
 
@@ -120,7 +119,7 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
     values = {split: np.array([row[key][column] for row in members]) for split, members in rows.items()}
     together = np.concatenate([np.empty(0), *values.values()])
     if key == "frames_per_sequence" and len(together):
-        # Whole numbers lie in the middle of equally many whole numbers, so that no bin is empty by rounding.
+        # Bins contain equally many whole numbers, with edges between them, so that rounding leaves no bin empty.
         step = int(np.ceil((np.ptp(together) + 1) / BINS))
         edges = np.arange(together.min() - 0.5, together.max() + step, step)
     else:
@@ -129,7 +128,7 @@ def _histogram(key: str, rows: dict[str, list[Row]]) -> dict[str, Any]:
     return {"edges": edges.tolist(), "counts": counts}
 
 
-# Measure, what is counted, the axis.
+# Measure, title, label of the axis.
 PANELS = [
     ("frames_per_sequence", "Length", "frames of a sequence"),
     ("fov_degrees", "Field of view", "horizontal angle, degrees"),
@@ -142,7 +141,7 @@ DASHES = ["-", "--", ":"]
 
 
 def plot_statistics(results: dict[str, Any], path: Path, title: str) -> None:
-    """Write a PNG with a histogram over the sequences for six measures of `statistics`, one line for each split."""
+    """Write a PNG with histograms over the sequences of six measures of `statistics`, one line for each split."""
     total = {split: summary["sequences"] for split, summary in results["splits"].items()}
     numbers = ", ".join(f"{count:,} {split}" for split, count in total.items())
     with written_figure(path, f"{title}: sequences {numbers}", (13, 7)) as figure:

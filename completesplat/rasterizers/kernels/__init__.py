@@ -1,5 +1,5 @@
-"""The compiled parts of the tiled CPU rasterizer.
+"""Compiled parts of the tiled CPU rasterizer.
 
-`prepare` -> `project` -> `composite` going forward, `composite` with gradients -> `project_backward` going back. All
-arrays are C-contiguous NumPy arrays; `array_layout` names the columns of the ones that travel between kernels.
+The forward pass is `prepare` -> `project` -> `composite`, the backward pass `composite` with gradients ->
+`project_backward`. Arrays are C-contiguous NumPy arrays; `array_layout` names the columns of those that kernels share.
 """

@@ -1,14 +1,14 @@
-"""Columns of the arrays that travel between kernels.
+"""Columns of the arrays that kernels pass to each other.
 
-prepared   [17 lane] float32: what does not depend on the view, with Gaussians beyond the last one, which are left out,
-           up to a multiple of 16
+prepared   [17 lane] float32: values that do not depend on the view; padded to a multiple of 16 with Gaussians that are
+           left out
 records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
-gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's own row
+gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's row in the scene
 camera     [20] float64
 
 With d = pixel - centre, the exponent of a Gaussian is sigma = ln(2) * (u^2 + v^2), where u = U * (d_x - SHEAR * d_y)
-and v = V * d_y (the Cholesky factors of the inverse covariance): a sum of squares, which cannot turn negative by
-rounding, and whose row bounds follow directly. Alpha is then 2^(LOG2_OPACITY - u^2 - v^2).
+and v = V * d_y (the Cholesky factors of the inverse covariance). This sum of squares cannot turn negative by
+rounding, and row bounds follow from it directly. Alpha is then 2^(LOG2_OPACITY - u^2 - v^2).
 """
 
 # prepared
@@ -29,7 +29,7 @@ INDEX = 14  # as int32: the Gaussian's row in the scene
 RECORD_WIDTH = 16
 
 # gradients
-SUM_COLOR = 0  # 3 columns; the weights' sums against the gradients of the three colour images
+SUM_COLOR = 0  # 3 columns; sums of weight times gradient of each of the three colour images
 SUM_DEPTH = 3
 SUM_S = 4  # s is -dL/dsigma at a pixel
 SUM_SU, SUM_SV, SUM_SUU, SUM_SUV, SUM_SVV = 5, 6, 7, 8, 9
@@ -40,14 +40,14 @@ GRADIENT_WIDTH = 16
 ROTATION = 0  # 9 columns, row-major
 TRANSLATION = 9
 FOCAL_X, FOCAL_Y, PRINCIPAL_X, PRINCIPAL_Y = 12, 13, 14, 15
-MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # between which x/z and y/z enter the Jacobian
+MIN_SLOPE_X, MAX_SLOPE_X, MIN_SLOPE_Y, MAX_SLOPE_Y = 16, 17, 18, 19  # limits of x/z and y/z in the Jacobian
 CAMERA_WIDTH = 20
 GRAD_CAMERA_WIDTH = 16  # the same columns up to PRINCIPAL_Y
 
-# images are worked on in blocks of 4 x 4 pixels, one SIMD lane each, row-major
+# images are processed in blocks of 4 x 4 pixels, row-major, with one SIMD lane for each pixel
 BLOCK = 4
 BLOCK_SHIFT = 2
 
-# Blocks are chosen for alphas down to 2^-SLACK of the threshold (1e-4 below it): rounding in this choice must not
-# lose a pixel. What counts is the test at the pixel itself.
+# Blocks are chosen for alphas down to 2^-SLACK of the threshold (1e-4 below it), because rounding in this choice must
+# not lose a pixel. The test at the pixel itself decides.
 SLACK = 1.5e-4

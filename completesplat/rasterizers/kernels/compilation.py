@@ -1,4 +1,4 @@
-"""How the kernels are compiled by numba, and where the machine code is kept."""
+"""Compilation of the kernels by numba, and the cache of their machine code."""
 
 import hashlib
 import inspect
@@ -15,8 +15,8 @@ import numba
 numba_config: Any = numba.config
 logger = logging.getLogger(__name__)
 
-# Neither "nnan" nor "ninf": with them the optimiser may remove the tests for values that are not finite.
-# error_model="numpy" is needed for speed: Python's error for a division by zero stops vectorisation.
+# Without "nnan" and "ninf", with which the optimiser may remove the tests for values that are not finite.
+# error_model="numpy" is needed for speed, because Python's error for a division by zero stops vectorisation.
 OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "nsz", "arcp", "reassoc", "afn"},
     "error_model": "numpy",
@@ -39,17 +39,17 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """A part of a kernel that is always inlined."""
-    # What is unwrapped are a type checker's wrappers, which numba could not compile.
+    """Compile a part of a kernel that is always inlined."""
+    # Unwrapping removes a type checker's wrappers, which numba could not compile.
     return numba.njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
 
 
 @cache
 def _cache_directory() -> Path | None:
-    """The first writable folder: $NUMBA_CACHE_DIR, beside the sources, then the user's cache; None if there is none.
+    """Return the first writable of $NUMBA_CACHE_DIR, a folder beside the sources and the user's cache, or None.
 
-    numba invalidates a cached function when its own file changes, but not when a helper in another file does.
-    So the folder's name carries a digest of all kernel sources.
+    numba invalidates a cached function when its file changes, but not when a helper in another file does, so the
+    folder's name contains a digest of all kernel sources.
     """
     here = Path(__file__).parent
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "completesplat"

@@ -1,7 +1,7 @@
 """Front-to-back compositing of one view's Gaussians over a band of block rows, and its backward pass.
 
-`open_words` [row word] uint64 holds one bit for each block of the band that has a pixel that is not opaque yet, 64
-blocks of a row to the word.
+`open_words` [row word] uint64 has a bit for each block of the band, 64 blocks of a row in each word. It is set while
+the block has a pixel that is not opaque.
 """
 
 from typing import Any
@@ -35,8 +35,8 @@ from completesplat.rasterizers.kernels.simd import (
 
 Array = np.ndarray
 
-# Of a block. Forward: transmittance, red, green, blue, depth, alpha. Backward: transmittance, sum behind, gradients of
-# red, green, blue, depth.
+# State of a block. Forward: transmittance, red, green, blue, depth, alpha. Backward: transmittance, sum behind, and
+# gradients of red, green, blue, depth.
 STATE_VECTORS = 6
 reached_flag = lane_constant([lane == layout.REACHED for lane in range(LANES)])
 BLOCK = layout.BLOCK
@@ -46,7 +46,7 @@ WORD_SHIFT = 6
 ZERO, ONE = np.float32(0), np.float32(1)
 ALL_BITS = np.uint64(2**64 - 1)
 BIT, TWO_BITS = np.uint64(1), np.uint64(2)
-# Blocks are chosen a little generously, in px, against rounding. What counts is the test at the pixel itself.
+# In px; extends the choice of blocks against rounding. The test at the pixel itself decides.
 MARGIN = np.float32(0.01)
 
 ROWS_AT_ONCE = LANES // 2  # in `row_spans`
@@ -69,16 +69,16 @@ def composite(
     color: Array, depth: Array, alpha: Array,
     grad_color: Array | None, grad_depth: Array | None, grad_alpha: Array | None, gradients: Array | None,
 ) -> None:  # fmt: skip
-    """Draw the block rows first_row..end_row - 1 of one view, or add up every Gaussian's gradients over them.
+    """Draw the block rows first_row..end_row - 1 of one view, or sum every Gaussian's gradients over them.
 
-    Each of the two is compiled by itself, without what is only for the other.
+    numba compiles two versions, each without the code that only the other needs.
 
     Args:
         records: [gaussian 16], of which the first `count` are used.
         state: scratch [block * 6 * 16], all blocks of the band.
         open_words: scratch [row word] uint64.
         spans: scratch [2 * row + 32] int32.
-        color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written, or read.
+        color, depth, alpha: the whole images [3 height width], [height width] twice; the band is written or read.
         grad_color, grad_depth, grad_alpha: gradients of the loss with respect to these images; None to draw.
         gradients: [gaussian 16], see `array_layout`; rows of Gaussians that are not visible are not written.
     """
@@ -138,7 +138,7 @@ def composite(
                         sum_behind = state_vector(state, offset, 1) - weight * own
                         store(state, offset + LANES, sum_behind)
                         grad_opacity = transmittance * own - sum_behind / (ONE - opacity)
-                        # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha lets nothing through.
+                        # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha has no gradient.
                         s = keep(passes & (value <= max_alpha), opacity * grad_opacity)
                         sum_red, sum_green = sum_red + weight * grad_red, sum_green + weight * grad_green
                         sum_blue, sum_z = sum_blue + weight * grad_blue, sum_z + weight * grad_z
@@ -199,7 +199,7 @@ def write_images(first_row, end_row, columns, state, color, depth, alpha):
 
 @helper
 def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_color, grad_depth, grad_alpha):
-    """Put the gradients of the images, and the total sum, into the state."""
+    """Write the gradients of the images, and the total sum, to the state."""
     height, width = alpha.shape
     plane = height * width
     flat_color, flat_depth, flat_alpha = color.reshape(-1), depth.reshape(-1), alpha.reshape(-1)
@@ -235,19 +235,19 @@ def read_images(first_row, end_row, columns, state, color, depth, alpha, grad_co
 
 @helper
 def is_whole(row, column, height, width):
-    """Whether all pixels of a block are inside the image."""
+    """Return whether all pixels of a block are inside the image."""
     return (row + 1) * BLOCK <= height and (column + 1) * BLOCK <= width
 
 
 @helper
 def is_inside(row, column, lane, height, width):
-    """Whether this pixel of a block is inside the image."""
+    """Return whether this pixel of a block is inside the image."""
     return row * BLOCK + lane // BLOCK < height and column * BLOCK + lane % BLOCK < width
 
 
 @helper
 def open_all_blocks(open_words, rows, columns):
-    """Set the bits of all blocks; returns their number."""
+    """Set the bits of all blocks and return their number."""
     for row in range(rows):
         for word in range((columns + WORD_BITS - 1) >> WORD_SHIFT):
             open_words[row, word] = word_mask(word, 0, columns - 1)
@@ -256,7 +256,7 @@ def open_all_blocks(open_words, rows, columns):
 
 @helper
 def word_mask(word, first, last):
-    """Bits of the block columns first..last (both included) in a word."""
+    """Return the bits of the block columns first..last (both included) in a word."""
     low = max(first - word * WORD_BITS, 0)
     high = min(last - word * WORD_BITS, WORD_BITS - 1)
     return ((TWO_BITS << np.uint64(high)) - BIT) & (ALL_BITS << np.uint64(low))
@@ -269,17 +269,17 @@ def close_block(open_words, row, column):
 
 @helper
 def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
-    """First and last block column that the ellipse of record j touches in each of the block rows top..bottom.
+    """Find the first and last block column that the ellipse of record j touches in each of the block rows top..bottom.
 
-    They go to spans[offset] and spans[offset + ROWS_AT_ONCE], where offset is `span_offset(row - top)`.
+    Write them to spans[offset] and spans[offset + ROWS_AT_ONCE], where offset is `span_offset(row - top)`.
 
     In a row at d_y the ellipse reaches from SHEAR d_y - h to SHEAR d_y + h with h^2 = (reach - (V d_y)^2) / U^2. Over
-    the rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest near minus
-    it. The left ends are in the first half of a vector's lanes, the right ends in the second.
+    the rows of a block the right end is largest as near as possible to RIGHTMOST_Y, the left end smallest as near as
+    possible to -RIGHTMOST_Y. Left ends are in the first half of a vector's lanes, right ends in the second.
     """
     center_y, extent = records[j, layout.CENTER_Y], records[j, layout.EXTENT_Y]
     reach = records[j, layout.LOG2_OPACITY] - log2_min_alpha + SLACK
-    # Truncation of the left end, which has one pixel too much, rounds up. The limits keep the integers small.
+    # The left end has one pixel too much, so that truncation rounds it up. The limits keep the integers small.
     start = records[j, layout.CENTER_X] - side() * (np.float32(0.5) - MARGIN)
     extreme_y, stretch = side() * records[j, layout.RIGHTMOST_Y], side() * records[j, layout.INVERSE_U]
     lowest, highest = lowest_pixel(), is_left() * np.float32(BLOCK + 1) + np.float32(width - 1)
@@ -295,13 +295,13 @@ def row_spans(records, j, log2_min_alpha, top, bottom, width, spans):
 
 @helper
 def span_offset(row):
-    """Where the first block column of a row stands in `spans`, counted from the top row."""
+    """Return the offset in `spans` of the first block column of a row, counted from the top row."""
     return row + (row & ~(ROWS_AT_ONCE - 1))
 
 
 @helper
 def row_terms(records, j, row):
-    """(u at lane positions of block column 0 less U * centre, v, exponent without u) for block row `row`."""
+    """Return (u without its part from column and centre, v, exponent without u) in the lanes of block row `row`."""
     y = lane_y() + (np.float32(row * BLOCK) - records[j, layout.CENTER_Y])
     u = (lane_x() - y * records[j, layout.SHEAR]) * records[j, layout.U]
     v = y * records[j, layout.V]
@@ -310,20 +310,20 @@ def row_terms(records, j, row):
 
 @helper
 def column_offset(records, j, column):
-    """What is added to u in block column `column`."""
+    """Return the part of u from block column `column` and the centre."""
     return (np.float32(column * BLOCK) - records[j, layout.CENTER_X]) * records[j, layout.U]
 
 
 @helper
 def alpha_at(exponent, log2_min_alpha, max_alpha):
-    """(2^exponent, alpha): the same clamped from above, and zero below the threshold."""
+    """Return 2^exponent, and alpha: the same clamped from above, and zero below the threshold."""
     value = exp2(exponent)
     return value, keep(exponent >= log2_min_alpha, min(value, max_alpha))
 
 
 @helper
 def attenuate(transmittance, alpha, min_transmittance):
-    """(weight, transmittance behind, mask of the pixels that took part); a pixel that stops is left with 0."""
+    """Return weight, transmittance behind, and a mask of contributing pixels; a pixel that stops is left with 0."""
     weight = transmittance * alpha
     behind = transmittance - weight
     passes = behind > min_transmittance
@@ -332,7 +332,7 @@ def attenuate(transmittance, alpha, min_transmittance):
 
 @helper
 def open_pixels(row, column, height, width, state, offset):
-    """Transmittances of a fresh block: 1, but 0 for the lanes outside the image, which must not keep it open."""
+    """Set a new block's transmittances: 1, but 0 for lanes outside the image, which must not keep the block open."""
     if is_whole(row, column, height, width):
         store(state, offset, splat(ONE))
         return
@@ -347,7 +347,7 @@ def state_vector(state, offset, channel):
 
 @vector_function(types.void)
 def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
-    """Pixels, truncated to integers, as the numbers of their blocks, to a flat int32 array."""
+    """Store the block numbers of pixels, truncated to integers, in a flat int32 array."""
     places = ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)
     blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
     builder.store(blocks, address(builder, array, offset, INTEGERS_IR), align=4)
@@ -355,14 +355,14 @@ def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
 
 @vector_function(VECTOR)
 def load_block(builder: Any, array: Any, corner: Any, width: Any) -> Any:
-    """4 x 4 pixels, row-major, of a flat image of this width, from the one at `corner` on."""
+    """Load 4 x 4 pixels, row-major, of a flat image of this width, from the one at `corner` on."""
     rows = [builder.load(row, align=4) for row in _block_rows(builder, array, corner, width)]
     return _joined(builder, _joined(builder, *rows[:2]), _joined(builder, *rows[2:]))
 
 
 @vector_function(types.void)
 def store_block(builder: Any, array: Any, corner: Any, width: Any, vector: Any) -> None:
-    """The reverse of `load_block`."""
+    """Store 4 x 4 pixels as `load_block` reads them."""
     for y, row in enumerate(_block_rows(builder, array, corner, width)):
         lanes = ir.Constant(ir.VectorType(I32, BLOCK), [y * BLOCK + x for x in range(BLOCK)])
         builder.store(builder.shuffle_vector(vector, vector, lanes), row, align=4)

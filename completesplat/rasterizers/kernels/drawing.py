@@ -1,4 +1,4 @@
-"""The kernels in their order, over all scenes and views of a batch, on several threads, in reused memory."""
+"""Sequence of kernels over all scenes and views of a batch, on several threads and in reused memory."""
 
 import math
 import os
@@ -20,11 +20,11 @@ from completesplat.rasterizers.kernels.simd import LANES
 
 ALIGNMENT = 64  # bytes, one cache line
 MOST_FREE_BYTES = 512 * 2**20
-# A view is cut into bands of block rows until there are this many tasks. A constant, not the number of threads:
-# sums over bands depend on where the bands end, and results must not depend on the number of threads.
+# Views are cut into bands of block rows until there are this many tasks. This is a constant, because sums over bands
+# depend on where the bands end, and results must not depend on the number of threads.
 FEWEST_TASKS = 4
-VIEWS_AT_ONCE = 8  # without gradients, where the projected Gaussians are not kept
-CHUNK = 2048  # Gaussians to a task of the projection's backward pass
+VIEWS_AT_ONCE = 8  # without gradients, when the projected Gaussians are not kept
+CHUNK = 2048  # Gaussians per task of the projection's backward pass
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _pool_lock = threading.Lock()
@@ -33,7 +33,7 @@ _buffers_lock = threading.Lock()
 
 
 def parallel(task: Callable[[int], None], count: int) -> None:
-    """Run task(0), ..., task(count - 1), each on whichever thread is free, and wait for all of them."""
+    """Run task(0), ..., task(count - 1), each on any free thread, and wait for all of them."""
     helpers = min(torch.get_num_threads(), count) - 1
     if helpers < 1:
         for i in range(count):
@@ -66,7 +66,7 @@ def _pool(size: int) -> ThreadPoolExecutor:
 
 
 def _after_a_fork() -> None:
-    """Threads do not survive in the child, which would wait for them, or for the locks that they held, for ever."""
+    """Replace pools and locks in a child process, where the threads that may hold the locks do not exist."""
     global _pool_lock, _buffers_lock
     _pools.clear()
     _pool_lock, _buffers_lock = threading.Lock(), threading.Lock()
@@ -77,13 +77,13 @@ if hasattr(os, "register_at_fork"):
 
 
 class Buffers:
-    """Arrays that are handed back for reuse when this object is deleted (with the autograd node that owns it)."""
+    """Arrays whose memory is reused after this object is deleted (with the autograd node that owns it)."""
 
     def __init__(self) -> None:
         self._blocks: list[np.ndarray] = []
 
     def empty(self, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
-        """An uninitialised array at an aligned address."""
+        """Return an uninitialised array at an aligned address."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         block = _take(size)
         self._blocks.append(block)
@@ -92,12 +92,12 @@ class Buffers:
         return array
 
     def __del__(self) -> None:
-        # No lock: the garbage collector may come here while `_take` of the same thread holds it. extend is atomic.
+        # No lock: the garbage collector may call this while `_take` of the same thread holds it. And extend is atomic.
         _free.extend(self._blocks)
 
 
 def _take(size: int) -> np.ndarray:
-    """A free block that is large enough, but not wastefully so, or a new one."""
+    """Return a free block of one to two times the size, or a new one."""
     needed = size + ALIGNMENT
     with _buffers_lock:
         while sum(block.nbytes for block in _free) > MOST_FREE_BYTES:
@@ -109,7 +109,7 @@ def _take(size: int) -> np.ndarray:
 
 
 def release() -> None:
-    """Give the memory that is not in use back to the system."""
+    """Return unused memory to the system."""
     with _buffers_lock:
         _free.clear()
 
@@ -132,12 +132,12 @@ class Images(NamedTuple):
     alpha: np.ndarray
 
     def view(self, batch: int, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The three images of one view, as the kernels take them: [3 height width], [height width] twice."""
+        """Return the images of one view in the kernels' shapes: [3 height width], and [height width] twice."""
         return self.color[batch, view], self.depth[batch, view, 0], self.alpha[batch, view, 0]
 
 
 class Drawing:
-    """A batch of scenes in all its views: drawn once, and taken back through the chain rule if need be.
+    """Batch of scenes in all views, drawn once, with a backward pass if `keep`.
 
     Args:
         cameras: [batch view 20], see `array_layout`.
@@ -184,9 +184,9 @@ class Drawing:
         return images
 
     def backward(self, images: Images, gradients: Images, to_cameras: bool) -> tuple[Parameters, np.ndarray | None]:
-        """Gradients of the parameters and, if wanted, the cameras, given those of the images that `draw` returned.
+        """Return gradients of the parameters and optionally the cameras from those of the images that `draw` returned.
 
-        The latter are [batch view 16]: of the first 16 columns of `cameras`.
+        The cameras' gradients are [batch view 16], for the first 16 columns of `cameras`.
         """
         buffers = Buffers()
         bands, views = len(self.bands), self.scenes * self.views

@@ -1,4 +1,4 @@
-"""Scene parameters to the visible Gaussians of one view, packed in depth order, and the backward pass."""
+"""Projection of a scene to the visible Gaussians of one view, packed in depth order, and its backward pass."""
 
 import math
 from typing import Any
@@ -66,11 +66,11 @@ LARGEST_FLOAT32 = np.float32(np.finfo(np.float32).max)
 RADIX_BITS = 11
 BUCKETS = 1 << RADIX_BITS
 PASSES = 4
-# A depth as an integer that sorts alike: 8 bits of the exponent above that of the smallest normal float32 and the first
-# 36 of the fraction. With a float32's 23, some neighbours in a large scene would come out in the wrong order.
+# Depths are sorted as integers of the same order: 8 bits of the exponent above that of the smallest normal float32, and
+# the first 36 of the fraction. With a float32's 23, some neighbours in a large scene would be in the wrong order.
 SMALLEST_DEPTH_BITS = np.float64(2.0**-126).view(np.int64)
 DROPPED_BITS = 8 + 52 - PASSES * RADIX_BITS
-# What is summed over views, before the rest of the chain rule, which is each Gaussian's own.
+# Columns of the sums over views, after which the chain rule continues for each Gaussian separately.
 COLOR, LOG_OPACITY, MEAN, ROOT, REACHED, TOTALS = 0, 3, 4, 7, 16, 17
 no_totals = zeros(TOTALS)
 gather_one, gather_three, gather_four = gather(1), gather(3), gather(4)
@@ -82,7 +82,7 @@ def prepare(
     means: Array, quaternions: Array, scales: Array, opacities: Array, colors: Array, log2_min_alpha: float,
     prepared: Array,
 ) -> None:  # fmt: skip
-    """Fill `prepared`; Gaussians with a value that is not finite, or too transparent ever to be seen, are marked."""
+    """Fill `prepared` and mark Gaussians that are too transparent to be seen or have values that are not finite."""
     count = means.shape[0]
     flat, stride = prepared.reshape(-1), prepared.shape[1]
     prepared[layout.REACH, count:] = -ONE
@@ -106,14 +106,14 @@ def prepare(
 
 @helper
 def lane_shapes(quaternions, scales, start, last):
-    """Quaternions and scales of the Gaussians start..start + 15; the last one stands again where there are no more."""
+    """Return quaternions and scales of the Gaussians start..start + 15; the last one repeats beyond the end."""
     quaternion = gather_four(quaternions.reshape(-1), 4, 0, start, last)
     return quaternion, gather_three(scales.reshape(-1), 3, 0, start, last)
 
 
 @helper
 def scaled_columns(m, a):
-    """M diag(a), row-major."""
+    """Return M diag(a), row-major."""
     return (
         m[0] * a[0], m[1] * a[1], m[2] * a[2],
         m[3] * a[0], m[4] * a[1], m[5] * a[2],
@@ -135,7 +135,7 @@ def project(
         visible: [lane] float32, receives 1 for these, 0 for the others.
 
     Returns:
-        How many are visible.
+        The number of visible Gaussians.
     """
     count = 0
     rotation = nine(camera, layout.ROTATION)
@@ -186,7 +186,7 @@ def depth_key(z):
 
 @helper
 def radix_sort(depths, keys, order, count):
-    """Stable sort of depths[:count], which are the memory of keys[0]; order[PASSES % 2] is the result."""
+    """Sort depths[:count], which share the memory of keys[0], stably; the result is order[PASSES % 2]."""
     starts = np.zeros((PASSES, BUCKETS), np.int32)
     for i in range(count):
         order[0, i] = i
@@ -211,7 +211,7 @@ def radix_sort(depths, keys, order, count):
 
 @vector_function(VECTOR)
 def packed_blocks(builder: Any, first: Any, last: Any) -> Any:
-    """Pixels as the bits of int32: the numbers of the first ones' blocks, and those of the last ones' shifted up."""
+    """Return, as the bits of int32, the block of each first pixel, and that of each last pixel shifted up."""
     low, high = (builder.fptosi(pixel, INTEGERS_IR) for pixel in (first, last))
     low, high = (builder.ashr(pixel, ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)) for pixel in (low, high))
     return builder.bitcast(builder.or_(low, builder.shl(high, ir.Constant(INTEGERS_IR, [16] * LANES))), VECTOR_IR)
@@ -219,16 +219,16 @@ def packed_blocks(builder: Any, first: Any, last: Any) -> Any:
 
 @vector_function(VECTOR)
 def index_bits(builder: Any, start: Any) -> Any:
-    """start, ..., start + 15 as the bits of int32."""
+    """Return start, ..., start + 15 as the bits of int32."""
     first = in_every_lane(builder, builder.trunc(start, I32))
     return builder.bitcast(builder.add(first, ir.Constant(INTEGERS_IR, list(range(LANES)))), VECTOR_IR)
 
 
 @vector_function(types.int64)
 def append(builder: Any, mask: Any, vectors: Any, rows: Any, vector: Any, numbers: Any, count: Any) -> Any:
-    """Lane i of 16 vectors becomes a row of a flat array, and that of one more a number of another, for i in the mask.
+    """Append lane i of 16 vectors as a row to a flat array, and lane i of `vector` to `numbers`, for i in the mask.
 
-    Returns the new number of rows. One row beyond them is overwritten.
+    Return the new number of rows. One row beyond them is overwritten.
     """
     for lane, row in enumerate(transposed(builder, unpack(builder, vectors))):
         place = ir.Constant(I32, lane)
@@ -244,7 +244,7 @@ def project_backward(
     visible: Array, gradients: Array, first: int, last: int,
     grad_means: Array, grad_quaternions: Array, grad_scales: Array, grad_opacities: Array, grad_colors: Array,
 ) -> None:  # fmt: skip
-    """Chain rule through the projection for the Gaussians [first, last) of one scene, summed over its views.
+    """Apply the chain rule through the projection to the Gaussians [first, last) of one scene, summed over views.
 
     Args:
         cameras: [view 20] float64.
@@ -288,14 +288,14 @@ def sum_views(prepared, cameras, blur, visible, gradients, start, last):
         )
         grad_mean = row_times_matrix(grad_point, rotation)
         parts = (sums[0], sums[1], sums[2], sums[layout.SUM_S]) + grad_mean + grad_root + (sums[layout.REACHED],)  # noqa: RUF005
-        # Of lanes that are not reached, anything may have come out, NaN included.
+        # Lanes that are not reached may hold any value, even NaN.
         results = add_each(results, keep_each(mask, parts))
     return results
 
 
 @helper
 def root_backward(quaternion, scale, n):
-    """Through root = R(q / |q|) diag(scale), whose gradient is n: those of the quaternion and of the scale."""
+    """Return the gradients of quaternion and scale from the gradient n of root = R(q / |q|) diag(scale)."""
     w, x, y, z, inverse_norm = unit_quaternion(quaternion)
     rotation = rotation_matrix(w, x, y, z)
     grad_scale = (

@@ -1,6 +1,6 @@
-"""The steps of the projection, for 16 Gaussians at once, one to a lane; the chain rule back through them, and cameras.
+"""Steps of the projection for 16 Gaussians at once, one in each lane; their backward pass, also to the cameras.
 
-Scalars, and the lanes going forward, are float64: huge scales must not overflow.
+Scalars, and lanes in the forward pass, are float64, because huge scales must not overflow.
 """
 
 import math
@@ -36,7 +36,7 @@ SMALLEST_SQUARED_NORM = np.float64(1e-24)  # of a quaternion that has a directio
 
 @helper
 def unit_quaternion(quaternion):
-    """(w, x, y, z, 1 / norm); the identity with 1 / norm = 0 for a zero quaternion."""
+    """Return (w, x, y, z, 1 / norm); the identity with 1 / norm = 0 for a zero quaternion."""
     w, x, y, z = quaternion
     squared = w * w + x * x + y * y + z * z
     inverse = keep(squared > SMALLEST_SQUARED_NORM, ONE / square_root(squared))
@@ -45,7 +45,7 @@ def unit_quaternion(quaternion):
 
 @helper
 def rotation_matrix(w, x, y, z):
-    """The 9 entries, row-major, for a unit quaternion."""
+    """Return the 9 entries, row-major, of the rotation by a unit quaternion."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
@@ -60,7 +60,7 @@ def dot(a, b):
 
 @helper
 def row_times_matrix(a, m):
-    """a^T M for a 3-vector and a row-major 3 x 3 matrix."""
+    """Return a^T M for a 3-vector and a row-major 3 x 3 matrix."""
     return (
         a[0] * m[0] + a[1] * m[3] + a[2] * m[6],
         a[0] * m[1] + a[1] * m[4] + a[2] * m[7],
@@ -70,13 +70,13 @@ def row_times_matrix(a, m):
 
 @helper
 def matrix_times_column(m, a):
-    """M a for a row-major 3 x 3 matrix and a 3-vector."""
+    """Return M a for a row-major 3 x 3 matrix and a 3-vector."""
     return dot(m[:3], a), dot(m[3:6], a), dot(m[6:9], a)
 
 
 @helper
 def nine(array, start):
-    """Nine neighbouring entries of a flat array, as float64."""
+    """Return nine neighbouring entries of a flat array, as float64."""
     return (
         np.float64(array[start]), np.float64(array[start + 1]), np.float64(array[start + 2]),
         np.float64(array[start + 3]), np.float64(array[start + 4]), np.float64(array[start + 5]),
@@ -86,7 +86,7 @@ def nine(array, start):
 
 @helper
 def camera_point(camera, rotation, mean):
-    """A mean in camera coordinates."""
+    """Return a mean in camera coordinates."""
     x, y, z = matrix_times_column(rotation, mean)
     t = layout.TRANSLATION
     return x + camera[t], y + camera[t + 1], z + camera[t + 2]
@@ -99,7 +99,7 @@ def clamp(value, low, high):
 
 @helper
 def image_jacobian(camera, rotation, slope_x, slope_y, inverse_z):
-    """Rows of J W (EWA splatting, Eq. 29): d(pixel) / d(world point), at the clamped slopes x/z and y/z."""
+    """Return the rows of J W (EWA splatting, Eq. 29): d(pixel) / d(world point), at the clamped slopes x/z and y/z."""
     x_scale, y_scale = camera[layout.FOCAL_X] * inverse_z, camera[layout.FOCAL_Y] * inverse_z
     x_depth = x_scale * clamp(slope_x, camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X])
     y_depth = y_scale * clamp(slope_y, camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y])
@@ -123,7 +123,7 @@ def cross(a, b):
 
 @helper
 def covariance_2d(a, b, blur):
-    """(xx, xy, yy, determinant) of [a; b] [a; b]^T + blur * I, for the rows a, b of J W times the root.
+    """Return (xx, xy, yy, determinant) of [a; b] [a; b]^T + blur * I, for the rows a, b of J W times the root.
 
     The determinant is written with the cross product (Lagrange's identity), so nothing cancels in thin ellipses.
     """
@@ -134,7 +134,7 @@ def covariance_2d(a, b, blur):
 
 @helper
 def lane_gaussians(prepared, start):
-    """Means and roots R(quaternion) diag(scales), row-major, of the Gaussians start..start + 15."""
+    """Return means and roots R(quaternion) diag(scales), row-major, of the Gaussians start..start + 15."""
     flat, stride = prepared.reshape(-1), prepared.shape[1]
     mean = three_columns(flat, stride, layout.MEAN * stride + start)
     return mean, nine_columns(flat, stride, layout.ROOT * stride + start)
@@ -142,11 +142,11 @@ def lane_gaussians(prepared, start):
 
 @helper
 def lane_sums_of_view(visible, gradients, start, last):
-    """The columns of these Gaussians' gradients in one view, added over its bands; REACHED is the number of bands.
+    """Return the columns of these Gaussians' gradients in one view, summed over bands; REACHED counts the bands.
 
     Args:
         visible: [lane] float32, 1 or 0.
-        gradients: [band gaussian 16]; rows of Gaussians that are not visible hold anything.
+        gradients: [band gaussian 16]; rows of invisible Gaussians hold arbitrary values.
     """
     seen = load(visible, start) > ZERO
     sums = no_sums()
@@ -158,7 +158,7 @@ def lane_sums_of_view(visible, gradients, start, last):
 
 @helper
 def outer(a, b):
-    """a b^T, row-major."""
+    """Return a b^T, row-major."""
     return (
         a[0] * b[0], a[0] * b[1], a[0] * b[2],
         a[1] * b[0], a[1] * b[1], a[1] * b[2],
@@ -168,15 +168,15 @@ def outer(a, b):
 
 @helper
 def combine(x, a, y, b):
-    """x a + y b for 3-vectors a, b."""
+    """Return x a + y b for 3-vectors a, b."""
     return x * a[0] + y * b[0], x * a[1] + y * b[1], x * a[2] + y * b[2]
 
 
 @helper
 def cross_of_rows(row_x, row_y, root):
-    """a x b for the rows a, b of J W times the root: the root's cofactors times the product of the rows of J W.
+    """Return a x b for the rows a, b of J W times the root: the root's cofactors times the product of J W's rows.
 
-    Where a Gaussian is a needle, a and b are almost parallel, and their own product would lose all that matters.
+    If a Gaussian is a needle, a and b are almost parallel, and their direct product would lose its significant digits.
     """
     first, second, third = (root[0], root[3], root[6]), (root[1], root[4], root[7]), (root[2], root[5], root[8])
     normal = cross(row_x, row_y)
@@ -185,7 +185,7 @@ def cross_of_rows(row_x, row_y, root):
 
 @helper
 def splat_gradients(row_x, row_y, root, blur, sums):
-    """Gradients with respect to the centre (two numbers) and to the rows a, b of J W times the root.
+    """Return gradients with respect to the centre (two numbers) and to the rows a, b of J W times the root.
 
     With T = [[U, -U SHEAR], [0, V]], so that (u, v) = T d, the inverse covariance is 2 ln(2) T^T T. Hence
     dL/dcentre = 2 ln(2) T^T (sum s u, sum s v), and dL/dcovariance = 1/2 (2 ln 2)^2 T^T S T with the symmetric
@@ -217,7 +217,7 @@ def splat_gradients(row_x, row_y, root, blur, sums):
 
 @helper
 def slopes(mean, camera, rotation):
-    """(x / z, y / z, 1 / z) of the means in camera coordinates."""
+    """Return (x / z, y / z, 1 / z) of the means in camera coordinates."""
     x, y, z = camera_point(camera, rotation, mean)
     inverse_z = ONE / z
     return x * inverse_z, y * inverse_z, inverse_z
@@ -225,7 +225,7 @@ def slopes(mean, camera, rotation):
 
 @helper
 def row_gradients(slope_x, slope_y, inverse_z, root, camera, rotation, blur, sums):
-    """Gradients with respect to the centre (two numbers), the rows of J W, and the root."""
+    """Return gradients with respect to the centre (two numbers), the rows of J W, and the root."""
     row_x, row_y = image_jacobian(camera, rotation, slope_x, slope_y, inverse_z)
     grad_center_x, grad_center_y, grad_a, grad_b = splat_gradients(row_x, row_y, root, blur, sums)
     grad_root = add_each(outer(row_x, grad_a), outer(row_y, grad_b))
@@ -236,7 +236,7 @@ def row_gradients(slope_x, slope_y, inverse_z, root, camera, rotation, blur, sum
 def point_gradient(
     camera, rotation, slope_x, slope_y, inverse_z, grad_row_x, grad_row_y, grad_center_x, grad_center_y, grad_depth
 ):
-    """Gradient with respect to the mean in camera coordinates, through its pixel position, the Jacobian and depth."""
+    """Return the gradient of the mean in camera coordinates, through its pixel position, the Jacobian and depth."""
     focal_x, focal_y = camera[layout.FOCAL_X], camera[layout.FOCAL_Y]
     min_x, max_x = camera[layout.MIN_SLOPE_X], camera[layout.MAX_SLOPE_X]
     min_y, max_y = camera[layout.MIN_SLOPE_Y], camera[layout.MAX_SLOPE_Y]
@@ -257,7 +257,7 @@ def point_gradient(
 def camera_backward(
     prepared: Array, camera: Array, blur: float, visible: Array, gradients: Array, grad_camera: Array
 ) -> None:
-    """Chain rule from one view's Gaussians to its camera.
+    """Apply the chain rule from one view's Gaussians to its camera.
 
     Args:
         camera: [20] float64.
@@ -289,17 +289,17 @@ def camera_backward(
         parts = keep_each(mask, to_rotation + grad_point + (x[0], y[0], x[1], y[1]))
         for column in range(layout.GRAD_CAMERA_WIDTH):
             store(totals, 0, parts[column])
-            # One after the other, so that a Gaussian that is left out changes nothing in the sum of the others.
+            # Lanes are added one by one, so that a Gaussian that is left out does not change the sum of the others.
             for lane in range(LANES):
                 grad_camera[column] += totals[lane]
 
 
 @helper
 def axis_gradients(camera, rotation, axis, slope, inverse_z, grad_row, grad_center):
-    """(focal, principal, R_axis, R_z): what the image's x (0) or y (1) axis adds, through the centre and J's row.
+    """Return gradients (focal, principal, R_axis, R_z) from the image's x (0) or y (1) axis, by the centre and J's row.
 
     The centre is focal * slope + principal; the row is focal / z * (R_axis - s R_z), where s is the slope between its
-    limits. At a limit s is (constant - principal) / focal, so that it depends on the intrinsics, too.
+    limits. At a limit, s is (constant - principal) / focal and depends on the intrinsics, too.
     """
     low, high = camera[layout.MIN_SLOPE_X + 2 * axis], camera[layout.MAX_SLOPE_X + 2 * axis]
     s = clamp(slope, low, high)

@@ -1,4 +1,4 @@
-"""Vectors of 16 lanes, float32 or float64, that numba kernels can hold in a variable, and functions of them."""
+"""Vectors of 16 lanes, float32 or float64, for variables in numba kernels, and functions of them."""
 
 import inspect
 import operator
@@ -26,7 +26,7 @@ _EXP2_POLYNOMIAL = (
 
 
 class LanesType(types.Type):
-    """16 numbers or booleans."""
+    """Type of a vector of 16 numbers or booleans."""
 
     def __init__(self, name: str, element: Any) -> None:
         super().__init__(name=f"{name}x{LANES}")
@@ -44,21 +44,21 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def constant(values: Any) -> ir.Constant:
-    """LLVM's constant vector of 16 numbers."""
+    """Return LLVM's constant vector of 16 numbers."""
     return ir.Constant(VECTOR_IR, [ir.Constant(F32, float(value)) for value in values])
 
 
 def uniform(value: float) -> ir.Constant:
-    """LLVM's constant vector with the same number in every lane."""
+    """Return LLVM's constant vector with the same number in every lane."""
     return constant([value] * LANES)
 
 
 def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
     """Turn `emit(builder, *operands)`, which writes LLVM code, into a function for kernels with this type of result.
 
-    What a kernel passes to it arrives so: an array as the address of its first element, an integer as one of 64 bits,
-    any other scalar in every lane (as float64 beside such a vector, else as float32). A list of what it returns becomes
-    a tuple. `result` may be a function of the operands' types that returns the signature.
+    A kernel's arguments arrive in `emit` as follows: an array as the address of its first element, an integer with 64
+    bits, any other scalar in every lane (as float64 beside a vector of float64, else as float32). A list that `emit`
+    returns becomes a tuple. `result` may be a function of the operands' types that returns the signature.
     """
 
     def decorate(emit: Callable[..., Any]) -> Any:
@@ -102,11 +102,7 @@ def in_every_lane(builder: Any, scalar: Any) -> Any:
 
 
 def _define_operator(function: Any, emit: Callable[..., Any], mask: bool = False, count: int = 2) -> None:
-    """Give a Python operator of this number of operands its meaning for vectors, with scalars beside them.
-
-    Args:
-        mask: whether it gives one.
-    """
+    """Define a Python operator with `count` operands for vectors and scalars beside them; `mask`: it returns a mask."""
     for kind in (VECTOR, DOUBLES):
         _define_for(kind, MASK if mask else kind, function, emit, count)
 
@@ -133,7 +129,7 @@ _define_operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a
 _define_operator(operator.lt, lambda builder, a, b: builder.fcmp_ordered("<", a, b), mask=True)
 _define_operator(operator.neg, lambda builder, a: builder.fneg(a), count=1)
 _define_for(MASK, MASK, operator.and_, lambda builder, a, b: builder.and_(a, b))
-# Of two numbers of which one is NaN, these give the second, as the processors' own instructions do.
+# If either operand is NaN, these return the second one, as the processor's instructions do.
 _define_operator(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 _define_operator(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
@@ -143,86 +139,86 @@ def _vectors(count: int, kind: Any = VECTOR) -> Any:
 
 
 def lane_constant(values: Any) -> Any:
-    """A function without arguments that returns these 16 lanes."""
+    """Return a function without arguments that returns these 16 lanes."""
     vector = constant(values)
     return vector_function(VECTOR)(lambda builder: vector)
 
 
 def zeros(count: int) -> Any:
-    """A function without arguments that returns a tuple of so many vectors of zeros."""
+    """Return a function without arguments that returns a tuple of `count` vectors of zeros."""
     return vector_function(_vectors(count))(lambda builder: [uniform(0)] * count)
 
 
 @vector_function(VECTOR)
 def splat(builder: Any, scalar: Any) -> Any:
-    """The scalar in every lane."""
+    """Return a vector with the scalar in every lane."""
     return scalar
 
 
 @vector_function(lambda mask, vector: vector(mask, vector))
 def keep(builder: Any, mask: Any, vector: Any) -> Any:
-    """The vector where the mask is set, zero elsewhere."""
+    """Return the vector where the mask is set, zero elsewhere."""
     return builder.select(mask, vector, ir.Constant(vector.type, None))
 
 
 @vector_function(lambda mask, vector, scalar: vector(mask, vector, scalar))
 def choose(builder: Any, mask: Any, vector: Any, scalar: Any) -> Any:
-    """The vector where the mask is set, the scalar elsewhere."""
+    """Return the vector where the mask is set, the scalar elsewhere."""
     return builder.select(mask, vector, scalar)
 
 
 @vector_function(lambda vectors: _vectors(len(vectors), DOUBLES)(vectors))
 def widen(builder: Any, vectors: Any) -> Any:
-    """A tuple of vectors as float64."""
+    """Convert a tuple of vectors to float64."""
     return [builder.fpext(one, DOUBLES.llvm) for one in unpack(builder, vectors)]
 
 
 @vector_function(lambda vectors: _vectors(len(vectors))(vectors))
 def narrow(builder: Any, vectors: Any) -> Any:
-    """A tuple of vectors of float64 as float32."""
+    """Convert a tuple of vectors from float64 to float32."""
     return [builder.fptrunc(one, VECTOR_IR) for one in unpack(builder, vectors)]
 
 
 @vector_function(lambda mask, vectors: vectors(mask, vectors))
 def keep_each(builder: Any, mask: Any, vectors: Any) -> Any:
-    """`keep` for every vector of a tuple."""
+    """Apply `keep` to every vector of a tuple."""
     return [builder.select(mask, one, uniform(0)) for one in unpack(builder, vectors)]
 
 
 @vector_function(MASK)
 def all_within(builder: Any, vectors: Any, limit: Any) -> Any:
-    """Where no number of a tuple of vectors is beyond the limit, of either sign, nor NaN."""
+    """Return a mask of the lanes in which no vector of a tuple is NaN or exceeds the limit in magnitude."""
     masks = [builder.fcmp_ordered("<=", _each(builder, "fabs", one), limit) for one in unpack(builder, vectors)]
     return reduce(builder.and_, masks)
 
 
 @vector_function(lambda a, b: a(a, b))
 def add_each(builder: Any, a: Any, b: Any) -> Any:
-    """The sums of two tuples of vectors."""
+    """Add two tuples of vectors."""
     return [builder.fadd(x, y, flags=FLAGS) for x, y in zip(unpack(builder, a), unpack(builder, b), strict=True)]
 
 
 @vector_function(types.boolean)
 def any_lane(builder: Any, mask: Any) -> Any:
-    """Whether the mask is set anywhere."""
+    """Return whether the mask is set in any lane."""
     bits = builder.bitcast(mask, ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
 @vector_function(lambda vector: vector(vector))
 def square_root(builder: Any, vector: Any) -> Any:
-    """The square root of every lane."""
+    """Return the square root of every lane."""
     return _each(builder, "sqrt", vector)
 
 
 @vector_function(VECTOR)
 def exp2(builder: Any, x: Any) -> Any:
-    """2^x with a relative error of 2e-7, for x from -126 to 127; meaningless (but harmless) outside.
+    """Return 2^x with a relative error of 2e-7, for x from -126 to 127; meaningless (but harmless) outside.
 
-    x is split into an integer, added to the exponent bits, and a rest in [-1/2, 1/2], put into a polynomial.
+    x is split into an integer, which is added to the exponent bits, and a rest in [-1/2, 1/2] for a polynomial.
     """
     shifted = builder.bitcast(builder.fadd(x, uniform(_ROUNDING_SHIFT)), INTEGERS_IR)
-    # Back by an integer operation: numba lets all floating-point ones be reassociated, (x + s) - s to x as well.
+    # Undo the shift in integers, because numba lets LLVM reassociate floating-point operations, also (x + s) - s to x.
     whole = builder.sub(shifted, ir.Constant(INTEGERS_IR, [_ROUNDING_BITS] * LANES))
     rest = builder.fsub(x, builder.sitofp(whole, VECTOR_IR), flags=FLAGS)
     power = uniform(_EXP2_POLYNOMIAL[-1])
@@ -234,7 +230,7 @@ def exp2(builder: Any, x: Any) -> Any:
 
 @vector_function(VECTOR)
 def lane_sums(builder: Any, vectors: Any) -> Any:
-    """From a tuple of up to 16 vectors, the vector whose lane i is the sum over all lanes of vector i; rest zero."""
+    """Return the vector whose lane i is the sum over vector i of a tuple of up to 16; other lanes are zero."""
     rows = unpack(builder, vectors)
     rows += [uniform(0)] * (LANES - len(rows))
     step = 1
@@ -253,12 +249,12 @@ def _fold(builder: Any, a: Any, b: Any, step: int) -> Any:
 
 @vector_function(types.int64)
 def lowest_bit(builder: Any, bits: Any) -> Any:
-    """Index of the lowest set bit of a nonzero uint64."""
+    """Return the index of the lowest set bit of a nonzero uint64."""
     return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
 def _each(builder: Any, name: str, vector: Any) -> Any:
-    """LLVM's function of this name, of every lane."""
+    """Apply LLVM's function of this name to every lane."""
     suffix = "f64" if vector.type == DOUBLES.llvm else "f32"
     kind = ir.FunctionType(vector.type, [vector.type])
     function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{suffix}")  # type: ignore[no-untyped-call]
@@ -274,13 +270,13 @@ def unpack(builder: Any, values: Any) -> list[Any]:
 
 @vector_function(VECTOR)
 def load(builder: Any, array: Any, offset: Any) -> Any:
-    """16 floats of a flat float32 array, from element `offset` on."""
+    """Load 16 floats of a flat float32 array, from element `offset` on."""
     return builder.load(address(builder, array, offset, VECTOR_IR), align=4)
 
 
 @vector_function(types.void)
 def store(builder: Any, array: Any, offset: Any, vector: Any) -> None:
-    """The reverse of `load`."""
+    """Store a vector as `load` reads it."""
     builder.store(vector, address(builder, array, offset, VECTOR_IR), align=4)
 
 
@@ -289,7 +285,7 @@ def address(builder: Any, array: Any, offset: Any, kind: Any) -> Any:
 
 
 def gather(count: int) -> Any:
-    """A function (array, stride, column, start, last) that returns so many neighbouring columns of a flat array.
+    """Return a function (array, stride, column, start, last) that returns `count` neighbouring columns of an array.
 
     The first is array[i * stride + column] for i = start, ..., start + 15, with last - 1 for any i beyond that.
     """
@@ -309,10 +305,10 @@ def gather(count: int) -> Any:
 
 @vector_function(types.void)
 def scatter(builder: Any, array: Any, start: Any, last: Any, vectors: Any) -> None:
-    """The reverse of `gather` with as many vectors as there are columns. No row beyond last - 1 is written."""
+    """Write vectors as `gather` reads them, one for each column. No row beyond last - 1 is written."""
     rows = unpack(builder, vectors)
     firsts = _rows(builder, ir.Constant(I64, len(rows)), start, last)
-    # Backwards, so that row last - 1 is left with what is its own.
+    # Backwards, so that the last write to row last - 1 is the right one.
     for lane, (k, vector) in product(reversed(range(LANES)), enumerate(rows)):
         value = builder.extract_element(vector, ir.Constant(I32, lane))
         place = builder.add(firsts[lane], ir.Constant(I64, k))
@@ -320,7 +316,7 @@ def scatter(builder: Any, array: Any, start: Any, last: Any, vectors: Any) -> No
 
 
 def columns(count: int) -> Any:
-    """A function (array, stride, start) that returns 16 neighbours of each of so many rows of a flat array."""
+    """Return a function (array, stride, start) that returns 16 neighbours of each of `count` rows of a flat array."""
 
     @vector_function(_vectors(count))
     def columns(builder: Any, array: Any, stride: Any, start: Any) -> Any:
@@ -332,7 +328,7 @@ def columns(count: int) -> Any:
 
 @vector_function(types.void)
 def store_columns(builder: Any, array: Any, stride: Any, start: Any, vectors: Any) -> None:
-    """The reverse of `columns`."""
+    """Store vectors as `columns` reads them."""
     for k, vector in enumerate(unpack(builder, vectors)):
         first = builder.add(start, builder.mul(stride, ir.Constant(I64, k)))
         builder.store(vector, address(builder, array, first, VECTOR_IR), align=4)
@@ -340,7 +336,7 @@ def store_columns(builder: Any, array: Any, stride: Any, start: Any, vectors: An
 
 @vector_function(_vectors(LANES))
 def transposed_rows(builder: Any, array: Any, stride: Any, start: Any, last: Any) -> Any:
-    """As `gather(16)` from column 0 on, by loads of whole rows."""
+    """Return the same as `gather(16)` from column 0 on, by loads of whole rows."""
     rows = _rows(builder, stride, start, last)
     return transposed(builder, [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in rows])
 
@@ -357,7 +353,7 @@ def transposed(builder: Any, matrix: list[Any]) -> list[Any]:
 
 
 def _rows(builder: Any, stride: Any, start: Any, last: Any) -> list[Any]:
-    """Where the rows start, ..., start + 15 of a flat array begin; row last - 1 instead of those beyond it."""
+    """Return the offsets of the rows start, ..., start + 15 of a flat array; row last - 1 replaces those beyond it."""
     final = builder.sub(last, ir.Constant(last.type, 1))
     numbers = [builder.add(start, ir.Constant(start.type, lane)) for lane in range(LANES)]
     return [builder.mul(builder.select(builder.icmp_signed("<", i, final), i, final), stride) for i in numbers]
