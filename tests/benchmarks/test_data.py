@@ -13,7 +13,7 @@ QUICK = [
     *("objects.write.scenes=3", "objects.write.frames=4", "objects.write.size=24", "objects.write.workers=1"),
     *("objects.data.image_size=16", "objects.data.batch_size=2"),
     "objects.references_per_sequence={raw: 2, prepared: 4}",
-    *("rooms.write.scenes=14", "rooms.write.frames=3", "rooms.write.size=16", "rooms.write.workers=1"),
+    *("rooms.write.scenes=14", "rooms.write.frames=4", "rooms.write.size=16", "rooms.write.workers=1"),
     *("rooms.data.image_size=16", "rooms.data.references_per_sequence=2"),
 ]
 
