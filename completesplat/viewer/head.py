@@ -1,6 +1,6 @@
-"""What viser's page gets of ours: a title, an icon, and two corrections of its program.
+"""Changes to viser's page: our title, our icon, and two corrections of its JavaScript.
 
-viser has no settings for them. Where another version of viser has other texts, the page stays as viser made it.
+viser has no options for them. If another version of viser has other texts, the page stays as viser made it.
 """
 
 import re
@@ -11,10 +11,10 @@ ICON = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill-op
 <ellipse cx="11" cy="20" rx="9" ry="7" fill="#1971c2"/><ellipse cx="21" cy="20" rx="9" ry="7" fill="#f08c00"/>
 <ellipse cx="16" cy="11" rx="8" ry="8" fill="#2f9e44"/></g></svg>"""
 
-# viser's program stands compressed in the page, and is put into the document as a text. Of that text,
-# - the square on which splats are drawn gets corners of three numbers: of two, three.js measures a bounding sphere of
-#   radius NaN, and says so as an error; the square is no place of the scene, and must not be culled by that sphere;
-# - the panel of narrow windows is folded at first, since it would cover most of the scene.
+# viser's page holds its JavaScript compressed, and inserts it into the document as text. Two parts are replaced in it:
+# - The square on which splats are drawn gets corners of three numbers. With two, three.js computes a bounding sphere of
+#   radius NaN and reports an error. The square has no place in the scene, and must not be culled by that sphere.
+# - The panel of narrow windows starts folded, because it would cover most of the scene.
 CORRECTIONS = r"""<script>
 document.head.appendChild = function (node) {
   if (node.type === "module")
@@ -28,7 +28,7 @@ document.head.appendChild = function (node) {
 
 
 def with_head(page: str) -> str:
-    """viser's HTML with our title, icon and corrections."""
+    """Return viser's HTML with our title, icon and corrections."""
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
     page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
     page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)
