@@ -1,4 +1,4 @@
-"""What more threads give the CPU rasterizer."""
+"""Speed of the CPU rasterizer with several threads."""
 
 import os
 import statistics
@@ -27,10 +27,10 @@ def scaling_rows(
     backend: Backend, threads: Sequence[int], sizes: Sequence[int], views: Sequence[int], repeats: int,
     tick: Callable[[str], None],
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """One row for each workload and number of threads that this machine has cores for; 1 is always among them.
+    """Return a row for each workload and each number of threads up to the machine's cores, including 1.
 
-    Times are medians, the numbers of threads taking turns. The efficiency of n threads is the time of one thread over n
-    times theirs: 100 % where n threads take an n-th of the time.
+    Times are medians; the numbers of threads take turns. The efficiency of n threads is the time of one thread divided
+    by n times theirs, which is 100 % if n threads take an n-th of the time.
     """
     numbers = sorted({1, *(number for number in threads if number <= (os.cpu_count() or 1))})
     result, before = [], torch.get_num_threads()
@@ -42,7 +42,7 @@ def scaling_rows(
             for turn, count in product(range(repeats + 1), numbers):
                 torch.set_num_threads(count)
                 taken = milliseconds(backend.rasterizer, gaussians, cameras)
-                if turn:  # the first one starts the threads
+                if turn:  # the first turn starts the threads
                     times[count].append(taken)
             workload = {"size": size, "gaussians": gaussians.count, "views": number}
             result += [workload | row for row in _efficiencies(times)]
@@ -52,7 +52,7 @@ def scaling_rows(
 
 
 def _efficiencies(times: dict[int, list[tuple[float, float]]]) -> list[dict[str, float]]:
-    """Of times (forward, both passes) by the number of threads, which begins with 1."""
+    """Return rows from times (forward, both passes) by the number of threads, the first of which is 1."""
     medians = {
         count: [statistics.median(column) for column in zip(*taken, strict=True)] for count, taken in times.items()
     }

@@ -1,10 +1,10 @@
-"""An opponent for the benchmark: the fastest tile-based rasterizer that plain torch operations gave on a CPU.
+"""Baseline of the benchmark: the fastest tile-based CPU rasterizer that we could write with plain torch operations.
 
 It composites dense [tile, entry, pixel] blocks that stay in cache. Exponents, blended colours and the moments of
-gradients are matrix products, what remains are a few passes in place; the backward pass is analytic and recomputes the
-alphas; lists are exact and drawn in rounds, so that opaque tiles drop out. Measured beside it: autograd through padded
-lists takes 3 to 4 times as long; tiles of 4 x 4 or 8 x 8, rounds of 8, 16 or 64 entries and smaller chunks are as
-fast or slower; chunks on two Python threads are slower.
+gradients are matrix products; only a few in-place passes remain. The backward pass is analytic and recomputes the
+alphas. Lists are exact and drawn in rounds, so that opaque tiles drop out. Alternatives that we measured: autograd
+through padded lists takes 3 to 4 times as long; tiles of 4 x 4 or 8 x 8, rounds of 8, 16 or 64 entries and smaller
+chunks are as fast or slower; chunks on two Python threads are slower.
 """
 
 import math
@@ -16,27 +16,20 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from completesplat.benchmarks.torch_tiles import (
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    Splats,
-    TileLists,
-    list_splats,
-    project,
-)
+from completesplat.benchmarks.torch_tiles import TILE_HEIGHT, TILE_WIDTH, Splats, TileLists, list_splats, project
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants
 
-ROUND = 32  # entries of a tile's list that are drawn before it is seen whether any of its pixels needs more
-CHUNK = 2048  # tiles at a time: blocks of 8 MiB
+ROUND = 32  # entries of a tile's list that are drawn before a check whether any of its pixels needs more
+CHUNK = 2048  # tiles at a time, in blocks of 8 MiB
 # The columns of a splat's row: log opacity, root_x, root_y, the coefficients of x^2, x y and y^2, centre x and y,
-# rest_y; what is blended, which is colour, depth and one; and two more to fill a cache line of 64 bytes.
+# rest_y; the blended colour, depth and one; and two more to fill a cache line of 64 bytes.
 SHAPE, BLENDED, ROW = slice(0, 9), slice(9, 14), 16
 
 
 class TorchTiledRasterizer:
-    """The function of `ReferenceRasterizer` for float32 tensors in main memory; gradients reach the cameras too."""
+    """Rasterizer like `ReferenceRasterizer`, for float32 tensors on the CPU; gradients reach the cameras too."""
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
         self.constants = constants or RenderingConstants()
@@ -56,11 +49,11 @@ class TorchTiledRasterizer:
 
 @dataclass(frozen=True)
 class _Board:
-    """The tensors that both passes read."""
+    """Tensors that both passes read."""
 
     rows: Float[Tensor, "splat 16"]
     windows: Int[Tensor, "start entry"]
-    """The splats of a round, for each place in the lists at which it may start."""
+    """The splats of a round, for each place in the lists where it may start."""
     starts: Int[Tensor, " tile"]
     lengths: Int[Tensor, " tile"]
     centers: Float[Tensor, "tile 2"]
@@ -96,7 +89,7 @@ def _monomials() -> Float[Tensor, "6 pixel"]:
 
 
 class _Round:
-    """The next entries of the lists of some tiles: where their splats lie about the tiles' centres, and the alphas."""
+    """The next entries of some tiles' lists: positions of their splats relative to the tiles' centres, and alphas."""
 
     def __init__(self, board: _Board, tiles: Int[Tensor, " tile"], step: int) -> None:
         first = board.starts.index_select(0, tiles) + step * ROUND
@@ -104,7 +97,7 @@ class _Round:
         self.ids = board.windows.index_select(0, first).long()
         rows = board.rows.index_select(0, self.ids.flatten())
         self.blended = rows[:, BLENDED].reshape(*self.ids.shape, -1)
-        # A product with the identity: the fastest way to turn columns into contiguous rows.
+        # A product with the identity is the fastest way to turn columns into contiguous rows.
         fields = torch.mm(torch.eye(ROW)[SHAPE], rows.T).reshape(-1, *self.ids.shape)
         self.root_x, self.root_y, self.rest_y = fields[1].clone(), fields[2].clone(), fields[8]
         self.dx, self.dy = board.centers.index_select(0, tiles).T[:, :, None] - fields[6:8]
@@ -112,9 +105,9 @@ class _Round:
         self.alphas = self._alphas(board, fields[:6])
 
     def _alphas(self, board: _Board, fields: Float[Tensor, "6 tile entry"]) -> Float[Tensor, "tile entry pixel"]:
-        """Alphas; their exponents -(root + root_x x + root_y y)^2 - rest_y (dy + y)^2 + log opacity are polynomials.
+        """Return alphas, with polynomial exponents -(root + root_x x + root_y y)^2 - rest_y (dy + y)^2 + log opacity.
 
-        Nothing is lost to cancellation: a splat that reaches a tile is not many deviations away from its centre.
+        Cancellation loses nothing, because a splat that reaches a tile is few standard deviations from its centre.
         """
         constant, x, y = fields[:3]
         rest = self.rest_y * self.dy
@@ -129,7 +122,7 @@ class _Round:
         return torch.threshold_(alphas, below, 0.0).reshape(*self.ids.shape, -1)
 
     def transmittances(self, first: Float[Tensor, "tile pixel"]) -> Float[Tensor, "tile entry_and_one pixel"]:
-        """Before each entry, and after the last."""
+        """Return transmittances before each entry, and after the last one."""
         result = first.new_empty(first.shape[0], ROUND + 1, first.shape[1])
         result[:, 0] = first
         steps = result.unbind(1)
@@ -140,7 +133,7 @@ class _Round:
     def gradients(
         self, board: _Board, d_exponents: Float[Tensor, "tile entry pixel"], out: Float[Tensor, "6 tile entry"]
     ) -> None:
-        """Sums over pixels, from the moments of d_exponents about the tile's centre.
+        """Write sums over pixels to `out`, computed from the moments of d_exponents about the tile's centre.
 
         With g for d_exponents and (dx, dy) and root at the pixels: g, g root dx, g root dy, g dy^2, g root, g dy.
         """
@@ -157,13 +150,13 @@ class _Round:
 
 
 def _keep_where_above(values: Tensor, compared: Tensor, threshold: float) -> Tensor:
-    """Zero `values` where `compared` is not above the threshold, in one pass (the kernel of a ReLU's backward)."""
-    kept: Tensor = torch.ops.aten.threshold_backward.grad_input(values, compared, threshold, grad_input=values)
-    return kept
+    """Zero `values` where `compared` is not above the threshold, in one pass (the kernel of ReLU's backward)."""
+    masked: Tensor = torch.ops.aten.threshold_backward.grad_input(values, compared, threshold, grad_input=values)
+    return masked
 
 
 class _Composite(torch.autograd.Function):
-    """(fields of the splats, lists, constants) to [tile, (colour, depth, alpha), pixel]."""
+    """Map from (fields of the splats, lists, constants) to [tile, (colour, depth, alpha), pixel]."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> Float[Tensor, "tile 5 pixel"]:
@@ -192,26 +185,26 @@ class _Composite(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         board, stop, gradient = ctx.board, ctx.board.constants.min_transmittance, gradient.contiguous()
-        # The gradient's product with all that lies behind, as if nothing were in front of it.
+        # The gradient's product with everything behind, as if nothing were in front of that.
         behind = torch.zeros_like(gradient[:, 0])
         sums, rows = torch.zeros_like(board.rows), torch.zeros(CHUNK * ROUND, ROW)
         for tiles, step, before in reversed(ctx.rounds):
-            entries, given = _Round(board, tiles, step), gradient.index_select(0, tiles)
+            entries, gradients = _Round(board, tiles, step), gradient.index_select(0, tiles)
             transmittances = entries.transmittances(before)
             alphas = _keep_where_above(entries.alphas, transmittances[:, 1:], stop)
             weights = alphas * transmittances[:, :-1]
-            own, rest = torch.bmm(entries.blended, given), transmittances
+            products, rest = torch.bmm(entries.blended, gradients), transmittances
             rest[:, -1] = behind.index_select(0, tiles)
-            steps, values, factors = rest.unbind(1), own.unbind(1), alphas.unbind(1)
+            steps, values, factors = rest.unbind(1), products.unbind(1), alphas.unbind(1)
             for entry in reversed(range(ROUND)):
                 torch.lerp(steps[entry + 1], values[entry], factors[entry], out=steps[entry])
             behind.index_copy_(0, tiles, steps[0])
-            d_exponents = own.sub_(rest[:, 1:]).mul_(weights)
+            d_exponents = products.sub_(rest[:, 1:]).mul_(weights)
             if board.clamped:
                 d_exponents.masked_fill_(alphas >= board.constants.max_alpha, 0.0)
             sums_of_round = torch.empty(10, *entries.ids.shape)
             entries.gradients(board, d_exponents, sums_of_round[:6])
-            sums_of_round[6:] = torch.bmm(given[:, :4], weights.mT).transpose(0, 1)
+            sums_of_round[6:] = torch.bmm(gradients[:, :4], weights.mT).transpose(0, 1)
             count = entries.ids.numel()
             rows[:count, :10] = sums_of_round.flatten(1).T
             sums.index_add_(0, entries.ids.flatten(), rows[:count])
@@ -219,7 +212,7 @@ class _Composite(torch.autograd.Function):
 
 
 def _to_fields(sums: Float[Tensor, "10 splat"], board: _Board) -> tuple[Tensor, ...]:
-    """Gradients of the splats' fields in their order, by the chain rule through the exponent."""
+    """Return gradients of the splats' fields in their order, by the chain rule through the exponent."""
     to_opacity, to_root_x, to_root_y, to_rest_y, root, dy = sums[:6] * math.log(2)
     root_x, root_y, rest_y = board.rows[:, 1], board.rows[:, 2], board.rows[:, 8]
     to_center = 2 * root_x * root, 2 * (root_y * root + rest_y * dy)

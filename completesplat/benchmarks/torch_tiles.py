@@ -1,10 +1,10 @@
-"""The first half of the pure-torch opponent: projection of all views at once, and which Gaussians a tile has to draw.
+"""Projection for the pure-torch baseline, all views at once, and the lists of Gaussians that each tile draws.
 
-A splat is one Gaussian as one camera sees it; splats are numbered [batch view gaussian], flattened. Its exponent is
+A splat is one Gaussian as seen by one camera. Splats are numbered [batch view gaussian], flattened. The exponent is
 
     log2 alpha(x, y) = log_opacity - (root_x dx + root_y dy)^2 - rest_y dy^2,   dx = x - center_x, dy = y - center_y,
 
-the Cholesky factor of the inverse covariance, which unlike the three entries of the inverse itself loses nothing to
+with the Cholesky factor of the inverse covariance. Unlike the three entries of the inverse itself, it loses nothing to
 cancellation when a splat is long and thin.
 """
 
@@ -24,13 +24,13 @@ from completesplat.tensors import TensorDataclass
 
 TILE_HEIGHT, TILE_WIDTH = 4, 8  # px
 HALF_LOG2_E = 0.5 / math.log(2)
-# How far a splat's outline is moved out, so that rounding never hides a pixel: in bits of alpha, and in px.
+# A splat's outline is moved out by this much, in bits of alpha and in px, so that rounding never hides a pixel.
 SLACK_BITS, SLACK_PIXELS = 1e-3, 1e-3
 
 
 @dataclass(frozen=True)
 class Splats(TensorDataclass):
-    """All Gaussians as seen from all cameras. Those that are not `drawable` hold harmless values, without gradients."""
+    """All Gaussians as seen by all cameras. Those that are not `drawable` hold harmless values without gradients."""
 
     log_opacities: Float[Tensor, " splat"]
     root_x: Float[Tensor, " splat"]
@@ -45,7 +45,7 @@ class Splats(TensorDataclass):
 
 @dataclass(frozen=True)
 class TileLists:
-    """The splats of all tiles of all images, tile after tile, front to back."""
+    """Splats of all tiles of all images, tile after tile, front to back."""
 
     splats: Int[Tensor, " entry"]
     ends: Int[Tensor, " tile"]
@@ -53,7 +53,7 @@ class TileLists:
     """Rows and columns of tiles in an image."""
 
     def centers(self) -> Float[Tensor, "tile 2"]:
-        """Centres (x, y) of all tiles, in px of their image."""
+        """Return the centres (x, y) of all tiles, in px of their image."""
         rows, columns = self.grid
         y, x = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
         one_image = torch.stack([x * TILE_WIDTH, y * TILE_HEIGHT], dim=-1).flatten(0, 1)
@@ -61,9 +61,9 @@ class TileLists:
 
 
 def project(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> Splats:
-    """Splats of scenes [batch] for cameras [batch view]; the function is that of `reference.project_gaussians`.
+    """Project scenes [batch] for cameras [batch view], with the function of `reference.project_gaussians`.
 
-    What cannot be drawn is replaced by constants wherever a NaN or an infinity could enter a gradient.
+    Values of splats that cannot be drawn are replaced by constants wherever NaN or infinity could enter a gradient.
     """
     finite = gaussians.finite()
     sane = gaussians.map(lambda t: t.where(finite.reshape(finite.shape + (1,) * (t.ndim - 2)), torch.zeros_like(t)))
@@ -104,7 +104,7 @@ def _project_axis(
     extent: int,
     constants: RenderingConstants,
 ) -> tuple[Float[Tensor, "batch view gaussian"], Float[Tensor, "batch view 3 gaussian"]]:
-    """Centres along one image axis, and that axis' row of Jacobian x rotation x covariance root."""
+    """Return centres along one image axis, and that axis' row of Jacobian x rotation x covariance root."""
     focal = cameras.intrinsics[..., axis, axis, None]
     principal = cameras.intrinsics[..., axis, 2, None]
     slope = offset / depth
@@ -120,7 +120,7 @@ def _factorize(
     variance_x, variance_y = row_x.square().sum(2), row_y.square().sum(2)
     covariance = (row_x * row_y).sum(2)
     (x1, x2, x3), (y1, y2, y3) = row_x.unbind(2), row_y.unbind(2)
-    # Lagrange's identity: without the blur, the determinant is the squared length of the rows' cross product.
+    # Lagrange's identity: without blur, the determinant is the squared length of the rows' cross product.
     squared_area = (x2 * y3 - x3 * y2).square() + (x3 * y1 - x1 * y3).square() + (x1 * y2 - x2 * y1).square()
     determinant = (squared_area + blur * (variance_x + variance_y) + blur**2).clamp(min=1e-10)
     variance_y = variance_y + blur
@@ -130,10 +130,10 @@ def _factorize(
 
 @torch.no_grad()
 def list_splats(splats: Splats, images: int, image_size: tuple[int, int], constants: RenderingConstants) -> TileLists:
-    """For each tile, the splats whose outline (alpha = min_alpha) meets the hull of the tile's pixel centres.
+    """List, for each tile, the splats whose outline (alpha = min_alpha) meets the hull of the tile's pixel centres.
 
-    The test is exact: first the rows of tiles that an outline touches, then its extent within each row. One sort by
-    depth of the splats and one stable sort by tile of the entries put the lists in order.
+    The test is exact: it finds the rows of tiles that an outline touches, then the outline's extent within each row.
+    The lists are ordered by one sort of the splats by depth and one stable sort of the entries by tile.
     """
     height, width = image_size
     grid = -(-height // TILE_HEIGHT), -(-width // TILE_WIDTH)
@@ -161,7 +161,7 @@ def list_splats(splats: Splats, images: int, image_size: tuple[int, int], consta
 def _outlines(
     splats: Splats, image_size: tuple[int, int], constants: RenderingConstants
 ) -> tuple[Float[Tensor, "outline 8"], Int[Tensor, " outline"]]:
-    """Ellipses that meet the image, front to back, with the numbers of their splats.
+    """Return the ellipses that meet the image, front to back, with the numbers of their splats.
 
     Columns: centre x and y, reach in x and y, the shear dx/dy of the ellipse's axis of row midpoints, dy of its
     rightmost point, root_x, and rest_y over the level.
@@ -177,7 +177,7 @@ def _outlines(
     height, width = image_size
     met = (x + reach_x >= 0) & (x - reach_x <= width) & (y + reach_y >= 0) & (y - reach_y <= height)
     met = met.nonzero().squeeze(1)
-    # Positive floats are ordered as their bits are, and torch sorts integers several times faster.
+    # Positive floats have the same order as their bits, and torch sorts integers several times faster.
     depths = splats.depths.index_select(0, numbers).index_select(0, met)
     met = met.index_select(0, depths.view(torch.int32).sort(stable=True).indices)
     columns = [x, y, reach_x, reach_y, shear, shear * squared_y / reach_x, level.sqrt() / root_x, 1 / squared_y]
@@ -187,14 +187,14 @@ def _outlines(
 def _extent_in_row(
     outlines: Float[Tensor, "item 8"], row: Int[Tensor, " item"], height: int
 ) -> tuple[Float[Tensor, " item"], Float[Tensor, " item"]]:
-    """Leftmost and rightmost x of an ellipse between the first and the last pixel centres of a row of tiles."""
+    """Return the leftmost and rightmost x of ellipses between the first and last pixel centres of a row of tiles."""
     x, y, _, reach_y, shear, extreme, half_width, flattening = outlines.unbind(1)
     top = row * TILE_HEIGHT + 0.5
     bottom = torch.clamp(top + (TILE_HEIGHT - 1), max=height - 0.5)
     top, bottom = torch.maximum(top - y, -reach_y), torch.minimum(bottom - y, reach_y)
 
     def edge(side: int) -> Tensor:
-        # The edge is a concave function of y (convex on the left), so the closest y to its extreme is the best.
+        # The edge is a concave function of y (convex on the left), outermost at the y that is closest to its extreme.
         dy = torch.minimum(torch.maximum(side * extreme, top), bottom)
         return x + shear * dy + side * half_width * (1 - flattening * dy.square()).clamp(min=0).sqrt()
 
@@ -202,17 +202,17 @@ def _extent_in_row(
 
 
 def _first_pixel(position: Float[Tensor, " n"], extent: int) -> Int[Tensor, " n"]:
-    """The first pixel whose centre is not before this position; `extent` if there is none."""
+    """Return the first pixel whose centre is not before this position; `extent` if there is none."""
     return (position - (0.5 + SLACK_PIXELS)).ceil().clamp(0, extent).int()
 
 
 def _last_pixel(position: Float[Tensor, " n"], extent: int) -> Int[Tensor, " n"]:
-    """The last pixel whose centre is not beyond this position; -1 if there is none."""
+    """Return the last pixel whose centre is not beyond this position; -1 if there is none."""
     return (position - (0.5 - SLACK_PIXELS)).floor().clamp(-1, extent - 1).int()
 
 
 def _expand(counts: Int[Tensor, " n"]) -> tuple[Int[Tensor, " total"], Int[Tensor, " total"]]:
-    """Item i `counts[i]` times, and the rank of each copy among those of its item."""
+    """Repeat item i `counts[i]` times; return items, and the rank of each copy among those of its item."""
     item = torch.repeat_interleave(counts)
     before = counts.cumsum(0) - counts
     return item, torch.arange(item.numel()) - before.index_select(0, item)
