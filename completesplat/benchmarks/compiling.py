@@ -20,11 +20,8 @@ class NotMeasured(CompleteSplatError):
 def compiled_within(limit: float, network: nn.Module, work: Callable[[Any], object], **settings: Any) -> Any:
     """Compile a network by `torch.compile` with these settings, call `work` once with it, and return it.
 
-    Args:
-        limit: seconds that this may take; 0 compiles nothing.
-
     Raises:
-        NotMeasured: it takes longer or fails, for example without a C++ compiler, or `limit` is 0.
+        NotMeasured: this takes more than `limit` seconds or fails, for example without a C++ compiler; or `limit` is 0.
     """
     if not limit:
         raise NotMeasured("compile_limit=0")

@@ -185,11 +185,9 @@ MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 
 
 class Training:
-    """Optimizer steps of either stage as in a run, without its logging.
+    """Optimizer steps of either stage as in a run, without its logging; `module` is on its device.
 
-    Args:
-        module: module on its device.
-        precision: precision in Lightning's notation; "bf16-mixed" computes the networks in bfloat16.
+    `precision` is in Lightning's notation: "bf16-mixed" computes the networks in bfloat16.
     """
 
     def __init__(self, module: SceneModule, precision: str) -> None:
@@ -325,11 +323,8 @@ def _named(sampler: Sampler, steps: int) -> str:
 def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: float) -> Comparison:
     """Compile the denoiser, and compare its forward and backward pass on noise, as in a training step.
 
-    Args:
-        limit: seconds that compiling may take; 0 compiles nothing.
-
     Raises:
-        NotMeasured: it takes longer or fails, for example without a C++ compiler, or `limit` is 0.
+        NotMeasured: compiling fails or takes more than `limit` seconds (see `compiled_within`).
     """
     denoiser, device = model.denoiser, model.latent_std.device
     with torch.no_grad():

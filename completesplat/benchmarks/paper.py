@@ -141,11 +141,7 @@ def run(
 
 
 def _refuse_missing_gpu(device: str) -> None:
-    """Refuse "cuda" without a GPU.
-
-    Raises:
-        CompleteSplatError: there is no GPU.
-    """
+    """Raise an error if the device is "cuda" and there is no GPU."""
     if device == "cuda" and not torch.cuda.is_available():
         raise CompleteSplatError(
             "the paper's figures are a GPU's, and there is none here: device=cpu measures all the same, "
@@ -176,9 +172,7 @@ def _rows_of_stage(
 ) -> list[dict[str, Any]]:
     """Measure a stage in each way; leave out optimizer steps with CUDA graphs, which do not go together.
 
-    Args:
-        works: makes the stage's kinds of work for a `precision`.
-        measure: returns the rows of a way and its kinds of work.
+    `works` makes the stage's kinds of work for a precision, and `measure` returns the rows of a way and its work.
     """
     measured = []
     for way in ways:

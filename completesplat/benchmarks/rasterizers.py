@@ -126,11 +126,7 @@ def _on_a_scene(
     file: str, gaussians: Gaussians, cameras: Cameras, defaults: Sequence[str], backends: Sequence[Backend],
     constants: RenderingConstants, repeats: int, tick: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Measure time and agreement of the backends on one scene.
-
-    Args:
-        defaults: names of arrays that the file lacks.
-    """
+    """Measure time and agreement of the backends on one scene; `defaults` names the arrays that its file lacks."""
     if defaults:
         values = ", ".join(f"{name}={DEFAULTS[name]}" for name in defaults)
         logger.info("%s has no %s: every Gaussian gets %s", file, ", ".join(defaults), values)

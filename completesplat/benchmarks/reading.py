@@ -29,7 +29,7 @@ class Epoch(NamedTuple):
 def rows(
     forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, tick: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Return a row per number of workers and form: rates of batches, scenes and images, and speed-up over the first form.
+    """Return a row per number of workers and form: rates of batches, scenes and images, and speed-up to the first form.
 
     The forms take turns. The median of `repeats` epochs counts for each form, after an untimed one in which workers
     start and files come into memory.
@@ -229,9 +229,7 @@ class Counter:
 def chunks(data: Any, read_chunk: str) -> dict[str, Any]:
     """Return the number of chunks and their largest size, and how many an epoch reads and holds in memory at once.
 
-    Args:
-        data: module without workers, whose training clips are in the chunks `<root>/train/*.torch`.
-        read_chunk: name of the function that reads a chunk.
+    `data` is a module without workers; the function named `read_chunk` reads its chunks, `<root>/train/*.torch`.
     """
     sizes = [path.stat().st_size for path in (data.root / "train").glob("*.torch")]
     counter = Counter()

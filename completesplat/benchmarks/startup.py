@@ -106,9 +106,8 @@ def run(weights: str, repeats: Positive, packages: Positive, against: str | None
 def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | None) -> dict[str, Seconds]:
     """Start processes in turn, each with one thread, and return their median times by name.
 
-    Args:
-        programs: arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
-        against: folder of another version, or None.
+    `programs` has the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
+    `against` is the folder of another version, or None.
     """
     kinds: dict[str, tuple[list[str], Path | None]] = {TORCH: (["-c", "import torch"], None)}
     kinds[NEEDED] = ["-c", NETWORKS], None

@@ -39,9 +39,7 @@ TO_GLTF = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
     """Write one unbatched set of Gaussians; the file appears whole or not at all.
 
-    Args:
-        gaussians: in any frame with +y down and +z forward; only the points' colours are clipped to [0, 1].
-        comments: lines of metadata.
+    The frame has +y down and +z forward. Only the points' colours are clipped to [0, 1]. `comments` are metadata.
 
     Returns:
         Number of Gaussians in the file, which omits those that cannot be stored.

@@ -25,14 +25,11 @@ REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
-    """Write one unbatched set of Gaussians; the file appears whole or not at all.
+    """Write one unbatched set of Gaussians in any frame; the file appears whole or not at all.
 
     Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Reading the file with `read_ply` and writing it again
-    gives the same bytes, except for clamped opacities.
-
-    Args:
-        gaussians: in any frame; quaternions of any length.
-        comments: lines of metadata for the header; characters outside ASCII are escaped.
+    gives the same bytes, except for clamped opacities. Quaternions may have any length. `comments` are lines of
+    metadata for the header; characters outside ASCII are escaped.
 
     Returns:
         Number of Gaussians in the file, which omits those that cannot be stored.
