@@ -109,10 +109,10 @@ def chosen_device(device: str) -> torch.device:
     Raises:
         CompleteSplatError: "cuda" without a GPU.
     """
-    there = torch.cuda.is_available()
-    if device == "cuda" and not there:
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
         raise CompleteSplatError("device=cuda: there is no GPU here; device=auto takes what there is")
-    return torch.device("cuda" if there and device != "cpu" else "cpu")
+    return torch.device("cuda" if available and device != "cpu" else "cpu")
 
 
 def chosen_of(

@@ -156,9 +156,9 @@ def _beside_the_papers(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _first_batch(data: Mapping[str, Any], folder: str) -> SceneBatch:
     """Make scenes in a folder, and return their first training batch."""
-    made = instantiate(data, root=f"{folder}/scenes", _convert_="all")
-    made.prepare_data()
-    batch: SceneBatch = next(iter(made.train_dataloader()))
+    module = instantiate(data, root=f"{folder}/scenes", _convert_="all")
+    module.prepare_data()
+    batch: SceneBatch = next(iter(module.train_dataloader()))
     return batch
 
 

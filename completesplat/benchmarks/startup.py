@@ -87,13 +87,13 @@ def run(weights: str, repeats: Positive, packages: Positive, against: str | None
         if find_spec("viser") is None:
             del programs[VIEW]
         times = timed(programs, repeats, None if against is None else Path(against).resolve())
-        ours = imported_by(["-m", PACKAGE, *programs[PREDICT]])
-        torchs = imported_by(["-c", "import torch"])
+        modules = imported_by(["-m", PACKAGE, *programs[PREDICT]])
+        torch_modules = imported_by(["-c", "import torch"])
     rows: list[dict[str, Any]] = [
         {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / times[TORCH].cpu}
         for name, x in times.items()
     ]
-    beyond = costs(ours, {module.name for module in torchs})[:packages]
+    beyond = costs(modules, {module.name for module in torch_modules})[:packages]
     results: dict[str, Any] = {"machine": machine(), "commit": git_commit(), "rows": rows, "imports": beyond}
     write_json(out / "startup.json", results)
     tables = [table("One sample, without a video, from a cold start", PROCESSES, rows)]

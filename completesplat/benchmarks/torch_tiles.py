@@ -116,7 +116,7 @@ def _project_axis(
 def _factorize(
     row_x: Float[Tensor, "batch view 3 gaussian"], row_y: Float[Tensor, "batch view 3 gaussian"], blur: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(root_x, root_y, rest_y) of the covariance of these rows plus the blur."""
+    """Return (root_x, root_y, rest_y) of the covariance of these rows plus the blur."""
     variance_x, variance_y = row_x.square().sum(2), row_y.square().sum(2)
     covariance = (row_x * row_y).sum(2)
     (x1, x2, x3), (y1, y2, y3) = row_x.unbind(2), row_y.unbind(2)
