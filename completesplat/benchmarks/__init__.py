@@ -1,1 +1,1 @@
-"""Benchmarks of speed and their opponents, side by side in one process. Nothing else imports this package."""
+"""Benchmarks of speed, with baselines that run side by side in one process. Nothing else imports this package."""

@@ -1,4 +1,4 @@
-"""How far the rasterizers' images of a large scene are from the float64 reference."""
+"""Differences between the rasterizers' images of a large scene and the float64 reference."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,12 +20,12 @@ from completesplat.rasterizers.reference import (
     visible_in_depth_order,
 )
 
-# `tiled` projects and sorts in float64, like the reference. The others do so in float32: in a large scene some
-# neighbours in depth then change places.
+# `tiled` projects and sorts in float64, like the reference. The others use float32, so that some neighbours in depth
+# change places in a large scene.
 TOLERANCE, FLOAT32_TOLERANCE = {"tiled": 1e-5}, 1e-4
 PIXELS_PER_VIEW, PIXELS_AT_ONCE = 128, 8
-# Where an alpha is this close to its threshold, or a transmittance to the stop (relatively), float32 may decide
-# otherwise than float64, rightly so. Such pixels are counted, not compared.
+# If the relative distance of an alpha to its threshold, or of a transmittance to its stop, is below these, float32 may
+# rightly decide differently from float64. These pixels are counted, but not compared.
 BAND, STOP_BAND = 1e-4, 1e-3
 
 
@@ -33,11 +33,11 @@ def agreement_rows(
     backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants,
     tick: Callable[[str], None],
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """For each backend the largest errors over the sampled pixels of all views of one scene (batch of 1).
+    """Return each backend's largest errors over sampled pixels of all views of one scene (batch of 1).
 
-    `color` and `alpha` are absolute, `depth` is relative to the largest depth of the sample; `pixels` of them were
-    compared, `undecided` left out. `agrees` says whether all three are within the backend's tolerance; one that is not
-    finite is None, and does not agree.
+    Errors of `color` and `alpha` are absolute, that of `depth` is relative to the largest depth of the sampled pixels.
+    `pixels` were compared, `undecided` were left out. `agrees` is whether all three errors are within the backend's
+    tolerance. An error that is not finite becomes None, and does not agree.
     """
     scene, seen = gaussians[0].to(torch.float64), cameras[0].to(torch.float64)
     views, (height, width) = len(seen.intrinsics), cameras.image_size
@@ -70,7 +70,7 @@ def agreement_rows(
 def draw_at(
     backend: Backend, gaussians: Gaussians, cameras: Cameras, positions: Int[Tensor, "view pixel"]
 ) -> Float[Tensor, "view pixel 5"]:
-    """Red, green, blue, depth and alpha of one scene at these positions (row-major) of each view's image."""
+    """Return red, green, blue, depth and alpha of one scene at row-major positions of each view's image."""
     rendering = backend.rasterizer(gaussians.to(backend.device), cameras.to(backend.device)).to("cpu")[0]
     images = torch.cat([rendering.color, rendering.depth, rendering.alpha], dim=1).flatten(-2)
     return images.gather(-1, positions[:, None].expand(-1, 5, -1)).mT
@@ -80,7 +80,7 @@ def draw_at(
 def is_decided(
     gaussians: Gaussians, camera: Cameras, pixels: Float[Tensor, "pixel 2"], constants: RenderingConstants
 ) -> Bool[Tensor, " pixel"]:
-    """A mask of the pixels that keep clear of the function's steps, where no decision depends on rounding."""
+    """Return a mask of the pixels that are not close to a threshold, where no decision depends on rounding."""
     visible, order = visible_in_depth_order(gaussians, camera, constants)
     chosen = gaussians[visible][order]
     centers, _, covariances = project_gaussians(chosen, camera, constants)

@@ -1,4 +1,4 @@
-"""Compiling within a time, for comparisons with what is not compiled."""
+"""Compilation within a time limit, for comparisons with networks that are not compiled."""
 
 import signal
 import threading
@@ -14,22 +14,19 @@ from completesplat.errors import CompleteSplatError
 
 
 class NotMeasured(CompleteSplatError):
-    """A comparison has no figures on this machine, for the reason in the message."""
+    """Error of a comparison that cannot be measured on this machine, for the reason in the message."""
 
 
 def compiled_within(limit: float, network: nn.Module, work: Callable[[Any], object], **settings: Any) -> Any:
-    """The network as `torch.compile` makes it with these settings, after the work was done once with it.
-
-    Args:
-        limit: seconds that this may take; 0: nothing is compiled.
+    """Compile a network by `torch.compile` with these settings, call `work` once with it, and return it.
 
     Raises:
-        NotMeasured: it takes longer or fails, for want of a C++ compiler, say.
+        NotMeasured: this takes more than `limit` seconds or fails, for example without a C++ compiler; or `limit` is 0.
     """
     if not limit:
         raise NotMeasured("compile_limit=0")
     try:
-        with at_most(limit), warnings.catch_warnings(action="ignore"):  # of code that torch will not see into
+        with at_most(limit), warnings.catch_warnings(action="ignore"):  # about code that torch does not trace
             compiled = torch.compile(network, **settings)
             work(compiled)
     except Exception as error:
@@ -41,12 +38,12 @@ def compiled_within(limit: float, network: nn.Module, work: Callable[[Any], obje
 
 
 class _TimeIsUp(BaseException):
-    """No Exception, because what is interrupted may handle those."""
+    """Interruption by `at_most`; no Exception, because the interrupted code may handle those."""
 
 
 @contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Interrupt what takes longer, where the system and the thread allow it."""
+    """Interrupt the context after this time, if the system and the thread allow it."""
     if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
         yield
         return

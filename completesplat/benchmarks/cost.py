@@ -1,4 +1,4 @@
-"""`completesplat bench cost`: how long whole trainings take, by the steps that `bench paper` measured."""
+"""`completesplat bench cost`: durations of whole trainings, from the steps that `bench paper` measured."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ DAY_MS = 24 * 3600 * 1000
 
 
 class WholeTraining(TypedDict):
-    """A training: which of the measured steps it repeats, and how often."""
+    """A training: the measured step that it repeats, and its number of steps."""
 
     step: Literal["stage1_step", "stage2_step"]
     steps: Positive
@@ -24,9 +24,10 @@ class WholeTraining(TypedDict):
 def run(
     measured: str, trainings: Mapping[str, WholeTraining], gpus: Annotated[Sequence[Positive], Entries(1)], out: Path
 ) -> None:
-    """Write `cost.json`, and print the days that each training takes on so many GPUs.
+    """Write `cost.json`, and print the days that each training takes on each number of GPUs.
 
-    `CompleteSplatError`: `measured` is no result of `bench paper`, or one without training steps.
+    Raises:
+        CompleteSplatError: `measured` is not a result of `bench paper`, or has no training steps.
     """
     results = _read(Path(measured))
     rows = bill(results["rows"], trainings, gpus)
@@ -46,7 +47,7 @@ def run(
 def bill(
     rows: Sequence[Mapping[str, Any]], trainings: Mapping[str, WholeTraining], gpus: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """A row for each training and each way in which its step was measured."""
+    """Return a row for each training and each way in which its step was measured."""
     return [
         {"training": name, "steps": training["steps"], "way": row["way"], "ms": row["ms"]}
         | {key: row[key] for key in ("memory_mb",) if key in row}

@@ -1,4 +1,4 @@
-"""`completesplat bench data`: reading from published and packed forms of the same scenes, side by side."""
+"""`completesplat bench data`: reading speeds of published and packed forms of the same scenes."""
 
 import logging
 import shutil
@@ -25,9 +25,9 @@ from completesplat.schema import Entries, Natural, OneOf, Positive, Range
 
 
 class Opening(TypedDict):
-    """A store of many sequences, which is opened and read for some epochs."""
+    """Size of a store with many sequences, and the number of epochs for which it is read."""
 
-    sequences: Annotated[int, Range(2)]  # one for training and one for validation at least
+    sequences: Annotated[int, Range(2)]  # at least one for training and one for validation
     epochs: Positive
 
 
@@ -41,23 +41,23 @@ def run(
     keep: bool,
     out: Path,
 ) -> None:
-    """Write scenes, read them in all their forms; write `data.json`, print tables.
+    """Write scenes, read them in all their forms, write `data.json`, and print tables.
 
     Args:
-        objects: `write` (out) makes the scenes, `data` (settings) their data module; `references_per_sequence`, `raw`
-            and `prepared`, is the number of items of each training sequence in an epoch.
+        objects: `write` (out) makes the scenes, `data` (settings) their data module. `references_per_sequence` holds
+            the number of items of each training sequence in an epoch, for the forms `raw` and `prepared`.
         rooms: `write` and `data` of clips, and `read_chunk`, the name of the function that reads a chunk of them; False
-            leaves them out.
-        opening: False leaves it out.
-        workers: numbers of loading processes; everything is measured for each.
-        repeats: timed epochs of each form.
-        codecs: of the packed stores; the store of many sequences has the first.
-        keep: whether the files that were read stay in `out`.
+            skips them.
+        opening: the store of many sequences; False skips it.
+        workers: numbers of loading processes; everything is measured with each of them.
+        repeats: number of timed epochs of each form.
+        codecs: codecs of the packed stores; the store of many sequences has the first one.
+        keep: whether to keep the files that were read in `out`.
     """
     folder = Path(mkdtemp(prefix="bench_data_", dir=out))
     try:
         with _warnings_only("completesplat.data"):
-            # Everything is written before anything is read: writing shows progress bars of its own.
+            # Write everything before reading anything, because writing shows its own progress bars.
             forms = _objects(objects, codecs, folder)
             clips = _rooms(rooms, codecs, folder) if rooms else {}
             store = _store(forms, opening["sequences"], codecs[0], folder) if opening else None
@@ -66,8 +66,8 @@ def run(
                 figures: dict[str, Any] = {"rows": measure(forms, decoding=True)}
                 if opening and store is not None:
                     status.update("reading many sequences in a fresh process")
-                    found = opening_figures(store, opening["epochs"])
-                    figures["opening"] = {"sequences": opening["sequences"], **found}
+                    measured = opening_figures(store, opening["epochs"])
+                    figures["opening"] = {"sequences": opening["sequences"], **measured}
                 if rooms:
                     figures["clips"] = measure(clips, decoding=False)
                     figures["chunks"] = chunks(clips["chunks"](workers=0), rooms["read_chunk"])
@@ -83,7 +83,7 @@ def run(
 
 @contextmanager
 def _warnings_only(name: str) -> Iterator[None]:
-    """Keep a logger to warnings: each of dozens of data modules would say how many sequences it has."""
+    """Limit a logger to warnings, because dozens of data modules would log their numbers of sequences."""
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.WARNING)
@@ -94,7 +94,7 @@ def _warnings_only(name: str) -> Iterator[None]:
 
 
 def _objects(settings: Mapping[str, Any], codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
-    """Makers of data modules by the form they read; the form as published comes first."""
+    """Write objects in all forms; return makers of their data modules by form, the published form first."""
     settings["write"](out=folder / "objects")
     data = partial(settings["data"], root=str(folder / "objects"))
     references = settings["references_per_sequence"]
@@ -118,15 +118,15 @@ def _store(objects: Mapping[str, MakeData], sequences: int, codec: str, folder: 
 def _rows(
     workers: Sequence[int], repeats: int, tick: Callable[[str], None], forms: Mapping[str, MakeData], decoding: bool
 ) -> list[dict[str, Any]]:
-    """Rates of all forms; with `decoding` also its share of the time, where the main process loads."""
-    found = rows(forms, workers, repeats, tick)
+    """Return the rates of all forms; with `decoding`, also its share of the time if the main process loads."""
+    results = rows(forms, workers, repeats, tick)
     for name, make in forms.items() if decoding else ():
         tick(f"{name}: time in decoding")
         share = decoding_share(make(workers=0).train_dataloader())
-        for row in found:
+        for row in results:
             if (row["form"], row["workers"]) == (name, 0):
                 row["decoding_share"] = share
-    return found
+    return results
 
 
 VALIDATION_SHARE = 0.1
@@ -136,11 +136,11 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
     """Prepare the training sequences of a data module once with each codec.
 
     Args:
-        data: the module, but for its number of workers; other settings may follow.
-        folder: what is made lies below it.
+        data: makes the module from the settings that are still open, such as its number of workers.
+        folder: the folder above the prepared forms.
 
     Returns:
-        By name, the module that reads the prepared form.
+        Makers of the modules that read the prepared forms, by name.
     """
     module = data()
     sources, settings = {"train": module.source("train")}, module.packed_settings()
@@ -151,7 +151,7 @@ def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, M
 
 
 def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeData:
-    """A packed store of `sequences` sequences for training and validation, of a module's few training sequences."""
+    """Write a packed store of `sequences` sequences that repeat a module's few; return its module's maker."""
     module = data()
     validation = max(1, round(VALIDATION_SHARE * sequences))
     counts = {"train": sequences - validation, "val": validation}
@@ -161,7 +161,7 @@ def repeated(data: MakeData, sequences: int, folder: Path, codec: str) -> MakeDa
 
 @dataclass
 class RepeatedSource(SequenceSource):
-    """`count` sequences: those of another source again and again, under new names. See `SequenceSource`."""
+    """Source of `count` sequences that repeat those of another source under new names."""
 
     source: SequenceSource
     count: int
@@ -173,16 +173,16 @@ class RepeatedSource(SequenceSource):
         self.listed = self.count
 
     def read(self, name: str) -> PosedSequence:
-        """A sequence of the other source under this name."""
+        """Read a sequence of the other source under this name."""
         originals = self.source.names
         return replace(self.source.read(originals[int(name) % len(originals)]), name=name)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
-        """All sequences are in one group."""
+        """Return one group with all sequences."""
         return [list(range(len(names)))]
 
     def fingerprint(self) -> str:
-        """The fingerprint of the other source."""
+        """Return the fingerprint of the other source."""
         return self.source.fingerprint()
 
 
@@ -204,17 +204,17 @@ STEPS: list[Column] = [
 
 
 def show(results: dict[str, Any]) -> None:
-    """Print all that there is in the results."""
-    shown: list[Table | str] = [table("Training batches", [*READING, DECODING], results["rows"])]
+    """Print all parts of the results."""
+    sections: list[Table | str] = [table("Training batches", [*READING, DECODING], results["rows"])]
     if "opening" in results:
         opening = results["opening"]
-        shown.append(table(f"A packed store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
+        sections.append(table(f"A packed store of {opening['sequences']:,} sequences", STEPS, opening["steps"]))
     if "clips" in results:
-        shown.append(table("Training batches of clips", READING, results["clips"]))
+        sections.append(table("Training batches of clips", READING, results["clips"]))
         chunks = results["chunks"]
         size, read, most = chunks["largest_mb"], chunks["read_in_an_epoch"], chunks["most_in_memory"]
-        shown.append(
+        sections.append(
             f"{chunks['files']} chunks of up to {size:.1f} MB: {read} read in an epoch, {most} in memory at once"
         )
     machine = results["machine"]
-    print_results(results, f"{machine['processor']}, {machine['cores']} cores", shown)
+    print_results(results, f"{machine['processor']}, {machine['cores']} cores", sections)

@@ -1,4 +1,4 @@
-"""`completesplat bench diffusion`: what stage 2 costs, one way against another on the same work."""
+"""`completesplat bench diffusion`: time of stage 2, in pairs of ways to do the same work."""
 
 import statistics
 import time
@@ -40,9 +40,9 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two ways, each with a few words for tables; the first is the one that should be faster.
+    """Two ways of doing the same work, each with a label for tables; the first one should be faster.
 
-    `counted`: also count their floating-point operations, which a compiled network hides.
+    `counted`: whether to count their floating-point operations, which a compiled network hides.
     """
 
     name: str
@@ -65,26 +65,26 @@ def run(
     seed: int,
     out: Path,
 ) -> None:
-    """Compare on random weights; write `diffusion.json`, print a table.
+    """Compare pairs of ways with random weights, write `diffusion.json`, and print a table.
 
     Args:
-        data, model: configurations of the data module and of stage 2's module.
-        few: configuration of a sampler with few steps.
-        device: "auto" takes a GPU where there is one.
-        precision: of training steps.
-        repeats: timed calls of each way.
-        samples: drawn of one picture, in a batch and one by one, in `steps` steps.
-        compile_limit: seconds that `torch.compile` may take; 0 leaves it out.
-        only: names of the comparisons; None for all.
+        data, model: configs of the data module and of stage 2's module.
+        few: config of a sampler with few steps.
+        device: "auto" takes a GPU if there is one.
+        precision: precision of training steps.
+        repeats: number of timed calls of each way.
+        samples: number of samples of one image, which are drawn in a batch and one by one, in `steps` steps.
+        compile_limit: seconds that `torch.compile` may take; 0 skips it.
+        only: names of the comparisons to do; None does all.
 
     Raises:
-        CompleteSplatError: there is no such device or comparison.
+        CompleteSplatError: the device or a comparison does not exist.
     """
     chosen = chosen_device(device)
     quieten()
     with TemporaryDirectory(prefix="bench_diffusion_", dir=out) as folder:
         make_data = partial(instantiate, data, root=f"{folder}/scenes", _convert_="all")
-        make_data().prepare_data()  # it shows progress of its own
+        make_data().prepare_data()  # it shows its own progress bar
         torch.manual_seed(seed)
         module = instantiate(model, _convert_="all").to(chosen)
         generator, batch = module.completesplat, data["batch_size"]
@@ -104,24 +104,24 @@ def run(
 
 
 def chosen_device(device: str) -> torch.device:
-    """The device of a setting.
+    """Return the device for the option `device`.
 
     Raises:
-        CompleteSplatError: "cuda", where there is no GPU.
+        CompleteSplatError: "cuda" without a GPU.
     """
-    there = torch.cuda.is_available()
-    if device == "cuda" and not there:
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
         raise CompleteSplatError("device=cuda: there is no GPU here; device=auto takes what there is")
-    return torch.device("cuda" if there and device != "cpu" else "cpu")
+    return torch.device("cuda" if available and device != "cpu" else "cpu")
 
 
 def chosen_of(
     prepared: Mapping[str, Callable[[], Comparison]], only: Sequence[str] | None
 ) -> Mapping[str, Callable[[], Comparison]]:
-    """Those of these names, or all.
+    """Select comparisons by name, or all.
 
     Raises:
-        CompleteSplatError: a name that is none of theirs.
+        CompleteSplatError: a name does not exist.
     """
     for name in only or ():
         if name not in prepared:
@@ -132,7 +132,7 @@ def chosen_of(
 def _measured_in_turn(
     prepared: Mapping[str, Callable[[], Comparison]], repeats: int, device: torch.device
 ) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Rows of the comparisons, each of which is prepared when it is its turn, and why others have none, by name."""
+    """Prepare and measure one comparison after another; return their rows, and reasons for missing rows by name."""
     rows, not_measured = [], {}
     with Console(stderr=True).status("building") as status:
         for name, prepare in prepared.items():
@@ -149,9 +149,9 @@ def _same(comparison: Comparison) -> Comparison:
 
 
 def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict[str, Any]:
-    """Return a row: medians in ms of both ways, which take turns, how many times faster `a` is, and TFLOP of a call.
+    """Return a row: medians in ms of both ways, which take turns, the speed-up of `a`, and TFLOP per call.
 
-    The first two calls of each are not timed. FLOPs are those of torch's own counter (products, convolutions).
+    The first two calls of each way are not timed. FLOPs are those that torch counts (products, convolutions).
     """
     ways = {"a": comparison.a, "b": comparison.b}
     tflop = {}
@@ -169,7 +169,7 @@ def measured(comparison: Comparison, repeats: int, device: torch.device) -> dict
 
 
 def milliseconds(work: Work, device: torch.device) -> float:
-    """Time of one call, until the device has finished it."""
+    """Return the time of one call, until the device has finished it."""
     wait = torch.cuda.synchronize if device.type == "cuda" else _nothing
     wait()
     start = time.perf_counter()
@@ -185,22 +185,20 @@ MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
 
 
 class Training:
-    """Optimizer steps of either stage as in a run, without what a run logs.
+    """Optimizer steps of either stage as in a run, without its logging; `module` is on its device.
 
-    Args:
-        module: on its device.
-        precision: Lightning's; "bf16-mixed" computes the networks in bfloat16.
+    `precision` is in Lightning's notation: "bf16-mixed" computes the networks in bfloat16.
     """
 
     def __init__(self, module: SceneModule, precision: str) -> None:
         self.module: Any = module.train()
         self.precision = precision
-        for logs in ("log_loss", "log_dict"):  # there is no trainer that would
+        for logs in ("log_loss", "log_dict"):  # there is no trainer to log with
             setattr(module, logs, lambda *_, **__: None)
         self.optimizer: Optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
 
     def step(self, batch: Any) -> None:
-        """One optimizer step on a batch of scenes, encoded or not."""
+        """Do one optimizer step on a batch of scenes or of their latents."""
         module = self.module
         with autocast(module.device, self.precision):
             loss = module.training_step(batch.to(module.device), 0)
@@ -211,16 +209,16 @@ class Training:
 
 
 def autocast(device: torch.device, precision: str) -> torch.autocast:
-    """The context in which Lightning computes with this precision."""
+    """Return the context in which Lightning computes with this precision."""
     return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
 
 
 def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule], folder: Path) -> Comparison:
-    """Steps on batches that are loaded within the time.
+    """Compare training steps from the latent cache and with encoding, both including the loading of batches.
 
     Args:
-        data: settings (`latent_cache`, `root`) -> the data module, whose scenes are there.
-        folder: where the training set is encoded; it is packed beside it.
+        data: makes the data module from the settings `latent_cache` and `root`; its scenes exist.
+        folder: folder for the latents of the training set, which is packed beside it.
     """
     parts = training.module.completesplat
     pictures, packed = data(), folder.with_name("packed")
@@ -245,7 +243,7 @@ def cached_vs_on_the_fly(training: Training, data: Callable[..., SceneDataModule
 
 
 def fill_cache(data: SceneDataModule) -> None:
-    """Read all training pictures, as a run has after its first epochs: what `data.cache` keeps is there then."""
+    """Read all training images, so that `data.cache` holds what it does after the first epochs of a run."""
     store = data.store("train")
     for name in store.names:
         sequence = store.source.read(name)
@@ -254,7 +252,7 @@ def fill_cache(data: SceneDataModule) -> None:
 
 
 def batches(data: SceneDataModule) -> Iterator[Any]:
-    """The training batches of one epoch after the other."""
+    """Yield the training batches of one epoch after another."""
     loader = data.train_dataloader()
     epoch = 0
     while True:
@@ -263,18 +261,17 @@ def batches(data: SceneDataModule) -> Iterator[Any]:
         epoch += 1
 
 
-GUIDANCE_WEIGHT = 0.5  # of the paper's settings for diverse samples
+GUIDANCE_WEIGHT = 0.5  # from the paper's settings for diverse samples
 MANY_STEPS = 50  # the paper's
 
 
 def comparisons(model: CompleteSplat, few: Mapping[str, Any], samples: int, steps: int, batch: int) -> list[Comparison]:
-    """The comparisons of drawing samples with a generator, which is on its device.
+    """Return the comparisons of drawing samples with a generator on its device.
 
     Args:
-        few: configuration of a sampler with few steps.
-        samples: of one picture, in a batch or one by one.
-        steps: of those samples.
-        batch: pictures, of which a sample each is drawn without and with guidance, and in few and in many steps.
+        few: config of a sampler with few steps.
+        samples, steps: number of samples of one image, in a batch or one by one, and of their steps.
+        batch: number of images, each with one sample, without or with guidance, and in few or many steps.
     """
     model.eval()
     usual, quick = model.sampler, _built(model, few)
@@ -300,16 +297,16 @@ def comparisons(model: CompleteSplat, few: Mapping[str, Any], samples: int, step
 
 
 def _built(model: CompleteSplat, sampler: Mapping[str, Any]) -> Sampler:
-    """The sampler of a configuration, for what the model's denoiser was trained with."""
-    own, config = model.sampler, model.architecture["sampler"]
+    """Build the sampler of a config for the noise schedule and prediction type of the model's denoiser."""
+    usual, config = model.sampler, model.architecture["sampler"]
     model.replace_sampler(sampler)
     built: Sampler = model.sampler
-    model.sampler, model.architecture["sampler"] = own, config
+    model.sampler, model.architecture["sampler"] = usual, config
     return built
 
 
 def _draw(model: CompleteSplat, sampler: Sampler, pictures: int, **settings: Any) -> Gaussians:
-    """Scenes of pictures of noise: what they show does not change the work."""
+    """Draw scenes for images of noise, because the content of images does not change the work."""
     size, device = model.image_size, model.latent_std.device
     images = torch.rand(pictures, 3, size, size, generator=torch.Generator().manual_seed(0)).to(device)
     camera = Cameras(torch.eye(4, device=device), pinhole(model.fov_degrees.item(), size).to(device), (size, size))
@@ -324,13 +321,10 @@ def _named(sampler: Sampler, steps: int) -> str:
 
 
 def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: float) -> Comparison:
-    """Forward and backward pass of the denoiser on noise, as in a training step; compiles it now.
-
-    Args:
-        limit: seconds that compiling may take; 0: nothing is compiled.
+    """Compile the denoiser, and compare its forward and backward pass on noise, as in a training step.
 
     Raises:
-        NotMeasured: it takes longer or fails, for want of a C++ compiler, say.
+        NotMeasured: compiling fails or takes more than `limit` seconds (see `compiled_within`).
     """
     denoiser, device = model.denoiser, model.latent_std.device
     with torch.no_grad():
@@ -355,7 +349,7 @@ def compiled_vs_eager(model: CompleteSplat, batch: int, precision: str, limit: f
 
 
 def drawn_compiled_vs_eager(model: CompleteSplat, samples: int, steps: int, limit: float) -> Comparison:
-    """Samples of a picture in a batch; compiles the denoiser now, on a GPU into CUDA graphs (`compiled_vs_eager`)."""
+    """Compile the denoiser, on a GPU into CUDA graphs, and compare a batch of samples (see `compiled_vs_eager`)."""
     denoiser, graphs = model.eval().denoiser, model.latent_std.device.type == "cuda"
 
     def work(network: nn.Module) -> None:
@@ -387,7 +381,7 @@ COMPARED: list[Column] = [
 
 
 def show(results: dict[str, Any]) -> None:
-    """Print all that there is in the results."""
+    """Print all parts of the results."""
     work = results["workload"]
     size = work["image_size"]
     title = f"{size} x {size} pixels, batch {work['batch']}, training in {work['precision']}"

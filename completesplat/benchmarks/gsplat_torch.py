@@ -1,9 +1,9 @@
-"""An outside opponent for the benchmark: gsplat's torch implementation, with stand-ins for its CUDA parts.
+"""External baseline of the benchmark: gsplat's torch implementation, with replacements for three of its parts.
 
-gsplat 1.5.3 keeps torch versions of its kernels for its tests (`gsplat/cuda/_torch_impl.py`). Its projection and its
-offsets of tiles are called as they are. Three parts are written here, because `_isect_tiles` is a Python loop over
-single Gaussians (seconds for a splatter image), and `_rasterize_to_pixels` needs a CUDA operator for the pairs of
-Gaussians and pixels and nerfacc for the weights along rays.
+gsplat 1.5.3 has torch versions of its kernels for its tests (`gsplat/cuda/_torch_impl.py`). Its projection and its
+offsets of tiles are called unchanged. This module replaces `_isect_tiles`, because that is a Python loop over single
+Gaussians (seconds for a splatter image), and two parts of `_rasterize_to_pixels`, because that needs a CUDA operator
+for the pairs of Gaussians and pixels, and nerfacc for the weights along rays.
 """
 
 from collections.abc import Iterator
@@ -20,18 +20,18 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rendering, RenderingConstants
 from completesplat.tensors import TensorDataclass, stack
 
-TILE_SIZE = 8  # px; a fifth faster here than gsplat's default of 16
+TILE_SIZE = 8  # px; a fifth faster on a CPU than gsplat's default of 16
 FRUSTUM_MARGIN = 0.3  # in gsplat's `_persp_proj`
 BUDGET = 2**20  # pairs of Gaussians and pixels that are examined at once
 
 
 class GsplatTorchRasterizer:
-    """gsplat's function, for float32 tensors in main memory; all views of a scene together, as gsplat takes them.
+    """gsplat's rasterizer for float32 tensors on the CPU, which renders all views of a scene together.
 
     Unlike in the other rasterizers, values that are not finite spread.
 
     Raises:
-        CompleteSplatError: gsplat is not installed, or the frustum margin is not the one that it has built in.
+        CompleteSplatError: gsplat is not installed, or the frustum margin differs from the one built into gsplat.
     """
 
     def __init__(self, constants: RenderingConstants | None = None) -> None:
@@ -87,7 +87,7 @@ class GsplatTorchRasterizer:
 
 @dataclass(frozen=True)
 class _Splats(TensorDataclass):
-    """Gaussians as the cameras see them, [view gaussian] flattened, with what is blended: colour, depth and one."""
+    """Gaussians as seen by the cameras, [view gaussian] flattened; `channels` are blended: colour, depth and one."""
 
     centers: Float[Tensor, "splat 2"]
     radii: Integer[Tensor, "splat 2"]
@@ -101,7 +101,7 @@ class _Splats(TensorDataclass):
 def intersect_tiles(
     splats: _Splats, grid: tuple[int, int], views: int
 ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
-    """In place of `_isect_tiles`: sorted keys (from the highest bit: view, tile, depth) and their splats."""
+    """Replace `_isect_tiles`: return sorted keys (from the highest bit: view, tile, depth) and their splats."""
     rows, columns = grid
     none, limits = torch.tensor([0, 0]), torch.tensor([columns, rows])
     first = ((splats.centers - splats.radii) / TILE_SIZE).floor().long().clamp(none, limits)
@@ -113,7 +113,7 @@ def intersect_tiles(
     x, y = first[listed, 0] + rank % wide[listed], first[listed, 1] + rank // wide[listed]
     view = listed // max(1, splats.depths.numel() // views)
     tile = (view << (rows * columns).bit_length()) | (y * columns + x)
-    # Positive floats are ordered as their bits are.
+    # Positive floats have the same order as their bits.
     keys, order = ((tile << 32) | splats.depths.view(torch.int32)[listed].long()).sort(stable=True)
     return keys, listed[order]
 
@@ -127,14 +127,14 @@ def pairs(
     image_size: tuple[int, int],
     constants: RenderingConstants,
 ) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
-    """In place of `rasterize_to_indices_in_range`: the splats that a pixel blends, and the pixels.
+    """Replace `rasterize_to_indices_in_range`: return pairs of a blended splat and its pixel.
 
     The pairs of a pixel follow each other, front to back. Pixels are numbered [view height width].
     """
     (height, width), (rows, columns) = image_size, grid
     counts = torch.cat([offsets[1:], offsets.new_tensor([listed.numel()])]) - offsets
     inside = torch.arange(TILE_SIZE**2)
-    found = [(listed[:0], listed[:0])]
+    blended = [(listed[:0], listed[:0])]
     for tiles in _chunks(counts):
         rank = torch.arange(int(counts[tiles].max()))
         numbers = listed[(offsets[tiles, None] + rank).clamp(max=listed.numel() - 1)]
@@ -147,12 +147,12 @@ def pairs(
         after = torch.where(drawn, 1 - alphas, 1).cumprod(-1)
         tile, pixel, entry = (drawn & (after > constants.min_transmittance)).nonzero().unbind(1)
         view = tiles[tile] // (rows * columns)
-        found.append((numbers[tile, entry], (view * height + y[tile, pixel]) * width + x[tile, pixel]))
-    return torch.cat([pair[0] for pair in found]), torch.cat([pair[1] for pair in found])
+        blended.append((numbers[tile, entry], (view * height + y[tile, pixel]) * width + x[tile, pixel]))
+    return torch.cat([pair[0] for pair in blended]), torch.cat([pair[1] for pair in blended])
 
 
 def _chunks(counts: Integer[Tensor, " tile"]) -> Iterator[Int[Tensor, " t"]]:
-    """Groups of tiles with lists of similar lengths, whose padded lists stay within the budget."""
+    """Yield groups of tiles with lists of similar lengths, whose padded lists stay within the budget."""
     lengths, order = counts.sort()
     tiles = order[lengths > 0]
     while tiles.numel():
@@ -169,16 +169,16 @@ def _alphas(
     opacities: Float[Tensor, "*#pair"],
     constants: RenderingConstants,
 ) -> Float[Tensor, "*pair"]:
-    """As in gsplat's `accumulate`."""
+    """Return alphas as gsplat's `accumulate` does."""
     (x, y), (xx, xy, yy) = deltas.unbind(-1), conics.unbind(-1)
     sigmas = 0.5 * (xx * x**2 + yy * y**2) + xy * x * y
     return torch.clamp_max(opacities * torch.exp(-sigmas), constants.max_alpha)
 
 
 def weights_along_rays(alphas: Float[Tensor, " pair"], pixels: Int[Tensor, " pair"]) -> Float[Tensor, " pair"]:
-    """In place of nerfacc's `render_weight_from_alpha`: alpha times the transmittance before it, for each pixel's run.
+    """Replace nerfacc's `render_weight_from_alpha`: return alpha times the transmittance before it, per pixel.
 
-    Transmittances are differences of one running sum of logarithms, in float64 because that sum spans all pixels.
+    Transmittances are differences of one running sum of logarithms, in float64 because the sum spans all pixels.
     """
     logs = torch.log1p(-alphas.double())
     before = logs.cumsum(0) - logs

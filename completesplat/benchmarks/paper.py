@@ -1,4 +1,4 @@
-"""`completesplat bench paper`: the durations that the paper gives for an A100, beside ours."""
+"""`completesplat bench paper`: our durations beside those that the paper states for an A100."""
 
 import gc
 import statistics
@@ -34,14 +34,14 @@ from completesplat.training.scene_module import SceneModule
 
 @dataclass(frozen=True)
 class Figure:
-    """A duration in ms: of the paper, on an A100, and what is aimed at on a newer GPU."""
+    """Durations in ms of one kind of work: the paper's on an A100, and our aim on a newer GPU."""
 
     text: str
     paper_ms: float | None
     aim_ms: float | None
 
     def durations(self) -> dict[str, float | None]:
-        """Both durations by their columns of the table."""
+        """Return both durations by their columns of the table."""
         return {"paper_ms": self.paper_ms, "aim_ms": self.aim_ms}
 
 
@@ -57,10 +57,10 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Way:
-    """How networks are computed.
+    """A way of computing networks: precision and compilation.
 
     Args:
-        compile: arguments of `torch.compile`; None leaves them as they are.
+        compile: arguments of `torch.compile`; None does not compile.
     """
 
     name: str
@@ -83,7 +83,7 @@ WAYS = (
 
 Works = dict[str, Callable[[], object]]
 
-# Where the paper's durations are of other work, they do not stand beside ours.
+# The paper's durations are shown beside ours only for the same work.
 PAPERS_WORK = {"image_size": 128, "batch": 32, "samples": 20, "steps": 50}
 PAPERS_CHANNELS = {"encoder": [128, 256, 512, 512], "denoiser": [320, 640, 1280, 1280]}
 
@@ -102,16 +102,16 @@ def run(
     seed: int,
     out: Path,
 ) -> None:
-    """Measure on random weights; write `paper.json`, print a table.
+    """Measure with random weights, write `paper.json`, and print a table.
 
     Args:
-        data, stage1, stage2: configurations of the data module and of both stages' modules.
-        steps: of the sampler.
-        repeats: timed calls of each.
-        samples: drawn of one picture at once.
-        compile: also with `torch.compile`, and with CUDA graphs.
-        training: also optimizer steps of both stages.
-        channels: of the `encoder` and the `denoiser`, which tell whether the work is the paper's.
+        data, stage1, stage2: configs of the data module and of both stages' modules.
+        steps: number of steps of the sampler.
+        repeats: number of timed calls of each kind of work.
+        samples: number of samples that are drawn of one image at once.
+        compile: whether to measure with `torch.compile` and with CUDA graphs as well.
+        training: whether to measure optimizer steps of both stages as well.
+        channels: channels of the `encoder` and the `denoiser`, which tell whether the work is the paper's.
 
     Raises:
         CompleteSplatError: there is no GPU.
@@ -121,31 +121,27 @@ def run(
     stages = {"stage1": (stage1, stage1_works), "stage2": (stage2, partial(stage2_works, samples=samples))}
     ways = [way for way in WAYS if compile or way.compile is None]
     quieten()
-    found = []
+    measured = []
     with (
         TemporaryDirectory(prefix="bench_paper_", dir=out) as folder,
         Console(stderr=True).status("building") as status,
     ):
         measure = partial(rows, repeats=repeats, tick=lambda text: status.update(f"timing {text}"))
         scenes = _first_batch(data, folder).to(torch.device(device))
-        # One after the other, so that the memory of one is not counted for the other.
+        # One stage after the other, so that the memory of one is not counted for the other.
         for name, (config, works) in stages.items():
             torch.manual_seed(seed)
             module = instantiate(config, _convert_="all").to(device)
-            found += _rows_of_stage(name, module, ways, partial(works, module, scenes), training, measure)
+            measured += _rows_of_stage(name, module, ways, partial(works, module, scenes), training, measure)
     work = {"image_size": data["image_size"], "batch": data["batch_size"], "samples": samples, "steps": steps}
-    found = _beside_the_papers(found) if is_as_in_the_paper(work, channels) else found
-    results = {"machine": machine(), "workload": {"device": device, **work, "repeats": repeats}, "rows": found}
+    measured = _beside_the_papers(measured) if is_as_in_the_paper(work, channels) else measured
+    results = {"machine": machine(), "workload": {"device": device, **work, "repeats": repeats}, "rows": measured}
     write_json(out / "paper.json", results)
     show(results)
 
 
 def _refuse_missing_gpu(device: str) -> None:
-    """Refuse "cuda" where there is none.
-
-    Raises:
-        CompleteSplatError: there is no GPU.
-    """
+    """Raise an error if the device is "cuda" and there is no GPU."""
     if device == "cuda" and not torch.cuda.is_available():
         raise CompleteSplatError(
             "the paper's figures are a GPU's, and there is none here: device=cpu measures all the same, "
@@ -154,15 +150,15 @@ def _refuse_missing_gpu(device: str) -> None:
 
 
 def _beside_the_papers(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with the paper's durations."""
+    """Add the paper's durations to rows."""
     return [FIGURES[row["name"]].durations() | row for row in rows]
 
 
 def _first_batch(data: Mapping[str, Any], folder: str) -> SceneBatch:
-    """The first batch of training scenes, which are made in a folder."""
-    made = instantiate(data, root=f"{folder}/scenes", _convert_="all")
-    made.prepare_data()
-    batch: SceneBatch = next(iter(made.train_dataloader()))
+    """Make scenes in a folder, and return their first training batch."""
+    module = instantiate(data, root=f"{folder}/scenes", _convert_="all")
+    module.prepare_data()
+    batch: SceneBatch = next(iter(module.train_dataloader()))
     return batch
 
 
@@ -174,30 +170,28 @@ def _rows_of_stage(
     training: bool,
     measure: Callable[..., list[dict[str, Any]]],
 ) -> list[dict[str, Any]]:
-    """Each way in turn. CUDA graphs and optimizer steps do not go together.
+    """Measure a stage in each way; leave out optimizer steps with CUDA graphs, which do not go together.
 
-    Args:
-        works: makes the works of the stage for a `precision`.
-        measure: gives the rows of a way and its works.
+    `works` makes the stage's kinds of work for a precision, and `measure` returns the rows of a way and its work.
     """
-    found = []
+    measured = []
     for way in ways:
         with compiled(networks(module), way):
             pieces = works(precision=way.precision)
             if not training or way.graphs:
                 del pieces[f"{name}_step"]
-            found += measure(way, pieces, device=module.device)
-    return found
+            measured += measure(way, pieces, device=module.device)
+    return measured
 
 
 def is_as_in_the_paper(work: Mapping[str, int], channels: Mapping[str, Sequence[int]]) -> bool:
-    """Whether the work is that which the paper's durations are of, so that they can stand beside ours."""
+    """Return whether the paper's durations belong to the same work, so that they can stand beside ours."""
     return dict(work) == PAPERS_WORK and dict(channels) == PAPERS_CHANNELS
 
 
 @contextmanager
 def compiled(networks: list[nn.Module], way: Way) -> Iterator[None]:
-    """Compile these networks on their first call within the context."""
+    """Within the context, let these networks compile on their first call."""
     before = [network._compiled_call_impl for network in networks]
     if way.compile is not None:
         torch.compiler.reset()
@@ -214,7 +208,7 @@ VIEWS = 100
 
 
 def stage1_works(module: ReconstructionModule, scenes: SceneBatch, precision: str) -> Works:
-    """Works of the autoreconstructor: the first scene from its picture, its views, and a step on all scenes."""
+    """Return the work of stage 1: reconstruct the first scene from its image, render it, train on all scenes."""
     scene = scenes[:1]
 
     @torch.no_grad()
@@ -233,7 +227,7 @@ def stage1_works(module: ReconstructionModule, scenes: SceneBatch, precision: st
 
 
 def stage2_works(module: LatentDiffusion, scenes: SceneBatch, precision: str, samples: int) -> Works:
-    """Works of latent diffusion: samples of the first picture, and a step on all, encoded within the time."""
+    """Return the work of stage 2: draw samples of the first image, train on all scenes (encoded in this time)."""
     scene = scenes[:1]
     parts = module.completesplat
 
@@ -250,7 +244,7 @@ def stage2_works(module: LatentDiffusion, scenes: SceneBatch, precision: str, sa
 
 
 def networks(module: ReconstructionModule | LatentDiffusion) -> list[nn.Module]:
-    """The parts that are called as a whole, which can be compiled."""
+    """Return the parts that are called as a whole, which can be compiled."""
     if isinstance(module, ReconstructionModule):
         return [module.model.get_submodule("encoder"), module.model.get_submodule("reconstructor")]
     parts = module.completesplat
@@ -259,7 +253,7 @@ def networks(module: ReconstructionModule | LatentDiffusion) -> list[nn.Module]:
 
 
 def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
-    """Cameras around the scene: [1, VIEWS]."""
+    """Return cameras around the scene, [1, VIEWS]."""
     pivot = gaussians.means[0].mean(0)
     up = pivot.new_tensor([0.0, -1.0, 0.0])
     return orbit(camera, pivot, up, VIEWS).map(lambda tensor: tensor[None])
@@ -267,7 +261,7 @@ def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
 
 def _step(module: SceneModule, scenes: SceneBatch, precision: str) -> Callable[[], None]:
     @cache
-    def training() -> Training:  # its optimizer's memory is not wanted before
+    def training() -> Training:  # made late, because its optimizer needs memory
         return Training(module, precision)
 
     def step() -> None:
@@ -283,21 +277,21 @@ MEGABYTE = 1e6
 def rows(
     way: Way, works: Mapping[str, Callable[[], object]], repeats: int, device: torch.device, tick: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """A row for each work: median ms, and on a GPU the most memory that torch held, weights included, in MB.
+    """Return a row for each kind of work: median ms and, on a GPU, torch's peak memory in MB, weights included.
 
-    What fails, for want of memory, say, has the reason in its row instead.
+    If some work fails, for example because memory is short, its row has the reason instead.
     """
-    found = []
+    results = []
     for name, work in works.items():
         tick(f"{way.name}: {FIGURES[name].text}")
         row: dict[str, Any] = {"name": name, "way": way.name}
         try:
-            found.append(row | _measured(work, repeats, device))
-        except (RuntimeError, AssertionError) as error:  # both kinds come from torch's compiler, too
+            results.append(row | _measured(work, repeats, device))
+        except (RuntimeError, AssertionError) as error:  # torch's compiler raises both kinds, too
             first = (str(error).strip().splitlines() or [""])[0]
-            found.append(row | {"not_measured": f"{type(error).__name__}: {first}"})
+            results.append(row | {"not_measured": f"{type(error).__name__}: {first}"})
         gc.collect()
-    return found
+    return results
 
 
 def _measured(work: Callable[[], object], repeats: int, device: torch.device) -> dict[str, Any]:
@@ -323,12 +317,12 @@ COLUMNS: list[Column] = [
 
 
 def show(results: dict[str, Any]) -> None:
-    """Print all that there is in the results, the ways of one work next to each other."""
+    """Print the results, with the ways of doing one kind of work next to each other."""
     work = results["workload"]
     order = list(FIGURES)
     rows = sorted(results["rows"], key=lambda row: order.index(row["name"]))
     size = work["image_size"]
     drawn = f"{work['samples']} samples in {work['steps']} steps"
     title = f"{size} x {size} pixels, {drawn}, training batches of {work['batch']}"
-    shown = table(title, COLUMNS, [row | {"text": FIGURES[row["name"]].text} for row in rows])
-    print_results(results, device_of(results), [shown], width=140)
+    durations = table(title, COLUMNS, [row | {"text": FIGURES[row["name"]].text} for row in rows])
+    print_results(results, device_of(results), [durations], width=140)

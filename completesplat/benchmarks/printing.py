@@ -1,4 +1,4 @@
-"""How the results of a benchmark are printed: the machine, its tables, and what could not be measured."""
+"""Printing of a benchmark's results: the machine, the tables, and the parts that were not measured."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,22 +12,22 @@ def print_results(results: dict[str, Any], where: str, tables: Iterable[Table | 
     """Print a line about the machine, the tables, and a line for each part that was not measured.
 
     Args:
-        results: with `machine`; `not_measured`, if it is there, holds reasons by the name of the part.
+        results: contain `machine`, and perhaps `not_measured`, reasons by the name of the part.
         where: the processor or the GPU that was measured.
-        width: columns, where the output is no terminal.
+        width: number of columns if the output is not a terminal.
     """
     machine = results["machine"]
-    # No markup: a reason may hold brackets, `pip install "completesplat[cuda]"` for one.
+    # No markup, because a reason may contain brackets, as in `pip install "completesplat[cuda]"`.
     console = Console(width=None if Console().is_terminal else width, markup=False)
     console.print(f"{where}, torch {machine['torch']}, {machine['date']}")
-    for one in tables:
-        console.print(one)
+    for part in tables:
+        console.print(part)
     for name, reason in results.get("not_measured", {}).items():
         console.print(f"{name}: not measured, because {reason}")
 
 
 def device_of(results: dict[str, Any]) -> str:
-    """The GPU, or the processor with the number of its threads, by the device of the workload."""
+    """Return the name of the workload's device: the GPU, or the processor with its number of threads."""
     machine = results["machine"]
     if results.get("workload", {}).get("device") == "cuda":
         return str(machine["gpu"])

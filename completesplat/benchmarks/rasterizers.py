@@ -1,4 +1,4 @@
-"""`completesplat bench rasterizers`: the backends side by side, in speed, growth and agreement."""
+"""`completesplat bench rasterizers`: comparison of the backends in speed, growth and agreement."""
 
 import logging
 import statistics
@@ -40,14 +40,14 @@ logger = logging.getLogger(__name__)
 
 
 class Growth(TypedDict):
-    """Growth of time with the workload, of these backends, up to this number of Gaussians."""
+    """Settings for the growth of time with the workload: backends, and the largest number of Gaussians."""
 
     backends: Sequence[str]
     most_gaussians: Positive
 
 
 class TrainingStep(TypedDict):
-    """A step of training with each of these backends, on scenes of this size; the precision is Lightning's."""
+    """Settings for a training step: backends, size of the scenes, and Lightning's precision."""
 
     backends: Sequence[str]
     size: Positive
@@ -61,19 +61,19 @@ def run(
     growth: Growth | Literal[False], training_step: TrainingStep | Literal[False],
     model: Mapping[str, Any], constants: Mapping[str, Any], out: Path,
 ) -> None:  # fmt: skip
-    """Time the rasterizers, or compare them on a scene; write `rasterizers.json` and a plot, print tables.
+    """Time the rasterizers, or compare them on a scene; write `rasterizers.json` and a plot, and print tables.
 
     Args:
-        scene: a file that `read_scene` reads, drawn instead of all that follows.
-        backends: keys of `CLASSES`; those that do not work here are left out, with the reason.
+        scene: a file for `read_scene`; only this scene is then rendered, and all other parts are skipped.
+        backends: keys of `CLASSES`; those that do not work on this machine are skipped, with the reason.
         sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
-        repeats: timed calls of each.
-        growth, training_step: False leaves them out.
-        model: configuration of the module whose steps are timed.
-        constants: configuration of the `RenderingConstants` that all backends share.
+        repeats: number of timed calls of each backend.
+        growth, training_step: settings of these parts; False skips them.
+        model: config of the module whose steps are timed.
+        constants: config of the `RenderingConstants` that all backends share.
 
     Raises:
-        CompleteSplatError: no such file or backend.
+        CompleteSplatError: the file or a backend does not exist.
     """
     compared = read_scene(Path(scene)) if scene else None
     shared = instantiate(constants)
@@ -109,22 +109,18 @@ def _step_rows(
         module: LightningModule = instantiate(model, rasterizer=rasterizer, _convert_="all")
         return module
 
-    found = []
+    rows = []
     for backend in (backend for backend in backends if backend.name in settings["backends"]):
         tick(f"a training step with {backend.name}")
-        found.append(share(backend, make_module, size, batch, targets, settings["precision"]))
-    return found
+        rows.append(share(backend, make_module, size, batch, targets, settings["precision"]))
+    return rows
 
 
 def _on_a_scene(
     file: str, gaussians: Gaussians, cameras: Cameras, defaults: Sequence[str], backends: Sequence[Backend],
     constants: RenderingConstants, repeats: int, tick: Callable[[str], None],
 ) -> dict[str, Any]:  # fmt: skip
-    """Time and agreement of the backends on one scene.
-
-    Args:
-        defaults: names of what the file lacks.
-    """
+    """Measure time and agreement of the backends on one scene; `defaults` names the arrays that its file lacks."""
     if defaults:
         values = ", ".join(f"{name}={DEFAULTS[name]}" for name in defaults)
         logger.info("%s has no %s: every Gaussian gets %s", file, ", ".join(defaults), values)
@@ -139,7 +135,7 @@ def _on_a_scene(
     }
 
 
-# `gsplat_torch` is a baseline, kept for this comparison, not to be chosen for training.
+# `gsplat_torch` is a baseline for this comparison; training cannot choose it.
 CLASSES = {
     "reference": "completesplat.rasterizers.reference.ReferenceRasterizer",
     "gsplat_torch": "completesplat.benchmarks.gsplat_torch.GsplatTorchRasterizer",
@@ -149,10 +145,10 @@ CLASSES = {
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
-    """The named backends that render a small scene here, and for each of the others the reason why it does not.
+    """Return the named backends that can render a small scene on this machine, and reasons for the others.
 
     Raises:
-        CompleteSplatError: a name that is not in `CLASSES`.
+        CompleteSplatError: a name is not in `CLASSES`.
     """
     for name in names:
         if name not in CLASSES:
@@ -171,13 +167,13 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
     return backends, absent
 
 
-LONGEST_SECONDS = 4.0  # a backend that has taken this long on a workload is not run again on it
+LONGEST_SECONDS = 4.0  # a backend that has run this long on a workload does not repeat it
 
 
 def speed_rows(
     backends: Sequence[Backend], sizes: Sequence[int], views: Sequence[int], repeats: int, tick: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """One row for each backend and workload (size, number of views, kind of opacities)."""
+    """Return a row for each backend and workload (size, number of views, kind of opacities)."""
     result = []
     for size, number, opacity in product(sizes, views, OPACITIES):
         tick(f"{size} x {size}, {number} views, {opacity}")
@@ -191,9 +187,9 @@ def speed_rows(
 def side_by_side(
     backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, repeats: int
 ) -> dict[str, dict[str, Any]]:
-    """Medians in ms of the forward pass and of both passes, the backends taking turns, and the peak of memory in MB.
+    """Return medians in ms of the forward pass and of both passes, and peak memory in MB; backends take turns.
 
-    Memory is what a first rendering with its backward pass adds. That one is timed only where it is the only one.
+    Memory is what a first rendering with its backward pass adds. Its time counts only if there is no other rendering.
     """
     pixels = cameras.image_size[0] * cameras.image_size[1] * cameras.intrinsics.shape[1]
     backends = [backend for backend in backends if backend.takes(gaussians.count, pixels)]
@@ -226,15 +222,15 @@ SOURCE_SIZES = (23, 72, 229, 724)  # two Gaussians to a pixel of the source: 1k,
 IMAGE_SIZE, SOURCE_SIZE = 512, 128
 VIEWS = (1, 2, 4, 8, 16)
 IMAGE_SIZES = (64, 128, 256, 512)
-PATIENCE_MS = 8e3  # a backend that took longer than this is not tried on the next larger workload
+PATIENCE_MS = 8e3  # a backend that took longer than this skips the next larger workload
 REPEATS = 3
 
 
 def growth_rows(backends: Sequence[Backend], tick: Callable[[str], None], most_gaussians: int) -> list[dict[str, Any]]:
-    """One row for each backend and point of an axis, all with opacities as after training.
+    """Return a row for each backend and point of an axis, with opacities as after training.
 
-    Gaussians: in one image of 512 x 512, which they cover alike (many small ones, or few large ones). Views: of
-    128 x 128. Size: of one image of the same 32,768 Gaussians. On the first axis `most_gaussians` are not exceeded.
+    The axis of Gaussians has one image of 512 x 512, which many small or few large Gaussians cover alike, and at most
+    `most_gaussians`. Views are of 128 x 128. The axis of sizes has one image of the same 32,768 Gaussians.
     """
     result: list[dict[str, Any]] = []
     tired: set[tuple[str, str]] = set()
@@ -265,7 +261,7 @@ def _workloads(most_gaussians: int) -> Iterator[tuple[str, Gaussians, Cameras]]:
 
 
 def plot(growth: list[dict[str, Any]], path: Path) -> None:
-    """Time of both passes against each axis, on logarithmic scales."""
+    """Plot the time of both passes against each axis, on logarithmic scales."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 4), layout="constrained")
@@ -284,7 +280,7 @@ def plot(growth: list[dict[str, Any]], path: Path) -> None:
         panel.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
         panel.grid(alpha=0.3)
     figure.axes[0].set_ylabel("forward + backward, ms")
-    figure.axes[-1].legend(loc="upper left")  # its first workload is the smallest of all, which every backend takes
+    figure.axes[-1].legend(loc="upper left")  # its smallest workload is drawn by every backend
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=120)
 
@@ -319,7 +315,7 @@ AGREEMENT: list[Column] = [
     ("pixels\ncompared", "pixels", ""),
     ("left out", "undecided", ""),
 ]
-# Key in the results, title, columns.
+# Keys in the results, titles, columns.
 SECTIONS = [
     ("rows", "Speed", SPEED),
     ("growth", "Growth", GROWTH),
@@ -334,17 +330,17 @@ WORKLOAD = ("axis", "size", "gaussians", "views", "opacity")
 
 
 def show(results: dict[str, Any]) -> None:
-    """Print all that there is in the results."""
-    shown = []
+    """Print all parts of the results."""
+    tables = []
     for key, title, columns in SECTIONS:
         rows = results.get(key, [])
         if rows:
-            shown.append(table(title, columns, against_tiled(rows) if key in ("rows", "growth") else rows))
-    print_results(results, device_of(results), shown)
+            tables.append(table(title, columns, against_tiled(rows) if key in ("rows", "growth") else rows))
+    print_results(results, device_of(results), tables)
 
 
 def against_tiled(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with how many times slower than `tiled` on the same workload they are, forward and backward."""
+    """Add to rows how many times slower than `tiled` they are on the same workload, both passes together."""
 
     def workload(row: dict[str, Any]) -> tuple[Any, ...]:
         return tuple(row.get(key) for key in WORKLOAD)

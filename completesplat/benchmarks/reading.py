@@ -1,4 +1,4 @@
-"""How fast training batches are read, what share of the time is decoding, and what it takes of memory."""
+"""Speed of reading training batches, its share of decoding, and its memory."""
 
 import statistics
 import time
@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 from completesplat.data.loading.loader import SceneLoader
 
-# Settings of a data module that are still open (workers, ...) -> the data module.
+# Makes a data module from the settings that are still open (workers, ...).
 MakeData = Callable[..., Any]
 
 
 class Epoch(NamedTuple):
-    """The batches, scenes and images of one epoch, and the seconds that reading them took."""
+    """Numbers of batches, scenes and images of one epoch, and the seconds that reading them took."""
 
     seconds: float
     batches: int
@@ -29,10 +29,10 @@ class Epoch(NamedTuple):
 def rows(
     forms: Mapping[str, MakeData], workers: Sequence[int], repeats: int, tick: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """One row for each number of workers and form: batches, scenes and images per second, and times the first form.
+    """Return a row per number of workers and form: rates of batches, scenes and images, and speed-up to the first form.
 
-    All forms take turns. Of each, the median of `repeats` epochs counts, after an untimed one in which workers start
-    and files come into memory.
+    The forms take turns. The median of `repeats` epochs counts for each form, after an untimed one in which workers
+    start and files come into memory.
     """
     result = []
     for count in workers:
@@ -86,9 +86,10 @@ KEYS = {"anonymous": "RssAnon", "file": "RssFile"}
 
 
 def resident_megabytes() -> dict[str, float] | None:
-    """Resident memory of this process in MB: `anonymous`, its own, and `file`; None where the system does not tell.
+    """Return the resident memory of this process in MB, `anonymous` and `file`; None if the system does not tell.
 
-    Pages of mapped files (`file`) count as soon as they are touched; the system takes them back when it needs them.
+    `anonymous` is the process's own memory. `file` counts the pages of mapped files that were touched, which the system
+    takes back when it needs them.
     """
     if not STATUS.exists():
         return None
@@ -100,9 +101,9 @@ def opening_figures(make: MakeData, epochs: int) -> dict[str, Any]:
     """Open a data module in a new process, and read its training items for some epochs there.
 
     Returns:
-        `seconds` to open it (train and val); `added_mb`, resident then above the imports; `growth_mb` of anonymous
-        memory from the first epoch's end to the last one's; `steps` with resident memory after each, and of what takes
-        time the processor's share (`cpu_seconds`), too. No memory is given where the system does not tell.
+        `seconds` to open it (train and val); `added_mb`, the resident memory that opening adds to the imports;
+        `growth_mb` of anonymous memory from the end of the first epoch to that of the last one; `steps` with resident
+        memory after each, seconds and CPU time (`cpu_seconds`). Memory is missing if the system does not tell it.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         steps = pool.submit(_steps, make, epochs).result()
@@ -118,8 +119,8 @@ def _resident(step: dict[str, Any]) -> float:
 
 
 def _steps(make: MakeData, epochs: int) -> list[dict[str, Any]]:
-    """One entry after the imports, one after opening, one after each epoch."""
-    import datasets  # noqa: F401  which the store itself imports with its first sequence
+    """Return an entry after the imports, one after opening, and one after each epoch."""
+    import datasets  # noqa: F401  the store imports it with its first sequence
 
     steps = [_step("imports")]
     start, busy = time.perf_counter(), time.process_time()
@@ -141,7 +142,7 @@ def _step(name: str, **figures: float) -> dict[str, Any]:
     return {"after": name, **figures, **{f"{kind}_mb": value for kind, value in resident.items()}}
 
 
-# The functions that turn image files into pixels, of a published data set and of a packed one.
+# The functions that decode image files of a published and of a packed data set.
 DECODERS = ("completesplat.data.pictures.crop.decode", "completesplat.data.packed.rows.decode")
 MEBIBYTE = 2**20
 
@@ -150,7 +151,7 @@ Function = Callable[..., Any]
 
 @contextmanager
 def replaced(path: str, wrap: Callable[[Function], Function]) -> Iterator[None]:
-    """While it lasts, the function `path` (package.module.name) of a module is `wrap(function)`."""
+    """Within the context, replace the function `path` (package.module.name) by `wrap(function)`."""
     module_name, _, name = path.rpartition(".")
     module = import_module(module_name)
     function = getattr(module, name)
@@ -162,13 +163,13 @@ def replaced(path: str, wrap: Callable[[Function], Function]) -> Iterator[None]:
 
 
 class Stopwatch:
-    """Adds up the seconds that are spent in the functions it wraps."""
+    """Sum of the seconds that are spent in wrapped functions."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def wrap(self, function: Function) -> Function:
-        """The same function, timed."""
+        """Return the same function, timed."""
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             start = time.perf_counter()
@@ -181,7 +182,7 @@ class Stopwatch:
 
 
 def decoding_share(loader: SceneLoader) -> float:
-    """The share of an epoch's time that decoding image files takes, after an unwatched epoch.
+    """Return the share of an epoch's time that decoding image files takes, after an unwatched epoch.
 
     The loader must read in this process.
     """
@@ -195,15 +196,15 @@ def decoding_share(loader: SceneLoader) -> float:
 
 
 class _Counted(dict[Any, Any]):
-    """A dictionary that weak references may point to."""
+    """A dictionary to which weak references are possible."""
 
 
 class Counter:
-    """Counts the calls of a function, and how many of the dictionaries that it gave are in memory at once.
+    """Counter of a function's calls, and of the returned dictionaries that are in memory at once.
 
     Attributes:
-        calls: so far.
-        most: dictionaries in memory at once, the one that is being made included.
+        calls: number of calls so far.
+        most: largest number of dictionaries in memory at once, including the one that is being made.
     """
 
     def __init__(self) -> None:
@@ -212,10 +213,10 @@ class Counter:
         self._given: list[weakref.ref[_Counted]] = []
 
     def wrap(self, function: Function) -> Function:
-        """The same function, counted."""
+        """Return the same function, counted."""
 
         def counted(*args: Any, **kwargs: Any) -> Any:
-            self._given = [given for given in self._given if given() is not None]
+            self._given = [reference for reference in self._given if reference() is not None]
             self.calls += 1
             self.most = max(self.most, len(self._given) + 1)
             result = _Counted(function(*args, **kwargs))
@@ -226,11 +227,9 @@ class Counter:
 
 
 def chunks(data: Any, read_chunk: str) -> dict[str, Any]:
-    """How many chunks there are and how large, how many an epoch reads, and how many are in memory at once.
+    """Return the number of chunks and their largest size, and how many an epoch reads and holds in memory at once.
 
-    Args:
-        data: a module without workers; its training clips lie in chunks, `<root>/train/*.torch`.
-        read_chunk: the function that reads one of them.
+    `data` is a module without workers; the function named `read_chunk` reads its chunks, `<root>/train/*.torch`.
     """
     sizes = [path.stat().st_size for path in (data.root / "train").glob("*.torch")]
     counter = Counter()

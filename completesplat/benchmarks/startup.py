@@ -1,4 +1,4 @@
-"""`completesplat bench startup`: what the first scene costs from a cold start, and which imports it waits for."""
+"""`completesplat bench startup`: time to the first scene from a cold start, and the imports that it waits for."""
 
 import json
 import os
@@ -26,12 +26,12 @@ from completesplat.schema import Positive
 
 TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
 OTHER = ", other version"
-# What no prediction does without: diffusers' networks and scheduler, with what diffusers imports of its own accord.
+# The least that every prediction needs: diffusers' networks and scheduler, with what diffusers itself imports.
 NEEDED = "import torch and the networks of diffusers"
 NETWORKS = "import gc; gc.disable(); import torch; from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel; "
 NETWORKS += "from diffusers.models.autoencoders import vae"
 PACKAGE = "completesplat"
-# What remains where everything is imported, and the kernels are there: settings, weights, a sample, files.
+# The second call needs no imports and no compilation of kernels: it has settings, weights, a sample and files left.
 TWICE = """
 import json, sys, time
 from completesplat.cli import main
@@ -51,14 +51,14 @@ IMPORTS += [("with what it\nimports, ms", "ms", ",.0f")]
 
 
 class Seconds(NamedTuple):
-    """Of a process and those that it starts: the processor's, and the clock's."""
+    """CPU and wall-clock seconds of a process and its children."""
 
     cpu: float
     wall: float
 
 
 class ImportedModule(NamedTuple):
-    """One that a process imported: the seconds of its own, and the packages that it was imported within."""
+    """Module that a process imported: its own seconds, and the packages within which it was imported."""
 
     name: str
     seconds: float
@@ -66,48 +66,48 @@ class ImportedModule(NamedTuple):
 
 
 def run(weights: str, repeats: Positive, packages: Positive, against: str | None, out: Path) -> None:
-    """Time whole processes in turn, list what is imported; write `startup.json`, print both tables.
+    """Time whole processes in turn, list their imports, write `startup.json`, and print both tables.
 
     Args:
-        weights: one sample is drawn with them, without a video.
-        repeats: timed processes of each kind, after one that is not timed; the median counts.
-        packages: that are listed, the most costly first.
+        weights: draw one sample, without a video.
+        repeats: number of timed processes of each kind, after an untimed one; the median counts.
+        packages: number of packages that are listed, the most costly first.
         against: a folder with another version of the package, which is measured in turn.
 
-    `CompleteSplatError`: there is none in `against`, or a process fails.
+    Raises:
+        CompleteSplatError: `against` has no version of the package, or a process fails.
     """
     if against is not None and not (Path(against) / PACKAGE / "cli.py").is_file():
         raise CompleteSplatError(f"against={against}: no {PACKAGE}/ here, of another version")
     with TemporaryDirectory(prefix="bench_startup_") as folder:
         picture = Path(folder) / "picture.png"
-        Image.new("RGB", (64, 64), "grey").save(picture)  # what it shows does not change the work
+        Image.new("RGB", (64, 64), "grey").save(picture)  # its content does not change the work
         shared = [f"weights={weights}", f"out={folder}/out"]
         programs = {PREDICT: ["predict", str(picture), "samples=1", "video=[]", *shared], VIEW: ["view", *shared]}
         if find_spec("viser") is None:
             del programs[VIEW]
-        found = timed(programs, repeats, None if against is None else Path(against).resolve())
-        ours = imported_by(["-m", PACKAGE, *programs[PREDICT]])
-        torchs = imported_by(["-c", "import torch"])
+        times = timed(programs, repeats, None if against is None else Path(against).resolve())
+        modules = imported_by(["-m", PACKAGE, *programs[PREDICT]])
+        torch_modules = imported_by(["-c", "import torch"])
     rows: list[dict[str, Any]] = [
-        {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / found[TORCH].cpu}
-        for name, x in found.items()
+        {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / times[TORCH].cpu}
+        for name, x in times.items()
     ]
-    beyond = costs(ours, {module.name for module in torchs})[:packages]
+    beyond = costs(modules, {module.name for module in torch_modules})[:packages]
     results: dict[str, Any] = {"machine": machine(), "commit": git_commit(), "rows": rows, "imports": beyond}
     write_json(out / "startup.json", results)
     tables = [table("One sample, without a video, from a cold start", PROCESSES, rows)]
     tables += [table("Imports beyond those of torch, in one process", IMPORTS, beyond)]
     print_results(results, results["machine"]["processor"], tables)
-    starting = (found[PREDICT].cpu - found[AGAIN].cpu) / found[TORCH].cpu
+    starting = (times[PREDICT].cpu - times[AGAIN].cpu) / times[TORCH].cpu
     print(f"predict without what it takes once more: {starting:.1f} times import torch, by the processor's time")
 
 
 def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | None) -> dict[str, Seconds]:
-    """Medians by the name of what was timed; of processes that are started in turn, each with one thread.
+    """Start processes in turn, each with one thread, and return their median times by name.
 
-    Args:
-        programs: the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
-        against: another version's folder, or None.
+    `programs` has the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
+    `against` is the folder of another version, or None.
     """
     kinds: dict[str, tuple[list[str], Path | None]] = {TORCH: (["-c", "import torch"], None)}
     kinds[NEEDED] = ["-c", NETWORKS], None
@@ -126,27 +126,27 @@ def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | N
                 after, wall = os.times(), time.perf_counter() - start
                 cpu = after.children_user - before.children_user + after.children_system - before.children_system
                 seconds = Seconds(cpu, wall) if name != AGAIN else Seconds(*json.loads(printed.splitlines()[-1]))
-                taken[name] += [seconds] if number else []  # the first one brings files into memory
+                taken[name] += [seconds] if number else []  # the first process brings files into memory
     return {name: Seconds(*map(statistics.median, zip(*taken[name], strict=True))) for name in kinds}
 
 
 def imported_by(arguments: Sequence[str]) -> list[ImportedModule]:
-    """What a process of Python imports (`-X importtime`, which lists a module behind those that it imports)."""
-    found: list[ImportedModule] = []
+    """Return a Python process's imports (`-X importtime` lists a module after those that it imports)."""
+    modules: list[ImportedModule] = []
     above: list[str] = []
     for line in reversed(_run(["-X", "importtime", *arguments], None).stderr.splitlines()):
         if (match := IMPORTED.match(line)) is None:
             continue
         depth, name = len(match[2]) // 2, match[3]
         above[depth:] = [name.partition(".")[0]]
-        found.append(ImportedModule(name, int(match[1]) / 1e6, frozenset(above)))
-    return found
+        modules.append(ImportedModule(name, int(match[1]) / 1e6, frozenset(above)))
+    return modules
 
 
 def costs(modules: Sequence[ImportedModule], known: set[str]) -> list[dict[str, Any]]:
-    """For each package what its modules cost, and all that is imported within it; without modules that are known.
+    """Return, for each package, the time of its own modules and of all that it imports, without known modules.
 
-    The package of this project, within which all is imported, has its own modules alone.
+    This project's package has only its own modules, because everything is imported within it.
     """
     own: dict[str, float] = defaultdict(float)
     total: dict[str, float] = defaultdict(float)
@@ -154,16 +154,17 @@ def costs(modules: Sequence[ImportedModule], known: set[str]) -> list[dict[str, 
         if module.name not in known:
             package = module.name.partition(".")[0]
             own[package] += 1000 * module.seconds
-            for one in module.within - ({PACKAGE} - {package}):
-                total[one] += 1000 * module.seconds
+            for outer in module.within - ({PACKAGE} - {package}):
+                total[outer] += 1000 * module.seconds
     most_first = sorted(total, key=lambda name: -total[name])
     return [{"package": name, "own_ms": own[name], "ms": total[name]} for name in most_first]
 
 
 def _run(arguments: Sequence[str], package: Path | None, first_line: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run Python with the package of this process, or with that of a folder, to its end or to its first line.
+    """Run Python with this process's package or that of a folder, until its end or its first line of output.
 
-    `CompleteSplatError`: it fails.
+    Raises:
+        CompleteSplatError: the process fails.
     """
     folder = Path(__file__).parents[2] if package is None else package
     environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(folder)}
@@ -173,8 +174,8 @@ def _run(arguments: Sequence[str], package: Path | None, first_line: bool = Fals
         begun = process.stdout.readline() if first_line and process.stdout is not None else ""
         if begun:
             process.kill()
-        printed, said = process.communicate()
+        printed, complaint = process.communicate()
     if process.returncode and not begun:
-        last = (said.strip().splitlines() or ["it says nothing"])[-1]
+        last = (complaint.strip().splitlines() or ["it says nothing"])[-1]
         raise CompleteSplatError(f"a process that was timed has failed: {last}")
-    return subprocess.CompletedProcess(program, 0, begun + printed, said)
+    return subprocess.CompletedProcess(program, 0, begun + printed, complaint)

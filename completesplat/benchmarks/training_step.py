@@ -1,4 +1,4 @@
-"""The share of the rasterizer in a training step of the reconstruction model."""
+"""Share of the rasterizer in a training step of the reconstruction model."""
 
 import statistics
 import time
@@ -17,18 +17,18 @@ from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch, Views
 
 UNTIMED_STEPS, TIMED_STEPS = 3, 15
-SLOW = {"gsplat_torch": (1, 3)}  # untimed and timed steps; the others of the slow ones would take minutes
+SLOW = {"gsplat_torch": (1, 3)}  # untimed and timed steps; the other slow backends would take minutes
 
 
 class StopWatch:
-    """A rasterizer that adds up the time it takes, forward and backward."""
+    """A rasterizer that sums the time of its forward and backward passes."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
         self.rasterizer = rasterizer
         self.seconds = 0.0
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render as the rasterizer would."""
+        """Render with the rasterizer."""
         gaussians = Gaussians(*_OnBackward.apply(self._stop, *vars(gaussians).values()))  # type: ignore[no-untyped-call]
         self._start()
         rendering = self.rasterizer(gaussians, cameras)
@@ -43,7 +43,7 @@ class StopWatch:
 
 
 class Repeated(Dataset[Any]):
-    """The same item a number of times."""
+    """Data set of the same item, `count` times."""
 
     def __init__(self, item: Any, count: int) -> None:
         self.item, self.count = item, count
@@ -56,12 +56,12 @@ class Repeated(Dataset[Any]):
 
 
 class _OnBackward(torch.autograd.Function):
-    """Hands tensors on, and calls a function when their gradients pass by."""
+    """Identity that calls a function when the tensors' gradients pass in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, function: Callable[[], None], *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.function = function
-        ctx.set_materialize_grads(False)  # zeros where the loss sends none would be extra work for the rasterizer
+        ctx.set_materialize_grads(False)  # zeros for missing gradients would be extra work for the rasterizer
         return tuple(tensor.view_as(tensor) for tensor in tensors)
 
     @staticmethod
@@ -73,7 +73,7 @@ class _OnBackward(torch.autograd.Function):
 class _StepTimes(Callback):
     def __init__(self, watch: StopWatch) -> None:
         self.watch = watch
-        self.steps: list[tuple[float, float]] = []  # seconds in all and in the rasterizer
+        self.steps: list[tuple[float, float]] = []  # seconds in total and in the rasterizer
 
     def on_train_batch_start(self, trainer: Trainer, module: LightningModule, batch: Any, index: int) -> None:
         self.started, self.watch.seconds = time.perf_counter(), 0.0
@@ -88,13 +88,13 @@ def share(
     backend: Backend, make_module: Callable[[Rasterizer], LightningModule], size: int, batch: int, targets: int,
     precision: str,
 ) -> dict[str, Any]:  # fmt: skip
-    """Medians over optimizer steps on one synthetic batch, on the CPU.
+    """Return medians over optimizer steps on one synthetic batch, on the CPU.
 
     Args:
-        make_module: the LightningModule for a rasterizer.
+        make_module: makes the LightningModule with a rasterizer.
         size: side of the images in pixels.
-        batch, targets: scenes in a batch, and target views of each.
-        precision: Lightning's.
+        batch, targets: number of scenes in a batch, and of target views of each.
+        precision: precision in Lightning's notation.
     """
     watch = StopWatch(backend.rasterizer)
     times = _StepTimes(watch)
@@ -126,7 +126,7 @@ def share(
 
 
 def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
-    """Noise seen from cameras on an orbit: what the images show does not change the work of a step."""
+    """Return views of noise from an orbit, because the content of images does not change the work of a step."""
     generator = torch.Generator().manual_seed(0)
     cameras = orbit(size, 1 + targets)[0]
     cameras = cameras.relative_to(cameras[0]).map(lambda tensor: tensor.expand(batch, *tensor.shape))

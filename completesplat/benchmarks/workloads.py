@@ -1,4 +1,4 @@
-"""Scenes to time: like splatter images, or from a file; and the time and memory of one rendering."""
+"""Workloads: scenes like splatter images or from a file, and the time and memory of one rendering."""
 
 import ctypes
 import math
@@ -27,11 +27,11 @@ OPACITIES = ("trained", "initial")
 
 
 def splatter_scene(size: int, views: int, opacity: str, image_size: int | None = None) -> tuple[Gaussians, Cameras]:
-    """One scene (batch of 1) of two Gaussians to a pixel, in two layers, and cameras on an orbit about it.
+    """Return a scene (batch of 1) with two layers of one Gaussian per pixel, and cameras on an orbit about it.
 
-    The opacities are as after training ("trained": a dense object, where pixels are soon opaque, in front of thin
-    air) or as at its start ("initial": all low, so that every Gaussian counts). `size` is the side of the splatter
-    image; what the cameras see has the side `image_size`, or the same.
+    Opacities are as after training ("trained": a dense object, where pixels are soon opaque, before a thin background)
+    or as at its start ("initial": all low, so that every Gaussian counts). `size` is the side of the splatter image,
+    `image_size` that of the cameras' images (None: the same).
     """
     generator = torch.Generator().manual_seed(0)
     source = Cameras(torch.eye(4), pinhole(FOV_DEGREES, size), (size, size))
@@ -40,7 +40,7 @@ def splatter_scene(size: int, views: int, opacity: str, image_size: int | None =
 
 
 def _layer(layer: int, source: Cameras, opacity: str, generator: torch.Generator) -> Gaussians:
-    """The front (0) or the back (1) of an ellipsoid, and a piece of background further away."""
+    """Return the front (0) or the back (1) of an ellipsoid, and a piece of background further away."""
     size = source.image_size[0]
     pixels = pixel_centers(size, size).flatten(0, 1)
     x, y = (pixels / size * 2 - 1).unbind(-1)
@@ -67,7 +67,7 @@ def _opacities(layer: int, inside: Tensor, opacity: str, generator: torch.Genera
 
 
 def orbit(size: int, views: int) -> Cameras:
-    """Cameras [1 view] about the object, for images of this side."""
+    """Return cameras [1 view] on an orbit about the object, for images of side `size`."""
     angles = 0.5 + 2 * math.pi * torch.arange(views) / views
     target = torch.tensor([0.0, 0.0, DISTANCE])
     eyes = target + DISTANCE * torch.stack([angles.sin(), torch.full_like(angles, -0.2), -angles.cos()], dim=-1)
@@ -76,19 +76,19 @@ def orbit(size: int, views: int) -> Cameras:
 
 
 NEEDED = ("means3d", "colors", "viewmats", "Ks", "width", "height")
-# What stands in for arrays that the file lacks, as gsplat's file lacks all three: round and half transparent, of
-# about the size that gsplat's own tests give them (0 to 0.02 world units, `gsplat/_helper.py`).
+# Defaults for missing arrays (gsplat's file lacks all three): round and half transparent Gaussians, of about the size
+# that gsplat's own tests use (0 to 0.02 world units, `gsplat/_helper.py`).
 DEFAULTS: dict[str, Any] = {"quats": (1.0, 0.0, 0.0, 0.0), "scales": (0.01, 0.01, 0.01), "opacities": 0.5}
 
 
 def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
-    """One scene (batch of 1), its cameras, and the names of what was missing and got a default.
+    """Read a scene (batch of 1) and its cameras; return them, and the names of missing arrays, which got defaults.
 
     Arrays: `means3d` [n 3], `colors` [n 3] (integers to 255, or floats to 1), `viewmats` [view 4 4] (world to
     camera), `Ks` [view 3 3] (pixels), `width`, `height`; if present `quats` [n 4] (wxyz), `scales` [n 3], `opacities`.
 
     Raises:
-        DataError: no such file, not an npz, or an array missing, without numbers or of the wrong shape.
+        DataError: the file is missing or not an npz, or an array is missing, not numeric or of the wrong shape.
     """
     arrays = _arrays(path)
     missing = [name for name in NEEDED if name not in arrays]
@@ -96,13 +96,13 @@ def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
         raise DataError(f"{path} lacks {', '.join(missing)}")
 
     count, views = len(np.atleast_1d(arrays["means3d"])), len(np.atleast_1d(arrays["viewmats"]))
-    given = {name: np.broadcast_to(value, (count, *np.shape(value))) for name, value in DEFAULTS.items()} | arrays
+    inputs = {name: np.broadcast_to(value, (count, *np.shape(value))) for name, value in DEFAULTS.items()} | arrays
 
     def tensor(name: str, *shape: int, unit: int = 1) -> Tensor:
-        values = given[name]
+        values = inputs[name]
         if values.shape != shape or 0 in shape or values.dtype.kind not in "iuf":
-            found = f"{values.dtype} in the shape {list(values.shape)}"
-            raise DataError(f"{path}: {name} should hold numbers in the shape {list(shape)}, not {found}")
+            actual = f"{values.dtype} in the shape {list(values.shape)}"
+            raise DataError(f"{path}: {name} should hold numbers in the shape {list(shape)}, not {actual}")
         return torch.from_numpy(np.ascontiguousarray(values / unit, np.float32))[None]
 
     gaussians = Gaussians(
@@ -110,7 +110,7 @@ def read_scene(path: Path) -> tuple[Gaussians, Cameras, list[str]]:
         tensor("quats", count, 4),
         tensor("scales", count, 3),
         tensor("opacities", count),
-        tensor("colors", count, 3, unit=255 if given["colors"].dtype.kind in "iu" else 1),
+        tensor("colors", count, 3, unit=255 if inputs["colors"].dtype.kind in "iu" else 1),
     )
     width, height = (float(tensor(name)) for name in ("width", "height"))
     if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
@@ -125,7 +125,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             return {name: np.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
-    except Exception as error:  # of a broken archive zipfile, zlib and numpy may raise anything
+    except Exception as error:  # zipfile, zlib and numpy may raise anything for a broken archive
         raise DataError(f"{path} is not an .npz file of plain arrays: {error}") from error
 
 
@@ -134,7 +134,7 @@ MEBIBYTE = 2**20
 
 
 def milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras) -> tuple[float, float]:
-    """Times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
+    """Return the times of the forward pass, and of both passes with gradients to all parameters of the Gaussians."""
     gaussians = gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     ones = [_ones(cameras, channels) for channels in (3, 1, 1)]
     wait = torch.cuda.synchronize if gaussians.means.is_cuda else _nothing
@@ -149,7 +149,7 @@ def milliseconds(rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras)
 
 
 def _ones(cameras: Cameras, channels: int) -> Tensor:
-    # By NumPy: torch would wake its own threads, which then spin for a while on the cores that are to be timed.
+    # NumPy, because torch would wake its own threads, which then spin for a while on the cores that are timed.
     ones = np.ones((*cameras.intrinsics.shape[:2], channels, *cameras.image_size), np.float32)
     return torch.from_numpy(ones).to(cameras.intrinsics.device)
 
@@ -158,7 +158,7 @@ def _nothing() -> None: ...
 
 
 def peak_megabytes(work: Callable[[], object], device: str) -> float | None:
-    """The memory in MB that `work` adds to the process, or to the GPU; None where the system does not tell.
+    """Return the memory in MB that `work` adds to the process, or to the GPU; None if the system does not tell.
 
     The memory of the process is read from /proc every 2 ms, and once more at the end.
     """
@@ -195,18 +195,18 @@ def peak_megabytes(work: Callable[[], object], device: str) -> float | None:
 
 
 def _return_free_memory() -> None:
-    """Otherwise memory that was freed earlier, but is still held by the process, would not be counted again."""
+    """Return memory that the process still holds after freeing it, because reusing it would not be counted."""
     release()
     with suppress(AttributeError, OSError, TypeError):
-        ctypes.CDLL(None).malloc_trim(0)  # of glibc
+        ctypes.CDLL(None).malloc_trim(0)  # a function of glibc
 
 
-MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel: the reference takes a second for a tenth of them
+MOST_REFERENCE_PAIRS = 2**28  # of a Gaussian and a pixel; the reference takes a second for a tenth of them
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A rasterizer, its name in the tables, and where it takes its tensors."""
+    """A rasterizer, its name in the tables, and the device of its tensors."""
 
     name: str
     rasterizer: Rasterizer
@@ -216,5 +216,5 @@ class Backend:
         return "cuda" if self.name == "cuda" else "cpu"
 
     def takes(self, gaussians: int, pixels: int) -> bool:
-        """Whether a workload with this many pixels in all views is not hopelessly large for it."""
+        """Return whether a workload with this many pixels in all views is feasible."""
         return self.name != "reference" or gaussians * pixels <= MOST_REFERENCE_PAIRS

@@ -1,1 +1,1 @@
-"""Files that a person opens: splats, videos, contact sheets, scene descriptions."""
+"""Export of files for people: splats, videos, contact sheets and scene descriptions."""

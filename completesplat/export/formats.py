@@ -1,4 +1,4 @@
-"""One scene in several file formats; `.splat`, the simplest of them, is written here."""
+"""Export of one scene to several file formats, and the writer of the simplest one, `.splat`."""
 
 import tempfile
 from collections.abc import Sequence
@@ -33,19 +33,18 @@ def write_formats(
     converter: SplatTransform | None,
     comments: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Write `NAME.ply`, `NAME.spz` and so on.
+    """Write one scene as `NAME.ply`, `NAME.spz` and so on.
 
-    Colours are clipped to 0 to 1, once for all formats but `.ply`: some of them and of their readers would do it,
-    others not. The `.ply` keeps Gaussians brighter than 1, which are seen through others. All hold the Gaussians in the
-    frame they are given in, save the page, which stands upright. `.ply`, `.splat` and `.sog` keep our axes (+y down);
-    `.glb` and `.spz` have +y up and +z towards the viewer, as their formats
-    prescribe, which readers of `.spz` undo. `.spz` goes without the Gaussians that are `transparent`.
+    All formats except `.ply` get colours clipped to [0, 1], because only some formats and readers would clip them. The
+    `.ply` keeps colours above 1, because Gaussians may be seen through others. All files keep the frame of the given
+    Gaussians, except the page, which is turned upright. `.ply`, `.splat` and `.sog` keep our axes (+y down). `.glb` and
+    `.spz` prescribe +y up and +z towards the viewer; readers of `.spz` undo this. `.spz` omits `transparent` Gaussians.
 
     Returns:
-        The files' names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
+        File names by purpose: `NAME` for the `.ply`, `NAME_spz` and so on for the others.
 
     Raises:
-        CompleteSplatError: nothing to write, or the converter (of `CONVERTED` formats) is missing or fails.
+        CompleteSplatError: there is nothing to write, or the converter (for `CONVERTED` formats) is missing or fails.
     """
     if converter is None and set(formats) & set(CONVERTED):
         raise CompleteSplatError(f"a converter is needed for {', '.join(set(formats) & set(CONVERTED))}")
@@ -75,14 +74,14 @@ def write_formats(
 
 
 def write_splat(path: str | Path, gaussians: Gaussians) -> int:
-    """Write one unbatched set of Gaussians, in its order, as `write_ply` does; colours beyond 0 to 1 are clamped."""
-    kept = cleaned(gaussians, path).detach()
-    records = np.zeros(kept.count, RECORD)
-    records["means"], records["scales"] = kept.means.cpu(), kept.scales.cpu()
-    records["colors"] = _bytes(torch.cat([kept.colors, kept.opacities[:, None]], dim=-1) * 255)
-    records["quaternions"] = _bytes(normalize_quaternion(kept.quaternions) * 128 + 128)
+    """Write one unbatched set of Gaussians in its order, as `write_ply` does; clamp colours to [0, 1]."""
+    stored = cleaned(gaussians, path).detach()
+    records = np.zeros(stored.count, RECORD)
+    records["means"], records["scales"] = stored.means.cpu(), stored.scales.cpu()
+    records["colors"] = _bytes(torch.cat([stored.colors, stored.opacities[:, None]], dim=-1) * 255)
+    records["quaternions"] = _bytes(normalize_quaternion(stored.quaternions) * 128 + 128)
     write_bytes(path, records.tobytes())
-    return kept.count
+    return stored.count
 
 
 def _bytes(values: Tensor) -> UInt8[np.ndarray, "*shape"]:

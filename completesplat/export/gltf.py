@@ -1,7 +1,7 @@
-"""Gaussians as binary glTF, with the extension KHR_gaussian_splatting; other readers see a cloud of coloured points.
+"""Binary glTF with the extension KHR_gaussian_splatting; readers without it show a cloud of coloured points.
 
-Formats: the Khronos Group's glTF 2.0 specification, and the extension's own text (`extensions/2.0/Khronos/` of their
-repository, in the version of 15 April 2026).
+Formats: the Khronos Group's glTF 2.0 specification, and the text of the extension (`extensions/2.0/Khronos/` in their
+repository, version of 15 April 2026).
 """
 
 import json
@@ -33,34 +33,35 @@ RENDERING = {
 COMPONENTS = {"float32": 5126, "uint16": 5123}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 TO_GLTF = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
-"""From our axes (+y down, +z forward) to glTF's (+y up, a camera looks along -z): half a turn about x."""
+"""Half a turn about x, from our axes (+y down, +z forward) to those of glTF (+y up, cameras look along -z)."""
 
 
 def write_glb(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
     """Write one unbatched set of Gaussians; the file appears whole or not at all.
 
-    Args:
-        gaussians: in any one frame of +y down, +z forward; colours beyond 0 to 1 are clipped for points only.
-        comments: metadata, a line each.
+    The frame has +y down and +z forward. Only the points' colours are clipped to [0, 1]. `comments` are metadata.
 
     Returns:
-        How many Gaussians the file holds: those that can be stored; `CompleteSplatError` if there are none.
+        Number of Gaussians in the file, which omits those that cannot be stored.
+
+    Raises:
+        CompleteSplatError: no Gaussian can be stored.
     """
-    kept = cleaned(gaussians, path).detach().to("cpu", torch.float32).transform(TO_GLTF)
-    if not kept.count:
+    stored = cleaned(gaussians, path).detach().to("cpu", torch.float32).transform(TO_GLTF)
+    if not stored.count:
         raise CompleteSplatError(f"{path}: glTF has no empty sets of Gaussians")
-    arrays = _attributes(kept)
+    arrays = _attributes(stored)
     content = b"".join(array.tobytes() for array in arrays.values())  # each a multiple of four bytes
     text = json.dumps(_description(arrays, len(content), comments)).encode()
     text += b" " * (-len(text) % 4)
     chunks = [struct.pack("<I4s", len(data), kind) + data for kind, data in ((b"JSON", text), (b"BIN\0", content))]
     with atomic_path(path) as temporary:
         temporary.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + sum(map(len, chunks))) + b"".join(chunks))
-    return kept.count
+    return stored.count
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Arrays [gaussian, component] by the names of the primitive's attributes."""
+    """Return arrays [gaussian, component] by attribute name of the glTF primitive."""
     opacities = gaussians.opacities.clamp(0, 1)[:, None]
     points = torch.cat([_linear(gaussians.colors.clamp(0, 1)), opacities], dim=-1)
     splats = {
@@ -75,7 +76,7 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 
 def _linear(colors: Float[Tensor, "gaussian 3"]) -> Float[Tensor, "gaussian 3"]:
-    """sRGB to linear light (IEC 61966-2-1), which glTF's own colours are."""
+    """Convert sRGB to linear light (IEC 61966-2-1), in which glTF stores colours."""
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 

@@ -1,4 +1,4 @@
-"""Tensors as pictures for people: bytes, grids, sheets with labels, and depth and normals in colours."""
+"""Images for people from tensors: bytes, grids, sheets with labels, and colours for depth and normals."""
 
 import io
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ READABLE_SIDE = 144
 GAP, LINE, MARGIN = 6, 20, 12
 INK, PAPER = "black", "white"
 NOTHING, OPAQUE = 0.5, 0.5
-# Far to near; lightness rises steadily, so that the picture is also right in grey.
+# From far to near. Lightness rises steadily, so that a greyscale copy shows the same order.
 STOPS = [
     [0.05, 0.03, 0.20],
     [0.30, 0.08, 0.45],
@@ -31,7 +31,11 @@ STOPS = [
 
 
 def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Images (sRGB, 0 to 1, clamped) to bytes with the channels last; `ValueError` for what is not finite."""
+    """Convert images (sRGB, clamped to [0, 1]) to bytes with the channels last.
+
+    Raises:
+        ValueError: a value is not finite.
+    """
     if not images.isfinite().all():
         raise ValueError("images hold values that are not finite")
     scaled = images.detach().clamp(0, 1).mul(255).round().to(torch.uint8)
@@ -39,7 +43,7 @@ def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray
 
 
 def write_png(path: Path, picture: Image.Image) -> None:
-    """Write a picture as PNG, as `write_bytes` does."""
+    """Write an image as PNG with `write_bytes`."""
     content = io.BytesIO()
     picture.save(content, format="PNG")
     write_bytes(path, content.getvalue())
@@ -48,12 +52,12 @@ def write_png(path: Path, picture: Image.Image) -> None:
 def enlarge(
     images: Float[Tensor, "*batch channel height width"], factor: int
 ) -> Float[Tensor, "*batch channel tall wide"]:
-    """Repeat every pixel `factor` times in both directions: larger, with nothing invented between the pixels."""
+    """Enlarge images by repeating every pixel `factor` times in both directions, without interpolation."""
     return images.repeat_interleave(factor, dim=-2).repeat_interleave(factor, dim=-1)
 
 
 def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Image.Image:
-    """Rows of images (sRGB, 0 to 1) of one size, enlarged; white where a row is shorter than the longest."""
+    """Return enlarged rows of images (sRGB, 0 to 1) of one size; short rows are filled with white."""
     columns = max(len(row) for row in rows)
     filled = [torch.cat([row, torch.ones(columns - len(row), *row.shape[1:]).to(row)]) for row in rows]
     whole = rearrange(torch.stack(filled), "row column rgb height width -> rgb (row height) (column width)")
@@ -62,7 +66,7 @@ def image_grid(*rows: Float[Tensor, "_ 3 height width"], factor: int = 3) -> Ima
 
 @dataclass(frozen=True)
 class SheetCell:
-    """A picture of a sheet (sRGB, 0 to 1), and the text above it."""
+    """An image (sRGB, 0 to 1) on a sheet, and the label above it."""
 
     image: Float[Tensor, "3 height width"]
     label: str = ""
@@ -71,11 +75,11 @@ class SheetCell:
 def picture_sheet(
     headings: Sequence[str], rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
 ) -> Image.Image:
-    """Pictures in rows and columns, each enlarged by a whole factor to about 144 px, with room for its label above it.
+    """Return images in rows and columns, each enlarged by a whole factor to about 144 px, with its label above it.
 
     Args:
-        rows: at least one, none longer than the headings; None leaves a place empty. All pictures have one size.
-        title: the first line; None leaves no room for one.
+        rows: at least one, none longer than `headings`; None leaves a cell empty. All images have one size.
+        title: the first line; None leaves no space for it.
     """
     first = next(cell.image for row in rows for cell in row if cell is not None)
     factor = max(1, round(READABLE_SIDE / max(first.shape[-2:])))
@@ -99,20 +103,20 @@ def picture_sheet(
 
 
 def surface_depth(rendering: Rendering) -> Float[Tensor, "*batch 1 height width"]:
-    """The expected depth of pixels that are more than half opaque; 0 elsewhere, where no surface is seen."""
+    """Return the expected depth of pixels that are more than half opaque, and 0 elsewhere (no surface)."""
     return torch.where(rendering.alpha > OPAQUE, rendering.expected_depth(), 0)
 
 
 def color_depth(
     depth: Float[Tensor, "*batch 1 height width"],
 ) -> tuple[Float[Tensor, "*batch 3 height width"], tuple[float, float]]:
-    """Colours of depths, linear in inverse depth, far dark and near bright, on one scale for all pictures.
+    """Colour depths linearly in inverse depth, near bright and far dark, on one scale for all images.
 
-    The scale leaves out the nearest and the farthest 2 % of the pixels, so that stray Gaussians do not flatten the
-    rest. A depth of 0 or less, or one that is not finite, means that nothing is seen there: grey.
+    The scale ignores the nearest and the farthest 2 % of the pixels, so that stray Gaussians do not compress the rest.
+    Pixels whose depth is not finite or not above 0 are grey, because no surface is seen there.
 
     Returns:
-        The pictures, and the depths at the ends of the scale (0, 0 if nothing is seen at all).
+        The images, and the near and far depths at the ends of the scale (0, 0 if no surface is seen at all).
     """
     seen = depth.isfinite() & (depth > 0)
     if not seen.any():
@@ -127,7 +131,7 @@ def color_depth(
 
 
 def ramp(values: Float[Tensor, "*batch 1 height width"]) -> Float[Tensor, "*batch 3 height width"]:
-    """Colours of values from 0 (dark) to 1 (bright); beyond these the ends' colours."""
+    """Return colours for values from 0 (dark) to 1 (bright); clamp other values."""
     position = values.clamp(0, 1) * (len(STOPS) - 1)
     stops = torch.tensor(STOPS, dtype=values.dtype, device=values.device)
     lower = position.floor().clamp(max=len(STOPS) - 2)
@@ -137,10 +141,10 @@ def ramp(values: Float[Tensor, "*batch 1 height width"]) -> Float[Tensor, "*batc
 
 
 def color_normals(normals: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 3 height width"]:
-    """(n + 1) / 2 of unit normals in the camera's frame, in the axes of normal maps: right, up, towards the viewer.
+    """Return (n + 1) / 2 of unit normals in the camera's frame, with the axes of normal maps: right, up, to the viewer.
 
-    What faces the camera is light blue (0.5, 0.5, 1), what faces right is red and what faces up is green. In the
-    camera's own axes (+y down, +z forward) that is (1 + x, 1 - y, 1 - z) / 2. No normal (0) is grey.
+    Surfaces that face the camera are light blue (0.5, 0.5, 1), those that face right red, those that face up green. In
+    the camera's own axes (+y down, +z forward), the colour is (1 + x, 1 - y, 1 - z) / 2. A normal of 0 (none) is grey.
     """
     signs = torch.tensor([1.0, -1.0, -1.0], dtype=normals.dtype, device=normals.device)
     return (normals * signs[:, None, None] + 1) / 2

@@ -1,4 +1,4 @@
-"""Gaussians as a `.ply` file in the layout of the original 3D Gaussian Splatting code."""
+"""Reader and writer of `.ply` files in the layout of the original 3D Gaussian Splatting code."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,17 +25,17 @@ REQUIRED = (*MEANS, *COLORS, "opacity", *SCALES, *QUATERNIONS)
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = ()) -> int:
-    """Write one unbatched set of Gaussians; the file appears whole or not at all.
+    """Write one unbatched set of Gaussians in any frame; the file appears whole or not at all.
 
     Opacities are clamped to [1e-6, 1 - 1e-6] before the logit. Reading the file with `read_ply` and writing it again
-    gives the same bytes, except for clamped opacities.
-
-    Args:
-        gaussians: in any one frame; quaternions of any length.
-        comments: metadata for the header, a line each; characters outside ASCII are escaped.
+    gives the same bytes, except for clamped opacities. Quaternions may have any length. `comments` are lines of
+    metadata for the header; characters outside ASCII are escaped.
 
     Returns:
-        How many Gaussians the file holds: those that can be stored; `CompleteSplatError` if there are none.
+        Number of Gaussians in the file, which omits those that cannot be stored.
+
+    Raises:
+        CompleteSplatError: no Gaussian of a nonempty set can be stored.
     """
     table = _table(cleaned(gaussians, path))
     first = header(len(table), [(name, "float") for name in WRITTEN], (AXES_COMMENT, *comments))
@@ -44,10 +44,10 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 
 def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
-    """One row for each Gaussian; computed in float64, so that the stored float32 is the nearest one."""
+    """Return a row for each Gaussian, computed in float64 so that the stored float32 is the nearest one."""
     g = gaussians.detach().to("cpu", torch.float64)
     logits = g.opacities.logit(SMALLEST_ALPHA)[:, None]
-    # A quaternion that is of unit length up to float32 rounding is kept: normalising it again would move its bits.
+    # A quaternion of unit length up to float32 rounding stays, because normalising it again would change its bits.
     is_unit = (g.quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
     rotations = torch.where(is_unit, g.quaternions, normalize_quaternion(g.quaternions))
     rows = [g.means, torch.zeros_like(g.means), (g.colors - 0.5) / SH_C0, logits, g.scales.log(), rotations]
@@ -57,8 +57,11 @@ def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
 def read_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
-    Properties beyond the layout (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0
-    become 0, as in the renderers of such files. `PlyError`: as `read_vertices`, or values that are not finite.
+    Other properties (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0 become 0, as in the
+    renderers of these files.
+
+    Raises:
+        PlyError: `read_vertices` fails, or a value is not finite.
     """
     try:
         gaussians = _gaussians(read_vertices(path, REQUIRED))

@@ -46,14 +46,14 @@ CONVENTIONS = {
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to write of each prediction.
+    """Selection of the files that are written for each prediction.
 
     Args:
-        formats: of the scenes, out of `completesplat.export.formats.FORMATS`; some need the converter.
-        videos: camera paths, out of `completesplat.geometry.trajectories.PATHS`; each video has `frames`.
-        background: grey value where a scene leaves a pixel open.
-        maps: depth, normals and opacity of the reference view, see `write_maps`.
-        screen_space_dilation: store Gaussians `with_screen_space_dilation`.
+        formats: scene formats, from `completesplat.export.formats.FORMATS`; some need the converter.
+        videos: camera paths, from `completesplat.geometry.trajectories.PATHS`; each video has `frames` frames.
+        background: grey value behind the scene.
+        maps: whether to write depth, normals and opacity of the reference view (`write_maps`).
+        screen_space_dilation: whether to store Gaussians `with_screen_space_dilation`.
     """
 
     formats: Sequence[str] = ("ply",)
@@ -67,7 +67,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class SampleViews:
-    """One sample: its renderings from several directions, and the depth seen from the first of them."""
+    """Renderings of one sample from several directions, and the depth seen from the first of them."""
 
     label: str
     images: Float[Tensor, "view 3 height width"]
@@ -89,15 +89,16 @@ def write_prediction(
 
     Args:
         image, reference: the input image and its camera.
-        scenes: the samples, in the reference camera's frame; what cannot be drawn is left out, with a warning.
-        up: where up is in the scene; the views turn about it.
+        scenes: the samples, in the reference camera's frame; broken Gaussians are left out, with a warning.
+        up: direction up in the scene, the axis of the orbits.
         settings: recorded in `scene.json`; must hold the seed and the image's name.
-        on_sample: called when a sample's files are written.
+        on_sample: called after the files of each sample are written.
 
-    `CompleteSplatError`: a sample without anything to draw, or a converter that fails; `DiskError`: a full disk, or the
-    folder's own one is missing.
+    Raises:
+        CompleteSplatError: all Gaussians of a sample are broken, or a converter fails.
+        DiskError: the disk is full, or the folder above `folder` is missing.
     """
-    # Before anything is written: a sample of which nothing is left is refused.
+    # Refuse samples without intact Gaussians before anything is written.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
     make_folder(folder)
     rows: list[SampleViews] = []
@@ -129,24 +130,25 @@ def write_fitted_scene(
     truth: Float[Tensor, "view 3 height width"],
     seed: int,
 ) -> None:
-    """Write `scene.ply`, `sheet.png` (true pictures and those of the scene, at most 8) and `scene.json`.
+    """Write `scene.ply`, `sheet.png` (true and rendered images of at most 8 views) and `scene.json`.
 
     Args:
-        scene: in the frame of the first camera, where up is where it is in that camera's picture.
-        images, truth: what the cameras see of the scene, and what they should see.
+        scene: in the frame of the first camera, whose image also defines the direction up.
+        images, truth: rendered and true images of the cameras.
 
-    `CompleteSplatError`: nothing of the scene can be stored.
+    Raises:
+        CompleteSplatError: no Gaussian of the scene can be stored.
     """
     make_folder(folder.parent)
     make_folder(folder)
     stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
-    shown = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
+    indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
     rows = [
-        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in shown]
+        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in indices]
         for label, pictures in (("true", truth), ("fitted", images))
     ]
-    write_png(folder / "sheet.png", picture_sheet([f"view {i}" for i in shown], rows, name))
+    write_png(folder / "sheet.png", picture_sheet([f"view {i}" for i in indices], rows, name))
     files = {"scene": "scene.ply", "sheet": "sheet.png"}
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
     write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
@@ -162,7 +164,7 @@ def _write_sample(
     wanted: Wanted,
     comments: Sequence[str],
 ) -> tuple[SampleViews, dict[str, str]]:
-    """A sample's splats and videos, and its row of the contact sheet; the files' names by purpose."""
+    """Write a sample's splats and videos; return its row of the contact sheet, and file names by purpose."""
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
@@ -178,9 +180,9 @@ def _write_sample(
 
 @torch.no_grad()
 def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) -> Float[Tensor, "3"]:
-    """The point that a turn goes around: on the optical axis, at the median depth of the image's central ninth.
+    """Return the pivot of orbits: the point on the optical axis at the median depth of the image's central ninth.
 
-    Where nothing is seen there, the median depth of all Gaussians stands in.
+    If nothing is seen in the central ninth, the median depth of all Gaussians is used.
     """
     depth = rasterizer(scene[None], reference[None][None]).expected_depth()[0, 0, 0]
     height, width = depth.shape
@@ -194,9 +196,9 @@ def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) ->
 def contact_sheet(
     path: str | Path, title: str, reference: Float[Tensor, "3 height width"], samples: Sequence[SampleViews]
 ) -> None:
-    """Write a PNG: the input image in the first column, then a row for each sample with its views and its depth.
+    """Write a PNG with the input image in the first column, and a row for each sample with its views and depth.
 
-    Depth is coloured on one scale for all rows. The views, as many for all samples, are evenly spread over a turn.
+    Depth is coloured on one scale for all rows. All samples have the same number of views, spread evenly over a turn.
     """
     depths, (near, far) = color_depth(torch.stack([sample.depth for sample in samples]))
     rows = [
@@ -213,13 +215,13 @@ def contact_sheet(
 def write_maps(
     folder: Path, scenes: Sequence[Gaussians], camera: Cameras, rasterizer: Rasterizer
 ) -> tuple[dict[str, str], tuple[float, float]]:
-    """Write `depth_00.png`, `normals_00.png`, `opacity_00.png` and so on: what a camera sees of each scene.
+    """Write `depth_00.png`, `normals_00.png`, `opacity_00.png` and so on, which a camera sees of each scene.
 
-    Depth is coloured as in `color_depth`, on one scale for all scenes, normals as in `color_normals`; both are grey
-    where a pixel is not more than half opaque. Opacity is white where nothing shines through.
+    Depth is coloured by `color_depth`, on one scale for all scenes, normals by `color_normals`; both are grey where a
+    pixel is at most half opaque. Opacity is white where a pixel is fully opaque.
 
     Returns:
-        The files' names by purpose, and the depths at the ends of the scale.
+        File names by purpose, and the depths at the ends of the scale.
     """
     views = [rasterizer(scene[None], camera[None][None])[0, 0] for scene in scenes]
     depth = torch.stack([surface_depth(view) for view in views])
@@ -241,9 +243,10 @@ def write_maps(
 def write_scene_json(
     path: str | Path, reference: Cameras, settings: Mapping[str, Any], seed: int, files: Mapping[str, str]
 ) -> None:
-    """Write the scene description as plain JSON; `ValueError` for a number that is not finite (JSON has none).
+    """Write the scene description as JSON, with the `settings` of the scene and the names of its `files` by purpose.
 
-    `settings` are what the scene was made with, as plain values, `files` the names of those beside it, by purpose.
+    Raises:
+        ValueError: a number is not finite, which JSON cannot represent.
     """
     scene = {
         "format": "completesplat scene 1",
@@ -257,6 +260,6 @@ def write_scene_json(
 
 
 def plain_camera(camera: Cameras) -> dict[str, Any]:
-    """One camera as JSON holds it."""
+    """Return one camera as values for JSON."""
     matrices = {"world_to_camera": camera.world_to_camera.tolist(), "intrinsics": camera.intrinsics.tolist()}
     return {**matrices, "image_size": list(camera.image_size)}

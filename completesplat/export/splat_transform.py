@@ -1,4 +1,4 @@
-"""Formats that npm's `@playcanvas/splat-transform` writes, a page with a viewer among them."""
+"""Export by npm's `@playcanvas/splat-transform`: file formats, and a page with a viewer."""
 
 import json
 import logging
@@ -34,14 +34,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SplatTransform:
-    """The installed program."""
+    """An installed `splat-transform`."""
 
     program: str
 
     def convert(self, source: Path, target: Path, options: Sequence[str] = ()) -> None:
-        """Write `target`, in the format that its suffix names, whole or not at all.
+        """Write `target` in the format of its suffix, whole or not at all.
 
-        `CompleteSplatError`: the program fails, writes nothing, or takes more than ten minutes.
+        Raises:
+            CompleteSplatError: the program fails, writes nothing, or takes more than ten minutes.
         """
         with atomic_path(target) as temporary:
             _run([self.program, "--quiet", "--overwrite", *options, str(source), str(temporary)])
@@ -50,9 +51,10 @@ class SplatTransform:
 
 
 def find_splat_transform() -> SplatTransform:
-    """The program on PATH; without one npm's package, which `npx` downloads on first use and keeps (some 200 MB).
+    """Return the program on PATH, or else that of npm's package, which `npx` downloads once (some 200 MB).
 
-    `CompleteSplatError`: neither is there, or the program does not start.
+    Raises:
+        CompleteSplatError: there is neither the program nor `npx`, or the program does not start.
     """
     program = shutil.which(PROGRAM)
     if program is None:
@@ -68,7 +70,7 @@ def find_splat_transform() -> SplatTransform:
 
 
 def _run(command: Sequence[str]) -> str:
-    """What a program prints. It has a session of its own: npx starts further processes, which end with it."""
+    """Run a program in a new session, so that npx's child processes can be killed with it; return its output."""
     name = Path(command[0]).name
     try:
         process = subprocess.Popen(
@@ -91,14 +93,14 @@ def _run(command: Sequence[str]) -> str:
 
 
 def _reason(complaint: str) -> str:
-    """The error output of a program, without npm's hints and node's list of calls."""
+    """Return a program's error output without npm's hints and Node's stack trace."""
     lines = [line for line in complaint.splitlines() if not line.startswith(("npm warn", "    at "))]
     return " ".join(" ".join(lines).split())[:500] or "it does not say why"
 
 
 @dataclass(frozen=True)
 class PageView:
-    """Where a page begins: at the reference camera (unbatched), turning about a point, before a grey background."""
+    """Initial view of a page: the reference camera (unbatched), the pivot of its turn, up, and a grey background."""
 
     reference: Cameras
     pivot: Float[Tensor, "3"]
@@ -107,22 +109,22 @@ class PageView:
 
 
 def write_page(path: Path, gaussians: Gaussians, view: PageView, converter: SplatTransform) -> None:
-    """Write the page: the scene upright, seen from the front, turning until a person touches it."""
+    """Write a page with the upright scene, seen from the front and turning until a person touches it."""
     turn = upright(view.up)
     with tempfile.TemporaryDirectory() as folder:
         scene, settings = Path(folder) / "scene.ply", Path(folder) / "settings.json"
         write_ply(scene, gaussians.transform(turn))
         settings.write_text(json.dumps(viewer_settings(view, turn)))
-        made = Path(folder) / "page.html"
-        converter.convert(scene, made, ["--viewer-settings", str(settings)])
-        write_bytes(path, around_the_target(made.read_bytes()))
+        html = Path(folder) / "page.html"
+        converter.convert(scene, html, ["--viewer-settings", str(settings)])
+        write_bytes(path, around_the_target(html.read_bytes()))
 
 
 def around_the_target(page: bytes) -> bytes:
-    """The page with a camera that turns about its target, whatever lies behind it.
+    """Make the page's camera turn about its target, even within the bounding box of the scene.
 
-    Its viewer takes a camera within the bounding box of a scene for one in a room: it would turn on the spot. Our
-    scenes have far Gaussians, which reach behind the photograph's camera. The viewer has no setting for it.
+    The viewer assumes that a camera within the bounding box stands in a room, and turns it on the spot. Far Gaussians
+    of our scenes extend the box behind the photo's camera. The viewer has no option for this.
     """
     if IN_A_ROOM not in page:
         log.warning("this version of %s may turn the page's camera on the spot, not about the object", PROGRAM)
@@ -131,10 +133,10 @@ def around_the_target(page: bytes) -> bytes:
 
 
 def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    """The rotation that makes `up` point to -y, as the viewer expects it of a file, and keeps forward in front."""
+    """Return the rotation that turns `up` to -y, as the viewer expects in files, and keeps forward in front."""
     down = -torch.nn.functional.normalize(up, dim=-1)
     axes = torch.eye(3, dtype=up.dtype, device=up.device)
-    # Where the camera looks straight down or up, any direction may be the front.
+    # If the camera looks straight down or up, any direction may be the front.
     ahead = axes[2] if down[2].abs() < 0.99 else axes[1]
     right = torch.nn.functional.normalize(torch.linalg.cross(down, ahead), dim=-1)
     matrix = torch.eye(4, dtype=up.dtype, device=up.device)
@@ -143,10 +145,10 @@ def upright(up: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
 
 
 def viewer_settings(view: PageView, turn: Float[Tensor, "4 4"]) -> dict[str, Any]:
-    """Settings of the viewer (its schema, version 2).
+    """Return the viewer's settings (version 2 of its schema).
 
-    It turns a file by 180 degrees about z, so that +y comes to point up; its camera is placed after that. Its field of
-    view is that of the window's longer side: wide enough for the shorter one to hold what the photograph shows.
+    The viewer turns a file by 180 degrees about z, so that +y points up, before it places the camera. Its field of view
+    belongs to the window's longer side; it is wide enough for the shorter side to hold what the photo shows.
     """
     points = torch.stack([view.reference.centers, view.pivot])
     flip = torch.tensor([-1.0, -1.0, 1.0], dtype=points.dtype, device=points.device)

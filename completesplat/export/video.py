@@ -1,4 +1,4 @@
-"""Renderings of a finished scene from a camera path, as a video that every browser plays."""
+"""Videos of finished scenes along camera paths, in a format that every browser plays."""
 
 from pathlib import Path
 
@@ -27,9 +27,9 @@ def orbit_views(
     background: float,
     up: Float[Tensor, "3"] | None = None,
 ) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
-    """`render_views` on a full turn, that starts at the reference camera, about the pivot and the direction up.
+    """Call `render_views` for a full turn about the pivot and the direction up, starting at the reference camera.
 
-    A photograph does not tell where gravity points: by default, up is where the camera's own up is.
+    By default, up is that of the camera, because a photo does not tell the direction of gravity.
     """
     up = -reference.world_to_camera[1, :3] if up is None else up
     return render_views(rasterizer, gaussians, orbit(reference, pivot, up, frames), background)
@@ -39,7 +39,7 @@ def orbit_views(
 def render_views(
     rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras, background: float
 ) -> tuple[Frames, Float[Tensor, "frame 1 height width"]]:
-    """Images of one unbatched scene from several cameras, and expected depths (0: nothing seen)."""
+    """Return images of one unbatched scene from several cameras, and expected depths (0 where nothing is seen)."""
     images, depths = [], []
     for start in range(0, len(cameras.world_to_camera), CHUNK):
         rendering = rasterizer(gaussians[None], cameras[start : start + CHUNK][None])
@@ -51,11 +51,11 @@ def render_views(
 def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
     """Write an H.264 `.mp4` (yuv420p) of images (sRGB, 0 to 1).
 
-    Small images are enlarged by a whole factor until their shorter side has at least 256 px. H.264 needs even sizes: an
-    odd side gets its last row or column once more.
+    Small images are enlarged by a whole factor until their shorter side has at least 256 px. The last row or column of
+    an odd side is repeated, because H.264 needs even sizes.
 
     Raises:
-        ValueError: no or broken frames, or a path without `.mp4`.
+        ValueError: there are no frames, a frame is not finite, or the path does not end in `.mp4`.
         DiskError: the disk is full.
     """
     import imageio.v2 as imageio
@@ -72,13 +72,13 @@ def write_video(path: str | Path, frames: Frames, fps: int = 24) -> None:
                 large = enlarge(frame, factor)
                 padded = torch.nn.functional.pad(large[None], (0, wide % 2, 0, tall % 2), mode="replicate")[0]
                 writer.append_data(to_bytes(padded))  # type: ignore[attr-defined]
-        # ffmpeg is another process, whose errors imageio does not pass on.
+        # ffmpeg is another process, and imageio does not pass on its errors.
         if not _is_whole(temporary):
             raise RuntimeError(f"{path}: was not written to its end")
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether an `.mp4` ends where its last box does, and has the index of its frames (ISO/IEC 14496-12, 4.2)."""
+    """Return whether an `.mp4` ends where its last box does, and has an index of its frames (ISO/IEC 14496-12, 4.2)."""
     content, at, kinds = path.read_bytes(), 0, set()
     while at + 8 <= len(content):
         length, kind = int.from_bytes(content[at : at + 4]), content[at + 4 : at + 8]

@@ -1,5 +1,5 @@
-"""The page on which a person looks at scenes and has new ones drawn: viser's, on this machine only.
+"""A viser page on this machine, on which a person looks at scenes and draws new ones.
 
-All browsers see one page: a sample, a slider or a layer that one of them changes is changed for all of them, and each
-has a camera of its own. Refusals and files go to the browser whose person caused them.
+All browsers share the page: a sample, a slider or a layer that one of them changes is changed for all, but each has its
+own camera. Error messages and files go only to the browser that caused them.
 """

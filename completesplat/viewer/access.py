@@ -1,7 +1,7 @@
-"""Who may use the page: browsers on this machine that know its token; and how much of theirs is taken in at once.
+"""Access control of the page: browsers on this machine need its token, and their uploads are limited.
 
-viser answers everyone who reaches its port. A web page of any site, opened on the same machine, reaches it as well.
-Nothing here needs torch, so that the page is there before what fills it is imported.
+viser itself answers everyone who reaches its port, and a web page of any site, opened on the same machine, reaches it.
+This module does not need torch, so that the page opens before torch is imported.
 """
 
 import contextlib
@@ -50,7 +50,7 @@ document.head.appendChild = function (node) {
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost", "[::1]")
 MOST_FRAME = 2**20  # bytes of one websocket message; the page sends files in parts of half of that
-MOST_BYTES = 32 * 2**20  # of all pictures that are being received
+MOST_BYTES = 32 * 2**20  # of all images that are being received
 MOST_PARTS = 2**10
 
 Answer = Callable[[ServerConnection, Request], Response | None]
@@ -59,21 +59,21 @@ _starting = threading.Lock()
 
 
 class GuardedServer(viser.ViserServer):
-    """viser's server on this machine's port or, if it is taken, on the next free one, behind checks of our own.
+    """viser's server behind our checks, on this machine's port or, if that is taken, on the next free one.
 
-    Requests and websocket handshakes are answered (else 403) if their `Host` is a loopback name with the server's port,
-    their `Origin` is that host too (a request that is no handshake may have none), and they bring the token: in the
-    address, or in the cookie that the page comes with, since viser's page leaves out the query of its address when it
-    opens the websocket. Websocket messages and uploads are refused by what they announce, before they are received.
+    A request or websocket handshake is answered if its `Host` is a loopback name with the server's port, its `Origin`
+    is that host too (only a handshake must have one), and it has the token; otherwise the answer is 403. The token is
+    in the address, or in the page's cookie, because viser's page drops the query of its address when it opens the
+    websocket. Websocket messages and uploads are refused by their announced sizes, before they are received.
 
     Raises:
-        CompleteSplatError: this viser starts its websocket server in a way that leaves the checks out.
+        CompleteSplatError: this version of viser starts its websocket server without our checks.
     """
 
     def __init__(self, port: int) -> None:
         self.token = secrets.token_urlsafe(32)
         self._guarded = False
-        # viser takes no settings for its websocket server, which its constructor starts in a thread and waits for.
+        # viser's constructor starts the websocket server in a thread and waits for it, and has no options for it.
         with _starting:
             serve = websockets_server.serve
             websockets_server.serve = partial(self._serve, serve)  # type: ignore[assignment, misc]
@@ -88,11 +88,11 @@ class GuardedServer(viser.ViserServer):
 
     @property
     def address(self) -> str:
-        """What opens the page; it holds the token."""
+        """Address that opens the page; it contains the token."""
         return f"http://{self.get_host()}:{self.get_port()}/?token={self.token}"
 
     def _serve(self, serve: Callable[..., Any], *args: Any, process_request: Answer, **settings: Any) -> Any:
-        """What viser calls in the place of `serve`."""
+        """Start viser's websocket server with our checks; viser calls this instead of `serve`."""
         self._guarded = True
         answer = partial(self._answer, process_request)
         return serve(*args, process_request=answer, **settings | {"max_size": MOST_FRAME})
@@ -103,7 +103,7 @@ class GuardedServer(viser.ViserServer):
         if refusal is not None:
             return connection.respond(HTTPStatus.FORBIDDEN, refusal + "\n")
         if "Accept-Encoding" in request.headers:
-            del request.headers["Accept-Encoding"]  # viser would compress its page, to which something is added
+            del request.headers["Accept-Encoding"]  # else viser would compress the page before our head is added
         response = answer(connection, request)
         if response is not None:
             if response.headers.get("Content-Type") == "text/html":
@@ -115,7 +115,7 @@ class GuardedServer(viser.ViserServer):
         return response
 
     def _refusal(self, request: Request, port: int) -> str | None:
-        """Why the request is not answered; None if it is."""
+        """Return why the request is refused, or None if it is answered."""
         hosts = [f"{name}:{port}" for name in NAMES] + list(NAMES if port == 80 else ())
         host = request.headers.get_all("Host")
         if len(host) != 1 or host[0].lower() not in hosts:
@@ -134,7 +134,7 @@ class GuardedServer(viser.ViserServer):
         connection.register_handler(FileTransferStartUpload, self._upload_starts)
         connection.unregister_handler(FileTransferPart, gui._handle_file_transfer_part)
         connection.register_handler(FileTransferPart, self._upload_goes_on)
-        # viser itself does this only for browsers that have sent a camera.
+        # viser drops the uploads only of browsers that have sent a camera.
         connection.on_client_disconnect(lambda client: gui._drop_uploads_from_client(ClientId(client.client_id)))
 
     def _upload_starts(self, client_id: ClientId, message: FileTransferStartUpload) -> None:
@@ -143,7 +143,7 @@ class GuardedServer(viser.ViserServer):
             return self.gui._handle_file_transfer_start(client_id, message)
         client = self.get_clients().get(client_id)
         if client is not None:
-            # Its page would wait for this before it takes another file; what it sends meanwhile is dropped.
+            # Its page waits for this before it accepts another file; the parts that it sends meanwhile are dropped.
             source, size = message.source_component_uuid, message.size_bytes
             client.gui._websock_interface.queue_message(FileTransferPartAck(source, message.transfer_uuid, size, size))
             most = f"at most {MOST_BYTES // 2**20} MiB are taken at a time"
@@ -159,38 +159,38 @@ class GuardedServer(viser.ViserServer):
 
 
 def start_server(port: int, background: float = 0.5) -> GuardedServer:
-    """Listen on the port or, if it is taken, on the next free one (0 takes any), before a grey background."""
+    """Start a server with a grey background on the port or, if that is taken, the next free one (0: any)."""
     logging.getLogger("websockets").setLevel(logging.WARNING)
     with contextlib.redirect_stdout(io.StringIO()):
         server = GuardedServer(port)
     server.scene.set_background_image(np.full((1, 1, 3), round(255 * background), np.uint8), format="png")
-    server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would lead through the internet
+    server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would use the internet
     server.gui.set_panel_label("completesplat")
     server.gui.main_panel.dock_right()
     return server
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """End it, and with it what browsers show."""
+    """Stop a server; browsers then lose the page."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def cookie_name(port: int) -> str:
-    """A name for each port, since browsers keep cookies of all ports of a host together."""
+    """Return a name for each port, because browsers share the cookies of a host between all its ports."""
     return f"completesplat-{port}"
 
 
 def tokens(request: Request, port: int) -> list[bytes]:
-    """What the request gives as the token, in its address and in its cookies."""
-    given = parse_qs(request.path.partition("?")[2]).get("token", [])
+    """Return the tokens in the address and in the cookies of a request."""
+    candidates = parse_qs(request.path.partition("?")[2]).get("token", [])
     pairs = [pair.strip().partition("=") for line in request.headers.get_all("Cookie") for pair in line.split(";")]
-    given += [value for name, _, value in pairs if name == cookie_name(port)]
-    return [token.encode(errors="replace") for token in given]
+    candidates += [value for name, _, value in pairs if name == cookie_name(port)]
+    return [token.encode(errors="replace") for token in candidates]
 
 
 def told(name: str) -> str:
-    """The name of an uploaded file as it is shown: of one line, not too long."""
+    """Return an uploaded file's name for messages: printable, and at most 80 characters."""
     return "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
 
 

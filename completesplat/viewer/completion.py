@@ -1,4 +1,4 @@
-"""Completing photographs on the page: the picture that is loaded, its samples, and how they form."""
+"""Completion of photos on the page: the loaded image, its samples, and how they form."""
 
 import tempfile
 import time
@@ -20,11 +20,11 @@ from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
 
-PAUSE = 0.2  # seconds between two pictures of a scene that forms
+PAUSE = 0.2  # seconds between two images of a scene that forms
 
 
 class Completion:
-    """The controls that complete a photograph, added to a page; the model works in the page's worker only."""
+    """Controls that complete a photo, added to a page; the model runs only in the page's worker."""
 
     def __init__(self, page: Page, model: SceneModel, start: dict[str, Any]) -> None:
         self.page, self.model = page, model
@@ -36,7 +36,7 @@ class Completion:
             getattr(self.controls, name).on_update(self._moved)
 
     def load(self, name: str, photograph: Photograph, client: viser.ClientHandle | None = None) -> None:
-        """Complete this picture from now on."""
+        """Show this photo in the panel, and draw its samples."""
         self.photograph = name, photograph
         label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
         self.controls.preview.content = preview_of(to_bytes(photograph.image), label)
@@ -44,7 +44,7 @@ class Completion:
         self.request(client)
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
-        """Draw with the present settings, after the jobs that wait."""
+        """Queue a drawing with the present settings."""
         if self.photograph is None:
             return self.page.tell(CompleteSplatError("load a picture first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
@@ -60,18 +60,18 @@ class Completion:
 
     def _moved(self, event: viser.GuiEvent[Any]) -> None:
         if not isinstance(self.model, CompleteSplat):
-            return  # nothing is drawn, and no slider shown
+            return  # this model draws no samples and has no sliders
         steps = self.controls.steps
         nearest = nearest_steps(self.model.sampler, steps.value)
         if nearest != steps.value:
-            steps.value = nearest  # calls this again
+            steps.value = nearest  # calls this function again
         elif self.controls.live.value and self.photograph is not None:
             self.request(event.client)
 
     def _draw(
         self, name: str, photograph: Photograph, settings: dict[str, Any], client: viser.ClientHandle | None
     ) -> None:
-        """In the worker's thread: the samples, and before them what they look like on the way."""
+        """Draw samples in the worker's thread, and show them while they form."""
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
         earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
@@ -79,15 +79,15 @@ class Completion:
         reference, last_shown = self.model.camera(photograph), 0.0
 
         def arranged(scenes: Sequence[Gaussians], finished: bool) -> list[Sample]:
-            """The new samples behind the earlier ones, as many as there is room for."""
-            told = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
-            new = [Sample(x, layers, reference, said, finished, True) for x, said in zip(scenes, told, strict=True)]
+            """Return the earlier samples and then the new ones, without the first ones if there are too many."""
+            infos = [{**settings, "image": name, "sample": i} for i in range(len(scenes))]
+            new = [Sample(x, layers, reference, info, finished, True) for x, info in zip(scenes, infos, strict=True)]
             return [*earlier, *new][-MOST_SAMPLES:]
 
         def formed(step: int, level: int, estimate: Gaussians) -> None:
             nonlocal last_shown
             progress.value = min(100.0, 100 * (step + 1) / settings["steps"])
-            # A model that works in parts does not say which of the samples these are.
+            # A model that draws the samples in several batches does not say which of them these are.
             if len(estimate.means) == settings["samples"] and time.monotonic() - last_shown > PAUSE:
                 self.page.show(arranged([estimate[i] for i in range(settings["samples"])], finished=False), "drawing")
                 last_shown = time.monotonic()
@@ -103,9 +103,11 @@ class Completion:
 
 
 def read_upload(model: SceneModel, name: str, content: bytes, remove_background: bool = False) -> Photograph:
-    """The picture at the model's size, as `SceneModel.read`; its name is for refusals only, never a path.
+    """Read an image at the model's size with `SceneModel.read`; `name` is only used in errors, never as a path.
 
-    `ImageError`: it is none. `CompleteSplatError`: the background cannot be removed.
+    Raises:
+        ImageError: the file is not an image.
+        CompleteSplatError: the background cannot be removed.
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "upload"

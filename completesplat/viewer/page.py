@@ -1,4 +1,4 @@
-"""The page: what its controls of looking do, and the files that it saves."""
+"""The page: its viewing controls, its worker thread, and the files that it saves."""
 
 import logging
 import threading
@@ -31,10 +31,10 @@ log = logging.getLogger(__name__)
 
 
 class Worker:
-    """Does one job after the other, in a thread of its own, so that the page answers meanwhile.
+    """A thread that does one job after another, so that the page answers meanwhile.
 
-    Of the waiting jobs of one kind only the newest is done: a moving slider submits more than can be computed. `failed`
-    is called with every exception that a job raises; the thread goes on.
+    Only the newest waiting job of each kind is done, because a moving slider submits more jobs than can be computed.
+    `failed` is called with every exception that a job raises; the thread goes on.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -46,18 +46,18 @@ class Worker:
         self._thread.start()
 
     def submit(self, kind: str, job: Job) -> None:
-        """Do this after what waits already, in the place of a waiting job of the same kind."""
+        """Add a job after the waiting ones, or replace the waiting job of the same kind."""
         with self._changed:
             self._waiting[kind] = job
             self._changed.notify_all()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until no job is left, at most `timeout` seconds; returns whether none is left."""
+        """Wait until no job is left, at most `timeout` seconds; return whether none is left."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._busy and not self._waiting, timeout)
 
     def close(self) -> None:
-        """Forget what waits, and end with the job in progress."""
+        """Drop the waiting jobs, and end the thread after the current job."""
         with self._changed:
             self._waiting.clear()
             self._closed = True
@@ -83,10 +83,9 @@ class Worker:
 
 
 class Saver:
-    """Writes numbered files into a folder; nothing is overwritten.
+    """Writer of numbered files in a folder; nothing is overwritten.
 
-    `make_rasterizer` is called when the first video or thumbnail is wanted; videos have this number of frames, and a
-    grey background.
+    `make_rasterizer` is called for the first video or thumbnail. Videos have `frames` frames and a grey background.
     """
 
     def __init__(
@@ -97,9 +96,10 @@ class Saver:
         self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write these samples in one of the formats or as a video, or the page as it stands as `html`.
+        """Write samples in one of the formats or as videos; `html` is the page as it stands.
 
-        `CompleteSplatError`: there are none, or what `write_formats` raises.
+        Raises:
+            CompleteSplatError: there are no samples, or `write_formats` fails.
         """
         if not samples:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
@@ -109,7 +109,7 @@ class Saver:
         return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
 
     def picture(self, sample: Sample, size: int) -> Picture:
-        """What the sample's reference camera sees, of `size` px on its longer side."""
+        """Render a sample from its reference camera, with `size` px on the longer side."""
         camera, scene = sample.reference, sample.for_viewers()
         factor = size / max(camera.image_size)
         height, width = (max(1, round(side * factor)) for side in camera.image_size)
@@ -119,7 +119,7 @@ class Saver:
         return to_bytes(views[0].nan_to_num())
 
     def _scene(self, kind: str, sample: Sample) -> Path:
-        """All layers of the sample, in its reference camera's frame."""
+        """Write all layers of a sample, in its reference camera's frame."""
         path = self._next("sample", f".{kind}")
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
         converter = self._converter() if kind in CONVERTED else None
@@ -128,7 +128,7 @@ class Saver:
         return path
 
     def _video(self, sample: Sample) -> Path:
-        """A turn about the sample."""
+        """Write a video of a full turn about a sample."""
         path = self._next("orbit", ".mp4")
         camera = sample.reference
         up = camera.intrinsics.new_tensor(self.stage.up.tolist())
@@ -143,7 +143,7 @@ class Saver:
 
 
 class Page:
-    """Controls and scene of one server, where `layers` can be switched. What takes time happens in the worker."""
+    """Controls and scene of one server, with switches for `layers`. Slow work is done by the worker."""
 
     def __init__(self, server: GuardedServer, stage: Stage, saver: Saver, layers: int) -> None:
         self.server, self.stage, self.saver = server, stage, saver
@@ -157,7 +157,7 @@ class Page:
         self.show(stage.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
-        """These samples from now on, in all browsers; their thumbnails when they are finished."""
+        """Show samples in all browsers, and their thumbnails when all of them are finished."""
         self.stage.show(samples)
         options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
@@ -167,7 +167,7 @@ class Page:
             self.worker.submit("thumbnails", partial(self._draw_thumbnails, samples))
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
-        """In the worker's thread. One sample needs none."""
+        """Render thumbnails in the worker's thread; a single sample needs none."""
         few = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
         self._pictures = [self.saver.picture(sample, THUMBNAIL) for sample in few]
         self._mark_thumbnail()
@@ -178,16 +178,16 @@ class Page:
             self.looking.thumbnails.content = row
 
     def tell(self, error: Exception, client: viser.ClientHandle | None = None) -> None:
-        """A message in one browser, or in all; faults of the program stand in the log as well."""
+        """Show an error in one browser or in all; log it as well if it is a fault of the program."""
         text = str(error)
         if not isinstance(error, CompleteSplatError):
             text = f"{type(error).__name__}: {text}"
             log.error("the viewer goes on after %s", text, exc_info=error)
-        for one in list(self.server.get_clients().values()) if client is None else [client]:
-            one.add_notification("Not possible", text, color="red")
+        for browser in list(self.server.get_clients().values()) if client is None else [client]:
+            browser.add_notification("Not possible", text, color="red")
 
     def close(self) -> None:
-        """End the thread and the server."""
+        """Stop the worker and the server."""
         self.worker.close()
         stop_server(self.server)
 
@@ -232,6 +232,6 @@ class Page:
 
 
 def write_page(server: viser.ViserServer, path: Path) -> Path:
-    """What the server shows, without the controls, as one HTML file that needs no server."""
+    """Write the server's scene, without controls, as one HTML file that needs no server."""
     write_text(path, with_head(server.get_scene_serializer().as_html()))
     return path

@@ -1,4 +1,4 @@
-"""The controls of the page: what completes a photograph, what is shown of the samples, what is saved."""
+"""Controls of the page: completing a photo, viewing its samples, and saving them."""
 
 import base64
 import io
@@ -22,19 +22,19 @@ MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
 CUT_OUT = "of the next pictures: only the object, before what the weights know (needs completesplat[background])"
-KEYS = 9  # samples that a key chooses; 0 shows all
+KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
 ONE_ANSWER = "One answer for each picture: these weights draw no samples."
 VIDEO = "video"
-# A press of the number's key, which the page hears everywhere; viser's HTML has no callbacks.
+# Simulates a press of the number's key, which the page hears everywhere, because viser's HTML has no callbacks.
 CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit{0}',bubbles:true}}))"
 
 Picture = UInt8[np.ndarray, "_ _ 3"]
 
 
 def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
-    """The folders `Photograph` and `Completion`: viser's handles; `start` says where the `SLIDERS` stand at first.
+    """Add the folders `Photograph` and `Completion`, and return viser's handles; `start` holds the initial values.
 
-    Of a model that draws no samples, what is about drawing is not shown.
+    The controls of drawing are hidden if the model draws no samples.
     """
     draws, most_steps, first_steps = model.draws_samples, 2, 1
     if isinstance(model, CompleteSplat):
@@ -66,9 +66,9 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
 
 
 def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNamespace:
-    """The folder `View`: handles of what is `chosen`, of `layers` by number and of `cameras` by name.
+    """Add the folder `View`; return handles of the `chosen` sample, of `layers` by number, and of `cameras` by name.
 
-    Above all folders: `thumbnails`, which `thumbnail_row` fills; `keys`, commands by the digit that calls them.
+    The handles also include `thumbnails` above all folders, filled by `thumbnail_row`, and `keys`, commands by digit.
     """
     names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
     commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
@@ -87,14 +87,14 @@ def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNam
 
 
 def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
-    """The folder `Save`: what `kind` of file, of the formats or a video, and the button `save`."""
+    """Add the folder `Save`; return handles of the file's `kind` (a format or a video) and of the button `save`."""
     with gui.add_folder("Save", order=4):
         kind = gui.add_dropdown("Format", (*formats, VIDEO), hint="spz and sog need Node.js")
         return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
 
 
 def thumbnail_row(pictures: Sequence[Picture], chosen: int | None) -> str:
-    """HTML: pictures of samples, each with its number; those of the first nine choose it when they are clicked."""
+    """Return HTML with numbered images of samples; a click on one of the first nine chooses it."""
     cells = []
     for i, picture in enumerate(pictures):
         line = "#228be6" if i == chosen else "transparent"
@@ -108,26 +108,26 @@ def thumbnail_row(pictures: Sequence[Picture], chosen: int | None) -> str:
 
 
 def preview_of(picture: Picture, label: str) -> str:
-    """HTML: the picture that is completed, and a line about it (any text)."""
+    """Return HTML with a line of any text above the image that is completed."""
     style = "padding:0 8px 8px;font-size:14px"
     return f'<div style="{style}">{escape(label)}<img src="{_source(picture)}" alt="" style="display:block"></div>'
 
 
 def _source(picture: Picture) -> str:
-    """The picture within the HTML: viser's own images lose theirs when the panel is moved."""
+    """Return an image as a data URL, because viser's own images disappear when the panel is moved."""
     content = io.BytesIO()
     Image.fromarray(picture).save(content, format="PNG")
     return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def possible_steps(sampler: Sampler) -> list[int]:
-    """Numbers of denoising steps up to 100, and the sampler's own one. DDIM's divide the number of noise levels."""
+    """Return the sampler's default steps and all others up to 100; those of DDIM divide the number of noise levels."""
     numbers = range(1, min(MOST_STEPS, sampler.training_timesteps) + 1)
     divides = isinstance(sampler.scheduler, DDIMScheduler)
-    found = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
-    return sorted(found | {sampler.steps})
+    possible = {n for n in numbers if not (divides and sampler.training_timesteps % n)}
+    return sorted(possible | {sampler.steps})
 
 
 def nearest_steps(sampler: Sampler, steps: int) -> int:
-    """The possible number of steps that is nearest, the smaller of two."""
+    """Return the possible number of steps nearest to `steps`, the smaller one of two."""
     return min(possible_steps(sampler), key=lambda n: abs(n - steps))

@@ -1,4 +1,4 @@
-"""What the page shows: scenes with the camera that they belong to."""
+"""Scenes that the page shows, with the cameras that they belong to."""
 
 import json
 import math
@@ -27,11 +27,11 @@ class Sample:
     """One scene, unbatched.
 
     Attributes:
-        layers: M of the splatter image that it was, or 1.
-        reference: the camera of its photograph, or one that sees all of it.
-        settings: what it was drawn with, for the files that are saved.
-        finished: False for an estimate on the way.
-        exact: as the model gives it, for our rasterizers; files hold Gaussians with screen-space dilation already.
+        layers: number of layers (M) of its splatter image, or 1.
+        reference: camera of its photo, or its `framing_camera`.
+        settings: settings that it was drawn with, which are recorded in saved files.
+        finished: False for an intermediate estimate.
+        exact: whether the Gaussians are the model's own; those of files already have screen-space dilation.
     """
 
     gaussians: Gaussians
@@ -42,29 +42,31 @@ class Sample:
     exact: bool = False
 
     def for_viewers(self) -> Gaussians:
-        """With screen-space dilation once: what the page draws and what is stored."""
+        """Return the Gaussians with screen-space dilation, for the page and for files."""
         return with_screen_space_dilation(self.gaussians, self.reference) if self.exact else self.gaussians
 
     def pivot(self) -> Float[Tensor, "3"]:
-        """On the optical axis, at the median depth (by opacity) of the Gaussians in the picture's central ninth."""
-        kept = self.gaussians.keep(self.gaussians.finite())
-        pixels, depths = project(self.reference, kept.means)
+        """Return the point on the optical axis at the median depth, by opacity, of the image's central ninth."""
+        finite = self.gaussians.keep(self.gaussians.finite())
+        pixels, depths = project(self.reference, finite.means)
         height, width = self.reference.image_size
         offset = pixels / torch.tensor([width, height], device=pixels.device) - 0.5
         seen = (depths > 0) & (offset.abs() < 1 / 6).all(-1)
         if not seen.any():
             seen = depths > 0
         ordered, order = depths[seen].sort()
-        weights = kept.opacities[seen][order].cumsum(0)
+        weights = finite.opacities[seen][order].cumsum(0)
         depth = ordered[(weights < weights[-1] / 2).sum()].item() if len(ordered) else 1.0
         return self.reference.centers + self.reference.camera_to_world[:3, 2] * depth
 
 
 def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
-    """A `.ply`, or the folder of a prediction with all its samples, or of a fitted scene; and where up is.
+    """Read a `.ply`, or all samples in the folder of a prediction or fitted scene; return them and the direction up.
 
-    Without the prediction's `scene.json` beside it, a file is looked at by its `framing_camera`. `CompleteSplatError`:
-    nothing there that can be shown.
+    A file without `scene.json` beside it is seen by its `framing_camera`.
+
+    Raises:
+        CompleteSplatError: there is nothing that can be shown.
     """
     files = [path] if path.is_file() else sorted([*path.glob("sample_*.ply"), *path.glob("scene.ply")])
     if not files:
@@ -78,15 +80,16 @@ def read_scene(path: Path) -> tuple[list[Sample], tuple[float, ...]]:
 
 
 def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
-    """The fixed scenes that a run has written last (`write_newest`), with the step, and where up is.
+    """Read the fixed scenes that a run has written last (`write_newest`); return the step, them and the direction up.
 
-    `CompleteSplatError`: they cannot be read.
+    Raises:
+        CompleteSplatError: the scenes cannot be read.
     """
     path = folder / NEWEST_FILE
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        step, up = int(found["step"]), _up(found)
-        described = [(str(one["file"]), str(one["scene"]), _camera(one["reference_camera"])) for one in found["scenes"]]
+        data = json.loads(path.read_text(encoding="utf-8"))
+        step, up = int(data["step"]), _up(data)
+        described = [(str(row["file"]), str(row["scene"]), _camera(row["reference_camera"])) for row in data["scenes"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CompleteSplatError(f"{path}: not the newest scenes of a run") from error
     samples = []
@@ -97,10 +100,10 @@ def read_newest(folder: Path) -> tuple[int, list[Sample], tuple[float, ...]]:
 
 
 def framing_camera(gaussians: Gaussians) -> Cameras:
-    """A camera that looks along +z at nine tenths of the Gaussians."""
+    """Return a camera that looks along +z and sees nine tenths of the Gaussians."""
     means = gaussians.means if gaussians.count else torch.zeros(1, 3)
     center = means.median(dim=0).values
-    # Sorted, as `torch.quantile` refuses more than 16 million values.
+    # Sorted, because `torch.quantile` refuses more than 16 million values.
     distances = (means - center).norm(dim=-1).sort().values
     radius = distances[int(0.9 * (len(distances) - 1))].clamp(min=1e-3)
     back = 1.1 * radius / torch.tensor(FRAMING_FOV / 2).deg2rad().sin()
@@ -110,7 +113,7 @@ def framing_camera(gaussians: Gaussians) -> Cameras:
 
 
 def _layers(gaussians: Gaussians, reference: Cameras) -> int:
-    """Gaussians that could not be written are missing from a file: then its layers are not known."""
+    """Return the number of layers, or 1 if Gaussians were left out of the file, so that it is unknown."""
     layers, rest = divmod(gaussians.count, math.prod(reference.image_size))
     return layers if layers and not rest else 1
 
@@ -130,8 +133,8 @@ def _camera(plain: Mapping[str, Any]) -> Cameras:
 
 def _read_description(path: Path) -> tuple[Cameras, dict[str, Any]]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        camera, settings = _camera(found["reference_camera"]), dict(found["settings"])
+        data = json.loads(path.read_text(encoding="utf-8"))
+        camera, settings = _camera(data["reference_camera"]), dict(data["settings"])
         _up(settings)
         return camera, settings
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -1,6 +1,6 @@
-"""A page for everyone, as a Space of the Hugging Face hub runs it: a picture in, scenes out that turn in the browser.
+"""A public page for a Space of the Hugging Face hub: from an image to complete scenes that turn in the browser.
 
-`python -m completesplat.viewer.space WEIGHTS` opens it on this machine; the Space's files are in this folder's README.
+`python -m completesplat.viewer.space WEIGHTS` opens it on this machine; this folder's README has the Space's files.
 """
 
 import sys
@@ -28,16 +28,17 @@ from completesplat.viewer.sample import Sample
 MOST_SAMPLES, MOST_BYTES, HOUR = 4, 32 * 2**20, 3600
 SETTINGS = ("samples", "skip_weight", "guidance_weight", "seed")  # of `CompleteSplat`
 FRAMES = '<div style="display: flex; flex-wrap: wrap; gap: 8px">{}</div>'
-# Its scripts reach nothing of the page around it.
+# The sandbox keeps its scripts away from the page around it.
 FRAME = '<iframe sandbox="allow-scripts" style="flex: 1 1 320px; height: 360px; border: 0" srcdoc="{}"></iframe>'
 
 
 def completed(
     model: SceneModel, rasterizer: Rasterizer, picture: Path, folder: Path, settings: dict[str, Any]
 ) -> tuple[str, str, list[str]]:
-    """Complete a picture: frames in which the scenes turn, and the files with the contact sheet and for other programs.
+    """Complete an image; return HTML frames of turning scenes, the path of the contact sheet, and those of other files.
 
-    `CompleteSplatError`: not a readable picture, or what the model refuses.
+    Raises:
+        CompleteSplatError: the image cannot be read, or the model refuses the settings.
     """
     photograph = model.read(picture)
     scenes, camera = model(photograph, **settings), model.camera(photograph)
@@ -53,7 +54,7 @@ def completed(
 
 
 def write_offline(path: Path, sample: Sample, up: Sequence[float]) -> None:
-    """One sample as the viewer's offline page, by a server of its own: one that goes on keeps what it has shown."""
+    """Write a sample as the viewer's offline page through a new server, because a used one keeps earlier scenes."""
     from completesplat.viewer.access import start_server, stop_server
     from completesplat.viewer.page import write_page
     from completesplat.viewer.stage import Stage
@@ -67,7 +68,11 @@ def write_offline(path: Path, sample: Sample, up: Sequence[float]) -> None:
 
 
 def make_space(weights: str) -> Any:
-    """The page, a `gradio.Blocks`. `CompleteSplatError`: gradio or viser is missing; and as `from_pretrained`."""
+    """Return the page, a `gradio.Blocks`.
+
+    Raises:
+        CompleteSplatError: gradio or viser is missing, or `CompleteSplat.from_pretrained` fails.
+    """
     try:
         import gradio as gr
 
@@ -83,7 +88,7 @@ def make_space(weights: str) -> Any:
         settings = dict(zip(SETTINGS, values, strict=True)) if draws else {"samples": 1, "seed": 0}
         with TemporaryDirectory() as folder:
             try:
-                # gradio copies the files before it comes back.
+                # gradio copies the files before it resumes this generator.
                 yield completed(model, rasterizer, Path(picture), Path(folder), settings)
             except CompleteSplatError as error:
                 raise gr.Error(printable(str(error).replace(picture, Path(picture).name))) from error
@@ -91,7 +96,7 @@ def make_space(weights: str) -> Any:
     with gr.Blocks(title="completesplat", analytics_enabled=False, delete_cache=(HOUR, HOUR)) as page:
         gr.Markdown(f"# completesplat\nOne picture, complete scenes of Gaussian splats; weights: `{weights}`.")
         with gr.Row():
-            # The file as it is: its EXIF may tell the field of view.
+            # The unchanged file, because its EXIF may contain the field of view.
             picture = gr.Image(type="filepath", image_mode=None, sources=["upload", "clipboard"], label="Picture")
             with gr.Column():
                 samples = gr.Slider(1, MOST_SAMPLES, 2, step=1, label="Samples", visible=draws)
@@ -100,13 +105,13 @@ def make_space(weights: str) -> Any:
                 seed = gr.Slider(0, MOST_SEED, 0, step=1, label="Seed", visible=draws)
                 draw = gr.Button("Complete", variant="primary")
         scenes, sheet = gr.HTML(), gr.Image(label="Around each sample")
-        shown = [scenes, sheet, gr.Files(label="For other programs")]
-        draw.click(complete, [picture, samples, skips, guidance, seed], shown, api_name="complete")
+        outputs = [scenes, sheet, gr.Files(label="For other programs")]
+        draw.click(complete, [picture, samples, skips, guidance, seed], outputs, api_name="complete")
     return page
 
 
 def main() -> None:
-    """Serve the weights that are named, on this machine; a Space's own program calls `make_space`."""
+    """Serve the page with the given weights on this machine; the program of a Space calls `make_space`."""
     try:
         if len(sys.argv) != 2:
             raise CompleteSplatError("give the weights: python -m completesplat.viewer.space WEIGHTS")

@@ -1,4 +1,4 @@
-"""The three-dimensional part of the page: splats, where samples stand, from where one looks."""
+"""The 3D part of the page: splats, the places of samples, and the viewpoint."""
 
 import math
 import threading
@@ -27,14 +27,14 @@ REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90,
 
 @dataclass(frozen=True)
 class Arrangement:
-    """One row of samples. A single one is seen exactly as its reference camera sees it.
+    """A row of samples and its camera. A single sample is seen exactly as by its reference camera.
 
     Attributes:
         pivots: the point that each sample turns about, before it is moved to its place.
-        right, spacing: the row's direction, and between neighbours 1.25 widths of the picture at the pivot.
-        position, look_at: of the page's camera.
+        right, spacing: direction of the row, and distance between neighbours (1.25 image widths at the pivot).
+        position, look_at: place and target of the page's camera.
         fov: its vertical field of view, in radians, in windows that are not narrower than `aspect`.
-        aspect: width through height of what is to be seen.
+        aspect: width / height of the region that must be visible.
     """
 
     pivots: list[Float[Tensor, "3"]]
@@ -47,32 +47,32 @@ class Arrangement:
 
     @property
     def distance(self) -> float:
-        """From the camera to what it looks at."""
+        """Distance from the camera to its target."""
         return float(np.linalg.norm(self.look_at - self.position))
 
     def shift(self, index: int) -> Float[np.ndarray, "3"]:
-        """How a sample is moved: the row has its middle where the first sample was."""
+        """Return a sample's offset; the middle of the row is where the first sample was."""
         return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
 
     def fov_in(self, aspect: float) -> float:
-        """The vertical field of view, in radians, that shows all of it in a window of this width through height."""
+        """Return the vertical field of view, in radians, that shows the row in a window of this width / height."""
         return 2 * math.atan(math.tan(self.fov / 2) * max(1.0, self.aspect / aspect))
 
     def beside(self, index: int, part: Gaussians) -> Gaussians:
-        """What of a sample reaches no further than to the middle between it and its neighbours; all of a single one."""
+        """Return the Gaussians that reach at most half-way to a neighbour; all of them for a single sample."""
         if len(self.pivots) == 1:
             return part
         reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
         return part.keep(reach <= self.spacing / 2)
 
     def looks_like(self, other: "Arrangement") -> bool:
-        """Whether a camera that was put there may stay: as many samples, about as far away."""
+        """Return whether a camera placed for `other` may stay: equal number of samples, nearly equal camera."""
         apart = np.linalg.norm(self.look_at - other.look_at) + np.linalg.norm(self.position - other.position)
         return len(self.pivots) == len(other.pivots) and float(apart) < SAME * other.distance
 
 
 def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
-    """The row of these samples, looked at by the first one's reference camera, moved back until all are seen."""
+    """Return a row of samples, seen by the first one's reference camera, moved back until all are visible."""
     reference = samples[0].reference
     pivots = [sample.pivot() for sample in samples]
     pose = reference.camera_to_world.cpu().numpy()
@@ -90,13 +90,13 @@ def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
 
 
 class Stage:
-    """One of the samples or all, side by side; all layers or some, in their colours or those of their depths; cameras.
+    """Splats and cameras on the page: one sample or all side by side, all layers or some, in colour or by depth.
 
-    Everything is drawn anew from the attributes by `refresh`, under a lock: callbacks come from several threads. Where
-    up is, and the cameras [view] of a data set, are in the reference camera's frame.
+    `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads. The
+    direction up and the cameras [view] of a data set are in the reference camera's frame.
 
-    Side by side, of each sample only what is around its middle is shown: scenes reach further than a picture's width,
-    and would hide each other.
+    Side by side, only the middle part of each sample is shown, because scenes are wider than an image and would hide
+    each other.
     """
 
     def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
@@ -117,50 +117,50 @@ class Stage:
 
     @property
     def shown(self) -> list[Sample]:
-        """The chosen sample, the first if there is none with its number; or all."""
+        """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
         samples, chosen = self.samples, self.chosen
         return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
 
     def show(self, samples: Sequence[Sample]) -> None:
-        """These samples from now on."""
+        """Replace the samples, and draw the new ones."""
         with self._lock:
             self.samples = list(samples)
             self.refresh()
 
     def refresh(self) -> None:
-        """Draw what the attributes say; cameras of browsers move only if the arrangement is another one."""
+        """Draw the state of the attributes; move the cameras of browsers only if the arrangement has changed."""
         with self._lock, self.server.atomic():
-            shown = self.shown
-            if not shown:
+            samples = self.shown
+            if not samples:
                 return
-            arrangement = arrangement_of(shown)
-            self._draw_splats(shown, arrangement)
-            self._draw_cameras(shown, arrangement)
+            arrangement = arrangement_of(samples)
+            self._draw_splats(samples, arrangement)
+            self._draw_cameras(samples, arrangement)
             if self._arrangement is None or not arrangement.looks_like(self._arrangement):
                 self._arrangement = arrangement
                 self.look_from_the_front()
 
     def forget_view(self) -> None:
-        """Another picture comes: what is drawn next is looked at from the front, wherever people look from now."""
+        """Make the next drawing be seen from the front, because it shows another image."""
         with self._lock:
             self._arrangement = None
 
     def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
-        """Put a browser's camera (all browsers', and those of browsers to come) where the photograph was taken."""
+        """Move a browser's camera (None: those of all present and future browsers) to where the photo was taken."""
         with self._lock:
             if self._arrangement is None:
                 return
             view, start = self._arrangement, self.server.initial_camera
             start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
-            for one in list(self.server.get_clients().values()) if client is None else [client]:
-                with one.atomic():
-                    camera = one.camera
+            for browser in list(self.server.get_clients().values()) if client is None else [client]:
+                with browser.atomic():
+                    camera = browser.camera
                     camera.up_direction = self.up
                     camera.position, camera.look_at = view.position, view.look_at
                     camera.fov = view.fov_in(camera.image_width / camera.image_height)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """From now on, narrow windows of this browser (a phone's, upright) show the whole picture as wide ones do."""
+        """Let narrow windows of a new browser (a phone's, upright) show the whole image, as wide ones do."""
         seen: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
@@ -235,10 +235,10 @@ class Stage:
 
 
 class ViserSplats(NamedTuple):
-    """What `add_gaussian_splats` takes, in units of `scale` scene units.
+    """Arguments of `add_gaussian_splats`, in units of `scale` scene units.
 
-    viser keeps covariances as float16, which ends at 65504 and has few digits below 6e-5: with this unit the largest
-    one is just below that end, and thin Gaussians keep their shape.
+    viser stores covariances as float16, which ends at 65504 and has few digits below 6e-5. In this unit, the largest
+    covariance is just below that end, and thin Gaussians keep their shape.
     """
 
     centers: Float[np.ndarray, "gaussian 3"]
@@ -249,16 +249,16 @@ class ViserSplats(NamedTuple):
 
 
 def to_splats(gaussians: Gaussians) -> ViserSplats:
-    """One unbatched set. Gaussians that are not finite are left out, and colours above 1 become 1."""
-    kept = gaussians.keep(gaussians.finite()).to("cpu")
-    largest = kept.scales.max().item() if kept.count else 1.0
+    """Convert one unbatched set; leave out Gaussians that are not finite, and clamp colours to [0, 1]."""
+    finite = gaussians.keep(gaussians.finite()).to("cpu")
+    largest = finite.scales.max().item() if finite.count else 1.0
     scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
-    unit = replace(kept, means=kept.means / scale, scales=kept.scales / scale)
+    unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
     return ViserSplats(
         unit.means.float().numpy(),
         unit.covariances().float().numpy(),
-        _bytes(kept.colors),
-        _bytes(kept.opacities[:, None]),
+        _bytes(finite.colors),
+        _bytes(finite.opacities[:, None]),
         scale,
     )
 
@@ -268,13 +268,13 @@ def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaus
 
 
 def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
-    """One layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
+    """Return one layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
     size = gaussians.count // layers
     return gaussians[layer * size : (layer + 1) * size]
 
 
 def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
-    """The scenes in the colours of their depths (z), near bright and far dark, on one scale for all of them."""
+    """Colour scenes by depth (z), near bright and far dark, on one scale for all of them."""
     depths = torch.cat([scene.means[:, 2] for scene in scenes])
     colors, _ = color_depth(depths[None, None, :])
     parts = torch.split(colors[:, 0].T, [scene.count for scene in scenes])
