@@ -14,7 +14,7 @@ QUICK = [
     *("bench", "paper", "repeats=1", "device=cpu", "compile=false", "samples=3", "sampler.steps=2"),
     *("autoreconstructor=tiny", "conditioning=learned", "denoiser=tiny", "rasterizer=tiled"),
     *(f"autoreconstructor.encoder.{CHANNELS}", f"conditioning.{CHANNELS}", "denoiser.channels=[16,32]"),
-    *("denoiser.attention_levels=[1]", "data.scenes=4", "data.frames=3", "data.image_size=32", "data.batch_size=2"),
+    *("denoiser.attention_levels=[1]", "data.scenes=4", "data.frames=4", "data.image_size=32", "data.batch_size=2"),
 ]
 
 
@@ -42,7 +42,7 @@ def test_both_stages_are_measured_written_and_shown(command, tmp_path, monkeypat
 @pytest.mark.parametrize("task", ["paper", "diffusion"])
 def test_scenes_are_made_in_the_temporary_folder(task, tmp_path):
     """Elsewhere toy data have to be asked for."""
-    sizes = [f"data.{setting}" for setting in ("scenes=2", "frames=3", "image_size=32")]
+    sizes = [f"data.{setting}" for setting in ("scenes=2", "frames=4", "image_size=32")]
     data = compose_config("bench", f"bench_task={task}", *sizes).task.data
     instantiate(data, root=str(tmp_path / "scenes"), workers=1, _convert_="all").prepare_data()
     assert len(list(tmp_path.rglob("*.jpg"))) >= 6
