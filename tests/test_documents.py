@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from omegaconf import OmegaConf
-from written_commands import BLOCK, DOCUMENTS, README, ROOT
+from written_commands import BLOCK, CHANGELOG, DOCUMENTS, README, ROOT, STUDIES
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 PATH = re.compile(r"`((?:completesplat|conf|tests|notebooks|\.ci)/[\w./]*)`")
@@ -55,6 +55,21 @@ def test_the_readme_is_a_page_and_leads_to_every_document():
     assert reached == set(DOCUMENTS)
 
 
+def test_documents_are_short_and_a_change_is_one_line():
+    words = {path: len(path.read_text().split()) for path in DOCUMENTS if path != STUDIES}
+    assert sum(words.values()) <= 9_500
+    assert words[ROOT / "completesplat/training/README.md"] <= 1_400
+    entries = [line for line in CHANGELOG.read_text().partition("## [")[2].splitlines()[1:] if line]
+    assert [line for line in entries if not line.startswith(("- ", "## ", "### ")) or len(line) > 160] == []
+
+
+def test_the_table_of_studies_leads_to_every_study():
+    text = STUDIES.read_text()
+    table, *studies = re.split(r"^## ", text, flags=re.MULTILINE)
+    linked = {link.partition("#")[2] for link in LINK.findall(table) if link.startswith("#")}
+    assert linked == {study.partition("\n")[0].lower().replace(" ", "-") for study in studies}
+
+
 def test_the_groups_of_settings_are_all_described():
     table = [line for line in (ROOT / "conf/README.md").read_text().splitlines() if line.startswith("| `")]
     described = {name for line in table for name in re.findall(r"`(\w+)`", line.split("|")[1])}
@@ -74,7 +89,7 @@ def test_the_citation_is_the_readmes_and_the_changelog_knows_this_version():
         assert re.search(rf"{field} += {re.escape(f'{{{value}}}')}", text)
     assert citation.version == PROJECT["version"]
     assert citation.license == PROJECT["license"]
-    assert f"## [{PROJECT['version']}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert f"## [{PROJECT['version']}]" in CHANGELOG.read_text()
 
 
 def test_the_hooks_are_the_checks_of_make_and_the_workflow_runs_what_must_hold():

@@ -16,7 +16,9 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 CARDS = sorted((ROOT / "completesplat/weights").rglob("README.md"))
 FOLDERS = [*sorted((ROOT / "completesplat").rglob("README.md")), ROOT / "conf/README.md"]
-DOCUMENTS = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "SECURITY.md", *FOLDERS]
+STUDIES = ROOT / "notebooks/experiments.md"
+CHANGELOG = ROOT / "CHANGELOG.md"
+DOCUMENTS = [README, ROOT / "CONTRIBUTING.md", CHANGELOG, ROOT / "SECURITY.md", *FOLDERS, STUDIES]
 
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(completesplat [^`]+)`")
