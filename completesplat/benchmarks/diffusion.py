@@ -193,7 +193,7 @@ class Training:
     def __init__(self, module: SceneModule, precision: str) -> None:
         self.module: Any = module.train()
         self.precision = precision
-        for logs in ("log_loss", "log_dict"):  # there is no trainer to log with
+        for logs in ("log_loss", "log_step"):  # there is no trainer to log with
             setattr(module, logs, lambda *_, **__: None)
         self.optimizer: Optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
 
