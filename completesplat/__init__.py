@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from completesplat.export.ply import read_ply as read_ply
     from completesplat.export.ply import write_ply as write_ply
     from completesplat.gaussians import Gaussians as Gaussians
-    from completesplat.generation import CompleteSplat as CompleteSplat
+    from completesplat.generator import CompleteSplat as CompleteSplat
 
 __version__ = "0.1.0"
 
-_PLACES = {"CompleteSplat": "generation", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
+_PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
 _PLACES |= {"compose": "commands", "instantiate": "commands.fit"}
 _PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
 

@@ -12,8 +12,8 @@ from hydra.utils import get_object
 from omegaconf import OmegaConf
 
 from completesplat.errors import WeightsError
-from completesplat.options import conf_folder
-from completesplat.schema import shown
+from completesplat.settings.options import conf_folder
+from completesplat.settings.schema import shown
 from completesplat.weights import read_small
 
 ONLY_FOR_TRAINING = (

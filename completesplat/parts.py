@@ -31,7 +31,7 @@ from completesplat.diffusion.conditioning import LearnedConditioning, StableDiff
 from completesplat.diffusion.denoiser import Denoiser, TextlessStableDiffusion
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
-from completesplat.schema import Entries, Range, Share, hints_of, refused, shown
+from completesplat.settings.schema import Entries, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, RUN_CONFIG_FILE, SCENES, read_small
 
@@ -61,7 +61,7 @@ class TrainingPictures(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
     `box_masks`: how often parts of an image were hidden. The others: mean and standard deviation of the training
-    images' features, see `completesplat.data.pictures.photograph.picture_features`.
+    images' features, see `completesplat.data.images.photograph.picture_features`.
     """
 
     box_masks: Share

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.baselines.published import PublishedSplatterImage
-from completesplat.data.pictures.photograph import Photograph, Picture, read_photograph
+from completesplat.baselines.splatter_image.model import PublishedSplatterImage
+from completesplat.data.images.photograph import Photograph, Picture, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras

@@ -10,13 +10,13 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from completesplat.atomic import atomic_path, make_folder, write_text
-from completesplat.data.pictures.photograph import Photograph, Picture, picture_features, read_photograph
+from completesplat.data.images.photograph import Photograph, Picture, picture_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, nearest_to_axes, pinhole, transform_points
 from completesplat.scene import Views
-from completesplat.schema import check_settings
+from completesplat.settings.schema import check_settings
 from completesplat.splatter_image import Parameterization
 from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
@@ -66,7 +66,7 @@ class SceneModel(nn.Module):
 
         Args:
             image: a file, a PIL image, an array or a tensor (see `read`), or what `read` returned.
-            visible: 0 where the image is hidden; see `completesplat.data.pictures.photograph`.
+            visible: 0 where the image is hidden; see `completesplat.data.images.photograph`.
             **settings: `samples`, `skip_weight`, `guidance_weight`, `steps`, `seed`, ...: see `generate`.
 
         Raises:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_rays
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.schema import Few, Range, Share
+from completesplat.settings.schema import Few, Range, Share
 from completesplat.tensors import TensorDataclass
 
 SH_C0 = 0.28209479177387814

@@ -17,7 +17,7 @@ from filelock import FileLock
 from PIL import Image, ImageOps
 from support import SMALL, call, tiny_generator
 
-from completesplat.data.pictures import photograph
+from completesplat.data.images import photograph
 from completesplat.data.toy import write_objects
 from completesplat.signals import ENDING
 

@@ -21,7 +21,7 @@ from completesplat import cli
 from completesplat.commands import conf_folder, refusal
 from completesplat.commands.jobs import start
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 
 NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
 SMALL = ["data.image_size=32", "data.batch_size=2", "data.targets=3", "data.evaluation_targets=2", *NETWORKS]

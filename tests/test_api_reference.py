@@ -18,7 +18,7 @@ def test_every_module_has_a_page_whose_links_lead_somewhere(tmp_path: Path) -> N
     said = [line for line in made.stderr.splitlines() if not line.startswith("Warn: Cannot determine where")]
     assert (made.returncode, said) == (0, [])
     pages = {path.resolve(): path.read_text() for path in tmp_path.rglob("*.html")}
-    model = pages[(tmp_path / "completesplat/generation.html").resolve()]
+    model = pages[(tmp_path / "completesplat/generator.html").resolve()]
     assert 'id="CompleteSplat.from_pretrained"' in model
     dead, links = [], 0
     for path, text in pages.items():

@@ -20,9 +20,9 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 # A module imports from its own floor and from those before it; nothing from the benchmarks, which are no part of the
 # method.
 LAYERS = """
-    errors names options signals atomic schema ply_files weights tensors geometry gaussians splatter_image scene
+    errors signals files settings ply_files weights tensors geometry gaussians splatter_image scene
     rasterizers
-    opening data autoreconstructor diffusion losses metrics baselines parts scene_model published generation export
+    opening data autoreconstructor diffusion losses metrics baselines parts scene_model published generator export
     training viewer results studies commands cli
     benchmarks
 """

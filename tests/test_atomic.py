@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from completesplat.atomic import atomic_path, file_refusal, make_folder, write_text
 from completesplat.errors import CompleteSplatError
+from completesplat.files import atomic_path, file_refusal, make_folder, write_text
 
 
 def test_a_file_takes_the_place_of_the_old_one(tmp_path: Path) -> None:

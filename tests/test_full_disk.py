@@ -18,18 +18,18 @@ import torch
 from PIL import Image
 from support import SMALL, some_gaussians, tiny_generator, write_capture
 
-from completesplat.atomic import make_folder, write_text
 from completesplat.commands import exit_status, refusal
 from completesplat.data.audit import Findings
-from completesplat.data.importing import import_capture
-from completesplat.data.latent_cache import ArrayWriter
-from completesplat.data.pictures.files import save_picture
+from completesplat.data.captures import import_capture
+from completesplat.data.images.files import save_picture
+from completesplat.data.loading.latent_cache import ArrayWriter
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
-from completesplat.export.pictures import write_png
+from completesplat.export.images import write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.video import write_video
+from completesplat.files import make_folder, write_text
 from completesplat.studies import statistics
 from completesplat.tensors import concatenate
 from completesplat.training import sharding

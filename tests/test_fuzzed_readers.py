@@ -35,18 +35,18 @@ from PIL import Image, ImageCms
 from realestate10k_trees import make_clip, write_chunk_form
 from support import some_gaussians, write_capture
 
+from completesplat.data.captures import import_capture
+from completesplat.data.captures.capture import read_picture
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.importing import import_capture
-from completesplat.data.importing.capture import read_picture
-from completesplat.data.pictures.crop import Square
-from completesplat.data.pictures.exif import ORIENTATION
-from completesplat.data.pictures.files import decode, picture_size, read_depth
-from completesplat.data.pictures.photograph import read_photograph
+from completesplat.data.images.crop import Square
+from completesplat.data.images.exif import ORIENTATION
+from completesplat.data.images.files import decode, picture_size, read_depth
+from completesplat.data.images.photograph import read_photograph
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.validation import read_points
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import read_ply, write_ply
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
 pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")

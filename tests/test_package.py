@@ -8,7 +8,7 @@ import pytest
 import completesplat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 
 
 def test_the_package_offers_the_model_and_its_scenes():

@@ -13,9 +13,9 @@ import pytest
 from support import compose_config
 
 from completesplat.errors import WeightsError
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.parts import CLASSES, PARTS, check_architecture, settings_of
-from completesplat.schema import refused
+from completesplat.settings.schema import refused
 from completesplat.weights import BOX, CONFIG_FILE, LARGEST_TEXT, SUMS_FILE
 
 ENCODER = "autoreconstructor.encoder"
@@ -82,7 +82,7 @@ def trap(tmp_path, monkeypatch):
             },
         ),
         (SCHEDULER, {"_target_": "completesplat.cli.main"}),
-        (SCHEDULER, {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": "FOLDER"}),
+        (SCHEDULER, {"_target_": "completesplat.generator.CompleteSplat.from_pretrained", "path": "FOLDER"}),
         (SCHEDULER, {"_target_": "completesplat.weights.json.loads", "_args_": ["{}"]}),
         (SCHEDULER, {"_target_": "diffusers.DDIMScheduler.from_pretrained", "pretrained_model_name_or_path": "FOLDER"}),
         (SCHEDULER, {"_target_": "diffusers.schedulers.scheduling_ddim.os.system", "command": "touch SPRUNG"}),
@@ -177,7 +177,7 @@ def test_no_memory_is_asked_for_that_the_file_does_not_have(folder):
     change(folder, "denoiser.channels", [1024] * 4)
     program = f"""
         import resource
-        from completesplat.generation import CompleteSplat
+        from completesplat.generator import CompleteSplat
         from completesplat.weights import BOX
         CompleteSplat.from_pretrained(BOX / "toy_objects")
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

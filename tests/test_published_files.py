@@ -8,8 +8,8 @@ import torch
 import yaml
 from published_weights import config, write_published
 
+from completesplat.baselines.splatter_image.files import find, is_published, read_tensors
 from completesplat.errors import WeightsError
-from completesplat.weights.splatter_image import find, is_published, read_tensors
 
 
 def test_a_file_a_folder_and_a_name_of_the_hub_are_known(tmp_path, tiny_weights):

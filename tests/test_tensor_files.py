@@ -12,10 +12,10 @@ import pytest
 import torch
 from fuzzing import CLEAR, bounded
 
+from completesplat.baselines.splatter_image.files import STATE, read_tensors
 from completesplat.data.realestate10k.chunks import read_chunk
 from completesplat.errors import CompleteSplatError
 from completesplat.weights.checkpoint_reading import read_checkpoint
-from completesplat.weights.splatter_image import STATE, read_tensors
 
 pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")
 READERS: dict[str, Callable[[Path], Any]] = {

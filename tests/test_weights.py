@@ -7,7 +7,7 @@ import pytest
 
 from completesplat import weights
 from completesplat.errors import WeightsError
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, in_the_box, weights_folder, write_sums
 
 

@@ -7,10 +7,10 @@ import torch
 from support import strict_json
 
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.metrics.images import psnr
 from completesplat.rasterizers.tiled import TiledRasterizer
-from completesplat.training.scene_module import copy_reference, repeat_image
+from completesplat.training.stage import copy_reference, repeat_image
 from completesplat.weights import BOX, SUMS_FILE, in_the_box, weights_folder
 
 NAME = "toy_objects"

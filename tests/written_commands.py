@@ -10,7 +10,7 @@ from support import compose_config
 
 from completesplat.cli import VERBS
 from completesplat.commands import conf_folder
-from completesplat.commands.arguments import SWEEP, for_hydra
+from completesplat.settings.arguments import SWEEP, for_hydra
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

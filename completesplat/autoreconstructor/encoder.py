@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Posterior, from_moments
-from completesplat.schema import Few, Range, Width, Widths
+from completesplat.settings.schema import Few, Range, Width, Widths
 
 
 def recompute(block: nn.Module, *inputs: Any) -> Any:

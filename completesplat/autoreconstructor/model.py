@@ -11,7 +11,7 @@ from completesplat.autoreconstructor.posterior import Posterior, from_moments
 from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.scene import Views
-from completesplat.schema import Share
+from completesplat.settings.schema import Share
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import TensorDataclass
 

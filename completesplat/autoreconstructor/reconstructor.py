@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
-from completesplat.schema import Few, Levels, Width, Widths
+from completesplat.settings.schema import Few, Levels, Width, Widths
 from completesplat.splatter_image import Parameterization, SplatterImage, from_channels, initialize_head
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import vae_encoder
 from completesplat.geometry.cameras import pixel_centers, project, rays_through
 from completesplat.scene import Views
-from completesplat.schema import Few, Range, Width, Widths
+from completesplat.settings.schema import Few, Range, Width, Widths
 
 
 class PlaneSweep(nn.Module):

@@ -15,7 +15,7 @@ from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pixel_centers, unproject
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.scene import Views
-from completesplat.schema import Positive, Share
+from completesplat.settings.schema import Positive, Share
 from completesplat.splatter_image import SH_C0
 
 Render = Callable[[Gaussians, Cameras], Tensor]

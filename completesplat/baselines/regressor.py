@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import recompute
 from completesplat.autoreconstructor.model import Reconstruction
-from completesplat.schema import Few, Levels, Share, Width, Widths
+from completesplat.settings.schema import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 

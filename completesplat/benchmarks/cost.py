@@ -9,7 +9,7 @@ from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, table
-from completesplat.schema import Entries, Positive
+from completesplat.settings.schema import Entries, Positive
 
 DAY_MS = 24 * 3600 * 1000
 

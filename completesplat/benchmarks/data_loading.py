@@ -21,7 +21,7 @@ from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.errors import DataError
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, Table, table
-from completesplat.schema import Entries, Natural, OneOf, Positive, Range
+from completesplat.settings.schema import Entries, Natural, OneOf, Positive, Range
 
 
 class Opening(TypedDict):

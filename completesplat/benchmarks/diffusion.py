@@ -25,13 +25,13 @@ from completesplat.data.packed.writing import prepare
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
-from completesplat.schema import Positive, Range
+from completesplat.settings.schema import Positive, Range
 from completesplat.training.encoding import encode_training_set
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.stage import Stage
 
 WARM_UP = 2
 
@@ -190,7 +190,7 @@ class Training:
     `precision` is in Lightning's notation: "bf16-mixed" computes the networks in bfloat16.
     """
 
-    def __init__(self, module: SceneModule, precision: str) -> None:
+    def __init__(self, module: Stage, precision: str) -> None:
         self.module: Any = module.train()
         self.precision = precision
         for logs in ("log_loss", "log_step"):  # there is no trainer to log with

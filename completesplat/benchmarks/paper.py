@@ -26,10 +26,10 @@ from completesplat.geometry.trajectories import orbit
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.scene import SceneBatch
-from completesplat.schema import Positive
+from completesplat.settings.schema import Positive
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
     return orbit(camera, pivot, up, VIEWS).map(lambda tensor: tensor[None])
 
 
-def _step(module: SceneModule, scenes: SceneBatch, precision: str) -> Callable[[], None]:
+def _step(module: Stage, scenes: SceneBatch, precision: str) -> Callable[[], None]:
     @cache
     def training() -> Training:  # made late, because its optimizer needs memory
         return Training(module, precision)

@@ -13,7 +13,6 @@ from hydra.utils import instantiate
 from lightning import LightningModule
 from rich.console import Console
 
-from completesplat.atomic import atomic_path
 from completesplat.benchmarks.agreement import agreement_rows
 from completesplat.benchmarks.printing import device_of, print_results
 from completesplat.benchmarks.training_step import share
@@ -29,12 +28,13 @@ from completesplat.benchmarks.workloads import (
 from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
+from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
-from completesplat.schema import Positive
+from completesplat.settings.schema import Positive
 
 logger = logging.getLogger(__name__)
 

@@ -143,7 +143,7 @@ def _step(name: str, **figures: float) -> dict[str, Any]:
 
 
 # The functions that decode image files of a published and of a packed data set.
-DECODERS = ("completesplat.data.pictures.crop.decode", "completesplat.data.packed.rows.decode")
+DECODERS = ("completesplat.data.images.crop.decode", "completesplat.data.packed.rows.decode")
 MEBIBYTE = 2**20
 
 Function = Callable[..., Any]

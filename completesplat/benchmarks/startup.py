@@ -22,7 +22,7 @@ from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
-from completesplat.schema import Positive
+from completesplat.settings.schema import Positive
 
 TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
 OTHER = ", other version"

@@ -17,12 +17,13 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
-from completesplat.atomic import file_refusal
-from completesplat.commands import help, jobs
-from completesplat.commands.arguments import SWEEP, behind_dashes, for_hydra
-from completesplat.commands.settings import misspelt
+from completesplat.commands import jobs
 from completesplat.errors import CompleteSplatError
-from completesplat.options import conf_folder, gsplat_constants
+from completesplat.files import file_refusal
+from completesplat.settings import help
+from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
+from completesplat.settings.checks import misspelt
+from completesplat.settings.options import conf_folder, gsplat_constants
 from completesplat.signals import end_with, ended_by_signals
 
 RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"

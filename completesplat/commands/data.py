@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
-from completesplat.schema import Entries, Positive, Range
+from completesplat.files import write_text
+from completesplat.settings.schema import Entries, Positive, Range
 
 logger = logging.getLogger(__name__)
 

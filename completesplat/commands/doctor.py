@@ -21,7 +21,7 @@ from rich.text import Text
 
 from completesplat import __version__
 from completesplat.commands.protocol import write_json
-from completesplat.options import conf_folder
+from completesplat.settings.options import conf_folder
 
 ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {
@@ -81,7 +81,7 @@ def check_extras() -> Iterator[Finding]:
 
 def check_imports() -> Iterator[Finding]:
     """Import the modules that compute and write a prediction; their exceptions are not caught here."""
-    for module in ("completesplat.generation", "completesplat.export.prediction"):
+    for module in ("completesplat.generator", "completesplat.export.prediction"):
         import_module(module)
     yield Finding("networks, files", "yes", "all that completing a photograph imports")
 

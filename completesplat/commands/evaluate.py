@@ -21,7 +21,7 @@ from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_modes, log_shown
-from completesplat.schema import Natural, Positive, Range
+from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.loggers import finished
 from completesplat.training.stopping import stopped_together
 

@@ -12,18 +12,19 @@ from lightning.pytorch.callbacks import WeightAveraging
 from omegaconf import OmegaConf
 from torch import nn
 
-from completesplat.baselines.published import PublishedSplatterImage
+from completesplat.baselines.splatter_image.files import write_trained
+from completesplat.baselines.splatter_image.model import PublishedSplatterImage
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
-from completesplat.commands.settings import check_image_size, check_optimizer, check_verb
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.generation import OneAnswer
+from completesplat.generator import OneAnswer
 from completesplat.opening import without_training
 from completesplat.results.tables import Table, evaluation_table, show, table
 from completesplat.results.wandb import begin, log_shown
+from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import finished
@@ -31,7 +32,6 @@ from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
-from completesplat.weights.splatter_image import write_trained
 
 logger = logging.getLogger(__name__)
 

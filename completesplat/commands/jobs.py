@@ -29,13 +29,13 @@ from hydra.utils import get_method, instantiate
 from omegaconf import OmegaConf
 
 from completesplat import __version__
-from completesplat.atomic import atomic_path, writing
 from completesplat.commands.protocol import git_commit, write_json
-from completesplat.commands.settings import check_verb
 from completesplat.errors import CompleteSplatError
-from completesplat.options import conf_folder, meant
+from completesplat.files import atomic_path, writing
 from completesplat.results.runs import typed
-from completesplat.schema import check_settings
+from completesplat.settings.checks import check_verb
+from completesplat.settings.options import conf_folder, meant
+from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
 
 LONGEST_NAME = 120

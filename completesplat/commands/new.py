@@ -6,9 +6,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError
-from completesplat.options import conf_folder
+from completesplat.files import write_text
+from completesplat.settings.options import conf_folder
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 KINDS = ("loss", "rasterizer", "dataset", "ablation", "experiment")

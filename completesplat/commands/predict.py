@@ -17,19 +17,19 @@ from rich.markup import escape
 from rich.progress import Progress
 from torch import Tensor
 
-from completesplat.commands.settings import REMOVE
 from completesplat.commands.trained import open_generator
-from completesplat.data.pictures.photograph import Photograph, outside_of_box, outside_of_mask
+from completesplat.data.images.photograph import Photograph, outside_of_box, outside_of_mask
 from completesplat.diffusion.guidance import allowed_skip_weight
 from completesplat.errors import CompleteSplatError, DiskError
 from completesplat.export.formats import CONVERTED, FORMATS
 from completesplat.export.prediction import Wanted, write_prediction
 from completesplat.export.splat_transform import find_splat_transform
-from completesplat.generation import CompleteSplat
+from completesplat.files import folder_names, printable, safe_name
+from completesplat.generator import CompleteSplat
 from completesplat.geometry.trajectories import PATHS
-from completesplat.names import folder_names, printable, safe_name
 from completesplat.rasterizers import Rasterizer
 from completesplat.scene_model import SceneModel
+from completesplat.settings.checks import REMOVE
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".avif", ".jp2", ".bmp", ".gif", ".ppm", ".pgm", ".pnm")
 FAR = 1.5
@@ -175,7 +175,7 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
         CompleteSplatError: one image alone, or a mask, box, field of view or removed background besides the cameras.
         DataError, WeightsError: as `read_photographs`, `CompleteSplat.reconstruct`.
     """
-    from completesplat.data.importing.transforms_json import read_photographs
+    from completesplat.data.captures.transforms_json import read_photographs
 
     if len(pictures) < 2:
         raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from completesplat import __version__
-from completesplat.atomic import write_text
+from completesplat.files import write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import origin
 

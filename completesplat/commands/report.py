@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, TypedDict
 
-from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError
+from completesplat.files import atomic_path
 from completesplat.results.html_page import page
-from completesplat.results.published import tables as published_tables
+from completesplat.results.paper_figures import tables as published_tables
 from completesplat.results.runs import find, origin
 from completesplat.results.sweeps import show_summary, write_summary
 from completesplat.results.tables import show, write_tables
-from completesplat.schema import Positive, Range
+from completesplat.settings.schema import Positive, Range
 
 logger = logging.getLogger(__name__)
 

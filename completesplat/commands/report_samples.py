@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, Column, table
 from completesplat.scene import SceneBatch
-from completesplat.schema import Entries, Positive, Range
+from completesplat.settings.schema import Entries, Positive, Range
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study

@@ -10,14 +10,14 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from completesplat.baselines.splatter_image.files import find, is_published
 from completesplat.commands.protocol import checkpoint_facts
-from completesplat.commands.settings import check_image_size, check_optimizer, check_parts
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.opening import OF_A_RUN, read_run_config, without_training
 from completesplat.parts import read_architecture
-from completesplat.schema import check_value
+from completesplat.settings.checks import check_image_size, check_optimizer, check_parts
+from completesplat.settings.schema import check_value
 from completesplat.weights import WEIGHTS_FILE, in_the_box, sha256_of, weights_folder
-from completesplat.weights.splatter_image import find, is_published
 
 WITHOUT_EFFECT = "samples, skip_weight, guidance_weight, steps and seed have no effect"
 
@@ -98,7 +98,7 @@ class Trained:
                 "loss": {"_target_": "completesplat.losses.WeightedSum", "terms": {"mse": mse}},
             }
         else:
-            loaded = {"_target_": "completesplat.generation.CompleteSplat.from_pretrained", "path": folder}
+            loaded = {"_target_": "completesplat.generator.CompleteSplat.from_pretrained", "path": folder}
             stage = {"_target_": "completesplat.training.latent_diffusion.LatentDiffusion", "completesplat": loaded}
         model = {
             **stage,
@@ -121,7 +121,7 @@ def _as_published(config: Any, weights: str) -> Any:
     """
     known = find(weights).data
     config.model.rasterizer = {
-        "_target_": "completesplat.rasterizers.directional.DirectionalRasterizer",
+        "_target_": "completesplat.baselines.splatter_image.directional.DirectionalRasterizer",
         "rasterizer": config.model.rasterizer,
     }
     config.model.background = config.data.background = float(known["white_background"])
@@ -135,7 +135,7 @@ def _as_published(config: Any, weights: str) -> Any:
 
 def network_of(weights: str) -> Any:
     """Return the network of weights that give one scene for an image and draw no samples."""
-    from completesplat.generation import CompleteSplat
+    from completesplat.generator import CompleteSplat
 
     return CompleteSplat.from_pretrained(weights).reconstructing
 
@@ -149,7 +149,7 @@ def open_generator(config: Any) -> Any:
         WeightsError: as `from_pretrained`.
         CompleteSplatError: a sampler is given for a model that draws no samples.
     """
-    from completesplat.generation import CompleteSplat
+    from completesplat.generator import CompleteSplat
     from completesplat.published import PublishedGenerator
 
     if config.weights in in_the_box():

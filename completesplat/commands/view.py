@@ -8,9 +8,9 @@ from signal import SIGINT
 from typing import Any
 
 from completesplat.commands.jobs import at_work, importing
-from completesplat.commands.settings import REMOVE, check_parts
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.names import printable
+from completesplat.files import printable
+from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
 from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, WEIGHTS_FILE
 
@@ -97,7 +97,7 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
         from completesplat.viewer.page import Page, Saver
         from completesplat.viewer.panel import SLIDERS
         from completesplat.viewer.sample import read_scene
-        from completesplat.viewer.stage import Stage
+        from completesplat.viewer.splat_view import SplatView
 
         check_parts(config)
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -115,7 +115,7 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
     if model is not None and config.image is not None:
         photograph = model.read(Path(config.image), config.fov, remove)
     cameras = None if config.get("data") is None else data_cameras(config.data)
-    stage = Stage(server, up, cameras)
+    stage = SplatView(server, up, cameras)
     stage.show(samples)
     rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
     saver = Saver(out, stage, rasterizer, config.frames, background)

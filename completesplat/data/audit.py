@@ -12,12 +12,11 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from completesplat.atomic import write_text
 from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
 from completesplat.errors import DataError
-from completesplat.names import printable
+from completesplat.files import printable, write_text
 
 FEWEST_FRAMES = 2
 LARGEST_BATCH = 16

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from completesplat.diffusion.guidance import Features, Latents
-from completesplat.schema import Few, Levels, Width, Widths
+from completesplat.settings.schema import Few, Levels, Width, Widths
 
 
 class Sizes(TypedDict, total=False):

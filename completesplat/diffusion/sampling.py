@@ -15,7 +15,7 @@ from torch import Tensor
 from completesplat.diffusion.guidance import Denoise, Features, Latents, guided_noise
 from completesplat.diffusion.objective import clean_estimate, is_flow, signal_and_noise
 from completesplat.errors import CompleteSplatError
-from completesplat.schema import Range
+from completesplat.settings.schema import Range
 
 Part = TypeVar("Part")
 logger = logging.getLogger(__name__)

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.atomic import write_bytes
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned, transparent
 from completesplat.export.gltf import write_glb
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, write_page
+from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 

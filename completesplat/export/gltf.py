@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat import __version__
-from completesplat.atomic import atomic_path
 from completesplat.errors import CompleteSplatError
 from completesplat.export.cleaning import cleaned
+from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.splatter_image import SH_C0

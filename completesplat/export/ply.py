@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import write_bytes
 from completesplat.errors import PlyError
 from completesplat.export.cleaning import cleaned
+from completesplat.files import write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.ply_files import header, read_vertices

@@ -11,10 +11,9 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import make_folder, write_text
 from completesplat.export.cleaning import beyond_gamut, cleaned, transparent, with_screen_space_dilation
 from completesplat.export.formats import write_formats
-from completesplat.export.pictures import (
+from completesplat.export.images import (
     SheetCell,
     color_depth,
     color_normals,
@@ -26,6 +25,7 @@ from completesplat.export.pictures import (
 from completesplat.export.ply import write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform
 from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.surfaces import normals_from_depth

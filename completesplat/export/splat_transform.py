@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, write_bytes
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
+from completesplat.files import atomic_path, write_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 

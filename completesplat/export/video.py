@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
-from completesplat.export.pictures import enlarge, to_bytes
+from completesplat.export.images import enlarge, to_bytes
+from completesplat.files import atomic_path
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.trajectories import orbit

@@ -12,7 +12,7 @@ from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.scene import Views
-from completesplat.schema import Natural, Range
+from completesplat.settings.schema import Natural, Range
 from completesplat.tensors import TensorDataclass
 
 

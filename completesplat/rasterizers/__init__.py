@@ -14,7 +14,7 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.options import gsplat_constants
+from completesplat.settings.options import gsplat_constants
 from completesplat.tensors import TensorDataclass
 
 

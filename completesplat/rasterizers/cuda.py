@@ -13,9 +13,9 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
-from completesplat.options import gsplat_constants
 from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
+from completesplat.settings.options import gsplat_constants
 
 DEVICE = "cuda"
 WARP = 32

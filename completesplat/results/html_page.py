@@ -14,7 +14,7 @@ from PIL import Image
 from completesplat import __version__
 from completesplat.errors import CompleteSplatError
 from completesplat.results.own import mode_tables, own_tables
-from completesplat.results.published import tables as compared
+from completesplat.results.paper_figures import tables as compared
 from completesplat.results.runs import CONFIG, MODES, ROWS, SCENE, SCORES, RunTree, find, mapping_or_empty, origin
 from completesplat.results.scores import entries
 from completesplat.results.tables import BEST, SECOND, Cell, Heading, Table, TableRow

@@ -12,7 +12,7 @@ from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.files import atomic_path, write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import SEED, Job, collect, typed
 from completesplat.results.tables import (

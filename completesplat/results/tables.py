@@ -7,7 +7,7 @@ from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import Any
 
-from completesplat.atomic import atomic_path, write_text
+from completesplat.files import atomic_path, write_text
 
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
 FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}

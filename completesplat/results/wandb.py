@@ -12,18 +12,18 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import make_folder
-from completesplat.export.pictures import color_depth, image_grid, surface_depth
+from completesplat.export.images import color_depth, image_grid, surface_depth
 from completesplat.export.prediction import seen_center
 from completesplat.export.video import orbit_views, write_video
+from completesplat.files import make_folder
 from completesplat.metrics.scoring import BEST, MODEL, Evaluation
-from completesplat.results.published import tables
+from completesplat.results.paper_figures import tables
 from completesplat.results.runs import find
 from completesplat.results.tables import Table, by_name
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import wandb_runs
-from completesplat.training.sample_pictures import evenly_spaced
-from completesplat.training.scene_module import SceneModule, ScoredScene
+from completesplat.training.sample_images import evenly_spaced
+from completesplat.training.stage import ScoredScene, Stage
 
 VIEWS, FRAMES = 4, 48
 READABLE_SIDE = 128
@@ -36,7 +36,7 @@ class SceneTable:
     the turntables are also written to `folder/00.mp4` and so on.
     """
 
-    def __init__(self, module: SceneModule, folder: Path, most: int) -> None:
+    def __init__(self, module: Stage, folder: Path, most: int) -> None:
         self.module, self.folder, self.most = module, folder, most
         self.rows: list[dict[str, Any]] = []
 
@@ -97,7 +97,7 @@ def scores_of(evaluation: Evaluation, name: str) -> dict[str, float]:
     return {"_".join(key): x for key, x in model.items()} | {f"{BEST}/{'_'.join(key)}": x for key, x in best.items()}
 
 
-def begin(module: SceneModule, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
+def begin(module: Stage, trainer: Trainer, config: Any, out: Path) -> SceneTable | None:
     """Begin W&B's run and collect a test's scenes for it; return None if W&B is not among the loggers."""
     runs = wandb_runs(trainer.loggers)
     if not runs or not trainer.is_global_zero:

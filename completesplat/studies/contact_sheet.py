@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.errors import DataError
-from completesplat.export.pictures import GAP, INK, LINE, MARGIN, PAPER, write_png
+from completesplat.export.images import GAP, INK, LINE, MARGIN, PAPER, write_png
 from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
 
 CELL, TEXT, NAME, TITLE = 216, 13, 15, 18

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from completesplat.atomic import atomic_path
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
+from completesplat.files import atomic_path
 
 
 @contextmanager

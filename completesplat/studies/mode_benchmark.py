@@ -13,7 +13,7 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.mode_coverage import (
     EDGES,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.errors import DataError
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering

@@ -17,7 +17,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError
-from completesplat.schema import Positive, Share
+from completesplat.settings.schema import Positive, Share
 from completesplat.training.sharding import own_part, whole
 
 BAD_STEPS = "train/bad_steps"

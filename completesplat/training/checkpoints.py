@@ -17,10 +17,10 @@ from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, make_folder
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError, WeightsError
-from completesplat.schema import Positive
+from completesplat.files import atomic_path, make_folder
+from completesplat.settings.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
 from completesplat.training.sharding import own_part, remove_unused_shards

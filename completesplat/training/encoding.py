@@ -18,7 +18,9 @@ from torch import nn
 
 from completesplat import __version__
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
-from completesplat.data.latent_cache import (
+from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.distributed import gathered, is_first, processes
+from completesplat.data.loading.latent_cache import (
     CHECKSUMS,
     Array,
     ArrayWriter,
@@ -30,8 +32,6 @@ from completesplat.data.latent_cache import (
     row_checksums,
     write_manifest,
 )
-from completesplat.data.loading.data_module import SceneDataModule
-from completesplat.data.loading.distributed import gathered, is_first, processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.source import PackedSource

@@ -16,22 +16,22 @@ from lightning.pytorch.loggers import WandbLogger
 from PIL import Image
 from torch import Tensor
 
-from completesplat.atomic import make_folder, write_text
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.export.cleaning import storable, with_screen_space_dilation
-from completesplat.export.pictures import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.images import SheetCell, color_depth, picture_sheet, write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
+from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
-from completesplat.schema import Natural, Positive
+from completesplat.settings.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
-from completesplat.training.scene_module import SceneModule
 from completesplat.training.sharding import whole_networks
+from completesplat.training.stage import Stage
 
 ERROR_GAIN = 4
 PERCENTILES = (10, 50, 90)
@@ -55,7 +55,7 @@ class DrawsFixedScenes(Callback):
         self.views = views
 
     @abstractmethod
-    def draw(self, trainer: Trainer, module: SceneModule, scenes: list[SceneBatch]) -> None:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
         """Write and log what the model makes of the scenes [view], which are on the CPU."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -76,7 +76,7 @@ class DrawsFixedScenes(Callback):
     def _draw_once(self, trainer: Trainer, module: LightningModule) -> None:
         if trainer.global_step == self.drawn:
             return
-        assert isinstance(module, SceneModule)
+        assert isinstance(module, Stage)
         self.drawn = trainer.global_step
         with untouched(trainer, module):
             if not trainer.is_global_zero:
@@ -134,7 +134,7 @@ class Pictures(DrawsFixedScenes):
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
         super().__init__(folder, every_n_steps, scenes, views=1)
 
-    def draw(self, trainer: Trainer, module: SceneModule, scenes: list[SceneBatch]) -> None:
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
@@ -174,7 +174,7 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
 
 
-def up_of(module: SceneModule) -> Float[Tensor, "3"]:
+def up_of(module: Stage) -> Float[Tensor, "3"]:
     """Return the up direction in the reference's frame: as measured on the training set, else the image's."""
     if isinstance(module, LatentDiffusion):
         return module.completesplat.up

@@ -8,24 +8,24 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache import LatentCache
 from completesplat.data.loading.distributed import gathered
+from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.diffusion.guidance import allowed_skip_weight, check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
-from completesplat.schema import Positive, Share
+from completesplat.settings.schema import Positive, Share
 from completesplat.training.encoding import check_cache
-from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights.checkpoint_reading import load_part
 
 LOSS_BUCKETS = 4
 """Equal ranges of timesteps, for each of which the loss is logged."""
 
 
-class LatentDiffusion(SceneModule):
+class LatentDiffusion(Stage):
     """Train the denoiser and a learned conditioning to predict the noise in latents (paper, Eqs. 2 and 3).
 
     Batches are scenes, or scenes that were encoded beforehand; both train the same.
@@ -41,7 +41,7 @@ class LatentDiffusion(SceneModule):
         noise_draws: times that a latent is taken in a step, each time with a noise and a noise level of its own: more
             steps of the denoiser for one of the encoders.
         channels_last, compile: of the denoiser, see `prepare_network`.
-        **rendering_and_optimization: see `SceneModule`.
+        **rendering_and_optimization: see `Stage`.
 
     Raises:
         CompleteSplatError: a weight of the samples outside of [0, 1].
@@ -192,7 +192,7 @@ class LatentDiffusion(SceneModule):
                 logger.log_metrics(values, step=self.global_step)
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
-        """See `SceneModule`: what is drawn for an image depends on no other image."""
+        """See `Stage`: what is drawn for an image depends on no other image."""
         return self.reconstruct(scenes, seeds, samples=samples)
 
     def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:

@@ -19,8 +19,8 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from lightning.pytorch.utilities import rank_zero_only
 
-from completesplat.atomic import write_text, writing
 from completesplat.errors import CompleteSplatError
+from completesplat.files import write_text, writing
 
 MODES = ("online", "offline", "disabled")
 ANSWER_SECONDS, START_SECONDS = 4, 6

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from completesplat.schema import Natural, Positive, Range, Share
+from completesplat.settings.schema import Natural, Positive, Range, Share
 
 
 def muon(

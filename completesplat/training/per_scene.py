@@ -11,17 +11,17 @@ from completesplat.baselines.preoptimized import project_to_splatter_image
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import write_fitted_scene
+from completesplat.files import safe_name
 from completesplat.gaussians import Gaussians
 from completesplat.losses import WeightedSum
-from completesplat.names import safe_name
 from completesplat.scene import SceneBatch
 from completesplat.splatter_image import Parameterization, SplatterImage
-from completesplat.training.scene_module import SceneModule, ScoredScene
+from completesplat.training.stage import ScoredScene, Stage
 
 logger = logging.getLogger(__name__)
 
 
-class PerScene(SceneModule):
+class PerScene(Stage):
     """An upper bound, not a competitor: it is fitted to all views, so it has seen those that it is scored on.
 
     It has nothing to train; all its work is done in evaluation. `loss` is that of the fit.
@@ -98,7 +98,7 @@ class Preoptimized(PerScene):
         self._empty = {}
 
     def test_results(self) -> dict[str, Any]:
-        """Return those of `SceneModule`, and `empty_pixels`, the mean over the scenes of all processes."""
+        """Return those of `Stage`, and `empty_pixels`, the mean over the scenes of all processes."""
         results = super().test_results()
         empty = {name: share for shares in gathered(self._empty) for name, share in shares.items()}
         results["model"]["empty_pixels"] = sum(empty.values()) / max(len(empty), 1)

@@ -15,15 +15,15 @@ from rich.progress import track
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from completesplat.atomic import atomic_path, make_folder
 from completesplat.baselines.sparse_vae import SparseVAE
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.errors import CompleteSplatError
+from completesplat.files import atomic_path, make_folder
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.scene import SceneBatch
-from completesplat.schema import Range
+from completesplat.settings.schema import Range
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import stack
 from completesplat.training.per_scene import Preoptimized

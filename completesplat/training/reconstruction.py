@@ -13,12 +13,12 @@ from completesplat.gaussians import Gaussians
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
-from completesplat.training.scene_module import SceneModule, prepare_network
+from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
 
 
-class ReconstructionModule(SceneModule):
+class ReconstructionModule(Stage):
     """Reconstruct, render the reference and all targets, compare (paper, Eq. 1).
 
     Args:
@@ -28,7 +28,7 @@ class ReconstructionModule(SceneModule):
         masked: the model sees the visible part of the reference picture only (`data.box_masks`), and is to complete it;
             it is compared with whole pictures. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
-        **rendering_and_optimization: see `SceneModule`.
+        **rendering_and_optimization: see `Stage`.
     """
 
     networks = ("model",)

@@ -20,9 +20,9 @@ from torch.distributed.device_mesh import init_device_mesh
 from torch.distributed.fsdp import FSDPModule, fully_shard
 from torch.distributed.tensor import DTensor, distribute_tensor
 
-from completesplat.atomic import writing
 from completesplat.errors import CompleteSplatError, DiskError
-from completesplat.training.scene_module import SceneModule
+from completesplat.files import writing
+from completesplat.training.stage import Stage
 from completesplat.weights import sha256_of
 from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUFFIX, shards_of
 
@@ -30,7 +30,7 @@ from completesplat.weights.checkpoint_reading import DIVIDED, SHARDS, SHARDS_SUF
 class FullyShardedStrategy(DDPStrategy):
     """DDP strategy that also divides the trained networks: each process keeps a share and trains on a share of a batch.
 
-    Networks are whole while they compute. Each of `SceneModule.networks` is one unit of torch's `fully_shard`, and so
+    Networks are whole while they compute. Each of `Stage.networks` is one unit of torch's `fully_shard`, and so
     is its average. Outside of training everything is as with DDP, because processes that test have different numbers
     of scenes, and cannot wait for each other in every layer.
 
@@ -148,7 +148,7 @@ def _averages(module: LightningModule) -> list[nn.Module]:
     return [average.module for average in averages]
 
 
-def _refuse_undivided(module: SceneModule) -> None:
+def _refuse_undivided(module: Stage) -> None:
     """Raise CompleteSplatError if a trained parameter is in none of the networks, or is not contiguous."""
     inside = {parameter for place in module.networks for parameter in module.get_submodule(place).parameters()}
     for name, parameter in module.named_parameters():

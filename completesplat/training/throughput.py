@@ -9,7 +9,7 @@ from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
 from completesplat.data.loading.distributed import mean_of_processes
-from completesplat.training.scene_module import now
+from completesplat.training.stage import now
 
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
 SAVING = "save_checkpoint"

@@ -9,11 +9,11 @@ from typing import Any
 
 import viser
 
-from completesplat.data.pictures.photograph import Photograph
+from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError, ImageError
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 from completesplat.viewer.access import told
 from completesplat.viewer.page import Page

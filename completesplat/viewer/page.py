@@ -10,18 +10,18 @@ from typing import Any
 import torch
 import viser
 
-from completesplat.atomic import write_text
 from completesplat.errors import CompleteSplatError
 from completesplat.export.formats import CONVERTED, FORMATS, write_formats
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import PageView, find_splat_transform
 from completesplat.export.video import orbit_views, render_views, write_video
+from completesplat.files import write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer, stop_server, with_head
 from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Picture, add_looking, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample
-from completesplat.viewer.stage import Stage
+from completesplat.viewer.splat_view import SplatView
 
 Job = Callable[[], None]
 
@@ -89,7 +89,7 @@ class Saver:
     """
 
     def __init__(
-        self, folder: Path, stage: Stage, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
+        self, folder: Path, stage: SplatView, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
     ) -> None:
         self.folder, self.stage, self.frames, self.background = folder, stage, frames, background
         self.rasterizer = cache(make_rasterizer)
@@ -145,7 +145,7 @@ class Saver:
 class Page:
     """Controls and scene of one server, with switches for `layers`. Slow work is done by the worker."""
 
-    def __init__(self, server: GuardedServer, stage: Stage, saver: Saver, layers: int) -> None:
+    def __init__(self, server: GuardedServer, stage: SplatView, saver: Saver, layers: int) -> None:
         self.server, self.stage, self.saver = server, stage, saver
         self.worker = Worker(self.tell)
         self.status = server.gui.add_markdown("", order=0)

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from completesplat.diffusion.sampling import Sampler
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
 
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99

@@ -18,8 +18,8 @@ import torch
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import Wanted, write_prediction
-from completesplat.generation import CompleteSplat
-from completesplat.names import printable
+from completesplat.files import printable
+from completesplat.generator import CompleteSplat
 from completesplat.rasterizers import Rasterizer
 from completesplat.rasterizers.selection import auto
 from completesplat.scene_model import SceneModel
@@ -57,11 +57,11 @@ def write_offline(path: Path, sample: Sample, up: Sequence[float]) -> None:
     """Write a sample as the viewer's offline page through a new server, because a used one keeps earlier scenes."""
     from completesplat.viewer.access import start_server, stop_server
     from completesplat.viewer.page import write_page
-    from completesplat.viewer.stage import Stage
+    from completesplat.viewer.splat_view import SplatView
 
     server = start_server(0)
     try:
-        Stage(server, up).show([sample])
+        SplatView(server, up).show([sample])
         write_page(server, path)
     finally:
         stop_server(server)

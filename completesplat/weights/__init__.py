@@ -10,9 +10,8 @@ import re
 from pathlib import Path
 from urllib.parse import urlparse
 
-from completesplat.atomic import write_text
 from completesplat.errors import WeightsError
-from completesplat.names import printable
+from completesplat.files import printable, write_text
 
 BOX = Path(__file__).parent
 CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE = "config.json", "model.safetensors", "SHA256SUMS"

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from completesplat.errors import TensorFileError, WeightsError
-from completesplat.schema import shown
+from completesplat.settings.schema import shown
 from completesplat.weights import sha256_of
 
 END, END_BYTES = b"PK\5\6", 22

@@ -11,7 +11,7 @@ from support import compose_config, tiny_generator
 from torch import Tensor, nn
 
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.scene import SceneBatch
 from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.weights import SUMS_FILE

@@ -7,7 +7,7 @@ from pretrained_vaes import BIN, SAFETENSORS, build, rewrite, stable_diffusion_v
 from safetensors.torch import load_file
 from support import compose_config, tiny_generator
 
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 

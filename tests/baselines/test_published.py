@@ -11,11 +11,11 @@ import pytest
 import torch
 from published_weights import LARGE, shapes, write_published
 
-from completesplat.baselines.published import PublishedSplatterImage
-from completesplat.baselines.song_unet import SongUNet
+from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
+from completesplat.baselines.splatter_image.model import PublishedSplatterImage
+from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.errors import WeightsError
 from completesplat.geometry.cameras import Cameras, pinhole
-from completesplat.rasterizers.directional import DirectionalRasterizer
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 PICKS = [0, 37, 200]

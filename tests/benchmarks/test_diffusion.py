@@ -26,7 +26,7 @@ from completesplat.benchmarks.diffusion import (
     measured,
 )
 from completesplat.errors import CompleteSplatError
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.scene import CachedScene, SceneBatch
 
 CPU = torch.device("cpu")
@@ -221,7 +221,7 @@ def test_both_ways_load_a_batch_for_each_step_and_pictures_only_once(toy_root, t
     given = []
     monkeypatch.setattr(Training, "step", lambda self, batch: given.append(batch))
     comparison = cached_vs_on_the_fly(training, data, tmp_path / "latents")
-    monkeypatch.setattr("completesplat.data.pictures.crop.decode", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("completesplat.data.images.crop.decode", lambda *_: pytest.fail("decoded again"))
     for _ in range(5):
         comparison.a[1]()
         comparison.b[1]()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import LIMIT, SMALL, refused, strict_json
 
-from completesplat.data.latent_cache import LatentCache
+from completesplat.data.loading.latent_cache import LatentCache
 
 
 def test_a_run_is_encoded_as_asked_and_trained_from(command, pipeline, packed_toys, tmp_path):

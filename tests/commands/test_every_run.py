@@ -18,7 +18,7 @@ from completesplat.commands.trained import Trained
 from completesplat.commands.view import settings_of
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
-from completesplat.generation import CompleteSplat, OneAnswer
+from completesplat.generator import CompleteSplat, OneAnswer
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
 FEW = ["frames=4", "video=[]"]

@@ -10,8 +10,8 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 from written_commands import ROOT
 
-from completesplat.commands.arguments import split_flags
 from completesplat.commands.jobs import composed
+from completesplat.settings.arguments import split_flags
 
 MINE = """
 from torch import nn

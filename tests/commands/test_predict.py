@@ -12,9 +12,9 @@ from plyfile import PlyData
 from support import compose_config, strict_json
 
 from completesplat.commands.predict import visible_part
-from completesplat.commands.settings import Predict
 from completesplat.errors import CompleteSplatError
-from completesplat.schema import check_settings
+from completesplat.settings.checks import Predict
+from completesplat.settings.schema import check_settings
 
 FEW = ["samples=2", "frames=4", "steps=2"]
 UNNEEDED = ["kornia", "lightning", "matplotlib", "pandas", "torchmetrics", "viser", "wandb"]

@@ -18,11 +18,11 @@ from safetensors.torch import load_file, save_file
 from support import compose_config, refused, some_gaussians, strict_json
 
 from completesplat.commands.predict import find_pictures, run, unusual_field_of_view
-from completesplat.data.pictures.photograph import Photograph
+from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
+from completesplat.files import folder_names
 from completesplat.gaussians import Gaussians, concatenate
-from completesplat.generation import CompleteSplat
-from completesplat.names import folder_names
+from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]

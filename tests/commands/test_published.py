@@ -10,13 +10,13 @@ from PIL import Image
 from published_weights import write_published
 from support import LIMIT, SMALL, compose_config, strict_json
 
+from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import Gaussians
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.published import PublishedGenerator
-from completesplat.rasterizers.directional import DirectionalRasterizer
 
 
 def cut_out(path, size=(60, 40)):

@@ -13,7 +13,7 @@ from completesplat.data.toy import write_objects
 from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.results.tables import SSIM_NOTE
-from completesplat.training.scene_module import SceneModule
+from completesplat.training.stage import Stage
 
 
 @pytest.fixture
@@ -110,13 +110,13 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
     scored, pipeline, tmp_path, monkeypatch
 ):
     shown = []
-    draw = SceneModule.draw
+    draw = Stage.draw
 
     def watched(self, scenes, *others):
         shown.append(scenes)
         return draw(self, scenes, *others)
 
-    monkeypatch.setattr(SceneModule, "draw", watched)
+    monkeypatch.setattr(Stage, "draw", watched)
     root = tmp_path / "larger"  # its pictures are larger than both sizes
     write_objects(root, scenes=4, frames=3, size=96, seed=0, workers=1, progress=False)
     described = scored("var", "evaluation.resolution=48", f"overrides=['data.root={root}']")[1]["protocol"]

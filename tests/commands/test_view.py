@@ -15,12 +15,12 @@ from viewer_scenes import balls
 from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
-from completesplat.commands.settings import View
 from completesplat.commands.view import LOADING, data_cameras, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.scene_model import SceneModel
-from completesplat.schema import check_settings
+from completesplat.settings.checks import View
+from completesplat.settings.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
 from completesplat.viewer.sample import UP
 

@@ -9,7 +9,7 @@ import skimage
 import torch
 from PIL import Image
 
-from completesplat.data.pictures.photograph import picture_features, read_photograph
+from completesplat.data.images.photograph import picture_features, read_photograph
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 

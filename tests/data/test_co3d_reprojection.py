@@ -21,7 +21,7 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import camera_from_viewpoint
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.pictures.crop import principal_square
+from completesplat.data.images.crop import principal_square
 from completesplat.geometry.cameras import crop_resize, project
 from completesplat.scene import SceneBatch
 

@@ -10,8 +10,8 @@ from completesplat.data.co3d import source
 from completesplat.data.co3d.annotations import CO3DFrame, DepthMap
 from completesplat.data.co3d.source import OBJECT_HALF_SIZE, object_placement
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
+from completesplat.data.images.crop import Square
 from completesplat.data.loading.scenes import Loaded, collate
-from completesplat.data.pictures.crop import Square
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.objects import SUBSET
 from completesplat.data.validation import BadPicture

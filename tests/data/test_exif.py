@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps, TiffImagePlugin
 
-from completesplat.data.pictures.exif import crop_fov
-from completesplat.data.pictures.photograph import read_photograph
+from completesplat.data.images.exif import crop_fov
+from completesplat.data.images.photograph import read_photograph
 from completesplat.errors import CompleteSplatError
 
 SIZE = 16

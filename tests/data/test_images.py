@@ -12,9 +12,9 @@ import pytest
 import torch
 from PIL import Image, ImageCms, ImageFile
 
-from completesplat.data.pictures.crop import Square, read_square
-from completesplat.data.pictures.exif import ORIENTATION
-from completesplat.data.pictures.files import decode, read_depth
+from completesplat.data.images.crop import Square, read_square
+from completesplat.data.images.exif import ORIENTATION
+from completesplat.data.images.files import decode, read_depth
 from completesplat.data.validation import BadPicture, MissingFile
 from completesplat.errors import DataError
 

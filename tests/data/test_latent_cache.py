@@ -6,7 +6,7 @@ import pytest
 import torch
 from latent_caches import FRAMES, broken_rooms, rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.latent_cache import LatentCache
+from completesplat.data.loading.latent_cache import LatentCache
 from completesplat.data.loading.loader import SceneLoader
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.scene import CachedScene

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from latent_caches import rooms, small_autoreconstructor, sound_rooms
 
-from completesplat.data.latent_cache import ArrayWriter, LatentCache, open_array
+from completesplat.data.loading.latent_cache import ArrayWriter, LatentCache, open_array
 from completesplat.errors import DataError
 from completesplat.training.encoding import encode_training_set
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from completesplat.data.pictures.photograph import outside_of_box, outside_of_mask, read_photograph
+from completesplat.data.images.photograph import outside_of_box, outside_of_mask, read_photograph
 from completesplat.errors import CompleteSplatError, ImageError
 
 BOX = (0.25, 0.5, 0.75, 1.0)

@@ -8,8 +8,8 @@ import torch
 from fuzzing import png_of, png_parts
 from PIL import Image, ImageCms
 
-from completesplat.data.pictures import files
-from completesplat.data.pictures.photograph import read_photograph
+from completesplat.data.images import files
+from completesplat.data.images.photograph import read_photograph
 from completesplat.errors import ImageError
 
 SIZE = 16

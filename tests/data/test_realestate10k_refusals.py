@@ -25,7 +25,7 @@ from realestate10k_trees import (
 )
 
 from completesplat.data.audit import check
-from completesplat.data.pictures.crop import Square
+from completesplat.data.images.crop import Square
 from completesplat.data.realestate10k import chunks, clips
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
 from completesplat.data.realestate10k.clips import TextClips

@@ -7,7 +7,7 @@ from support import tiny_generator
 
 from completesplat.diffusion.conditioning import LearnedConditioning, StableDiffusionConditioning
 from completesplat.errors import WeightsError
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from PIL import Image
 
 from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
 from completesplat.export.splat_transform import LARGEST_FOV, PageView, upright, viewer_settings, write_page
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import Cameras, look_at, pinhole

@@ -10,7 +10,7 @@ from picture_sheets import cells
 from PIL import Image
 from support import some_gaussians, strict_json
 
-from completesplat.export.pictures import color_depth, surface_depth
+from completesplat.export.images import color_depth, surface_depth
 from completesplat.export.ply import read_ply
 from completesplat.export.prediction import (
     SampleViews,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from completesplat.commands import conf_folder
-from completesplat.results.published import PrintedCell, PrintedColumn, PublishedTable, parse, published
+from completesplat.results.paper_figures import PrintedCell, PrintedColumn, PublishedTable, parse, published
 
 ENVIRONMENT = re.compile(r"\\begin\{table(\*?)\}.*?\\end\{table\1\}", re.DOTALL)
 COMMENT = re.compile(r"(?<!\\)%.*")

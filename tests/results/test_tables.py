@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from completesplat.results.published import published, tables
+from completesplat.results.paper_figures import published, tables
 from completesplat.results.runs import find
 from completesplat.results.tables import (
     SSIM_NOTE,

@@ -7,8 +7,8 @@ import pytest
 import torch
 from support import some_gaussians
 
-from completesplat.export.pictures import NOTHING, ramp
-from completesplat.generation import CompleteSplat
+from completesplat.export.images import NOTHING, ramp
+from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch, Views

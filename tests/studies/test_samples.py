@@ -9,7 +9,7 @@ import pytest
 import torch
 from support import tiny_generator
 
-from completesplat.data.pictures.photograph import Photograph
+from completesplat.data.images.photograph import Photograph
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.metrics.images import PSNR_LIMIT, psnr
 from completesplat.studies.controls import PAPER, box_visibility, grid, plot_controls

@@ -7,7 +7,7 @@ import pytest
 import torch
 from support import SMALL, call, refused
 
-from completesplat.data.latent_cache import LatentCache
+from completesplat.data.loading.latent_cache import LatentCache
 
 STEPS = 3
 QUICK = [*SMALL, f"trainer.max_steps={STEPS}", "trainer.precision=32-true", "trainer.log_every_n_steps=1"]

@@ -15,7 +15,7 @@ from support import tiny_generator
 from torch import nn
 
 from completesplat.autoreconstructor.posterior import Posterior
-from completesplat.data.latent_cache import LatentCache, write_manifest
+from completesplat.data.loading.latent_cache import LatentCache, write_manifest
 from completesplat.data.packed import writing
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import CachedScene

@@ -7,7 +7,7 @@ from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
 from completesplat.benchmarks.training_step import Repeated
-from completesplat.training.scene_module import copy_reference, repeat_image
+from completesplat.training.stage import copy_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 

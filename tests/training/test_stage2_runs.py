@@ -11,7 +11,7 @@ from pretrained_vaes import random_vae
 from safetensors.torch import load_file
 from support import NETWORKS, SMALL, call, compose_config, refused
 
-from completesplat.generation import CompleteSplat
+from completesplat.generator import CompleteSplat
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.weights.checkpoint_reading import read_checkpoint
 

@@ -24,7 +24,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver, write_page  # noqa: E402
-from completesplat.viewer.stage import Stage  # noqa: E402
+from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
 CHROMIUM = shutil.which("chromium")
 pytestmark = [
@@ -49,7 +49,7 @@ def chromium():
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     server = start_server(0)
-    stage = Stage(server, (0.0, -1.0, 0.0))
+    stage = SplatView(server, (0.0, -1.0, 0.0))
     stage.show([balls_sample()])
     saver = Saver(tmp_path_factory.mktemp("saved"), stage, ReferenceRasterizer, 2, 0.5)
     made = Page(server, stage, saver, layers=4)

@@ -16,7 +16,7 @@ from support import LIMIT, tiny_generator
 from viewer_scenes import balls_sample
 
 from completesplat.export.cleaning import with_screen_space_dilation
-from completesplat.export.pictures import to_bytes
+from completesplat.export.images import to_bytes
 from completesplat.export.ply import read_ply
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
@@ -27,7 +27,7 @@ from completesplat.viewer.access import start_server  # noqa: E402
 from completesplat.viewer.completion import Completion  # noqa: E402
 from completesplat.viewer.page import Page, Saver  # noqa: E402
 from completesplat.viewer.panel import SIDE_BY_SIDE, preview_of, thumbnail_row  # noqa: E402
-from completesplat.viewer.stage import Stage  # noqa: E402
+from completesplat.viewer.splat_view import SplatView  # noqa: E402
 
 SETTINGS = {"samples": 2, "skip_weight": 1.0, "guidance_weight": 0.0, "steps": 2, "seed": 0}
 START = SETTINGS | {"remove_background": False}
@@ -64,7 +64,7 @@ def page(server, tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "THUMBNAIL", 8)  # of 96 pixels they take most of the time
     server.scene.reset()
     server.gui.reset()
-    stage = Stage(server, (0.0, -1.0, 0.0))
+    stage = SplatView(server, (0.0, -1.0, 0.0))
     stage.show([balls_sample()])
     made = Page(server, stage, Saver(tmp_path / "out", stage, ReferenceRasterizer, 2, 0.5), layers=4)
     yield made

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from completesplat.data.pictures.files import MOST_PIXELS
+from completesplat.data.images.files import MOST_PIXELS
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,

@@ -11,7 +11,7 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
 from completesplat.data.sequences import PosedSequence
-from completesplat.schema import Natural, Positive, Range, Share
+from completesplat.settings.schema import Natural, Positive, Range, Share
 
 
 class CO3DDataModule(SceneDataModule):

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
-from completesplat.data.pictures.crop import Square, principal_square, read_square
-from completesplat.data.pictures.files import decode, read_depth
+from completesplat.data.images.crop import Square, principal_square, read_square
+from completesplat.data.images.files import decode, read_depth
 from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
 from completesplat.data.validation import BadCamera, BadPlacement, at, read_points
 from completesplat.errors import DataError

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from lightning import LightningDataModule
 from torch import Tensor
 
-from completesplat.data.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment
 from completesplat.data.loading.distributed import batch_per_process, processes
+from completesplat.data.loading.latent_cache import CachedTrainingScenes, LatentCache
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
@@ -26,7 +26,7 @@ from completesplat.data.packed.source import PackedSource
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
+from completesplat.settings.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # if data.workers is null
 WORKERS_OF_A_CORE = 4  # upper limit of data.workers for each core

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from completesplat.data.images.photograph import picture_features
 from completesplat.data.loading.scenes import SceneStore
-from completesplat.data.pictures.photograph import picture_features
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras

@@ -8,9 +8,9 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from completesplat.atomic import write_text
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json, require_file
 from completesplat.errors import DataError
+from completesplat.files import write_text
 
 MANIFEST = "manifest.json"
 HEADER = {"format": 2}

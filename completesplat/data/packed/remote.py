@@ -9,9 +9,9 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from completesplat.atomic import atomic_path
 from completesplat.data.packed.manifest import MANIFEST, Shard
 from completesplat.data.validation import ChangedFile, MissingFile
+from completesplat.files import atomic_path
 from completesplat.weights import sha256_of
 
 ADDRESS = "address.txt"

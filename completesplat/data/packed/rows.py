@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from PIL import Image
 from torch import Tensor
 
-from completesplat.data.pictures.crop import Square, cut_square
+from completesplat.data.images.crop import Square, cut_square
 from completesplat.data.sequences import Picture, PosedSequence
 from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
 from completesplat.geometry.cameras import Cameras, crop_resize

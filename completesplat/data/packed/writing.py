@@ -15,7 +15,6 @@ import numpy as np
 from rich.filesize import decimal
 from rich.progress import Progress
 
-from completesplat.atomic import atomic_path
 from completesplat.data.packed.manifest import (
     HEADER,
     MANIFEST,
@@ -34,6 +33,7 @@ from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource, spread_places
 from completesplat.data.validation import TooFewFrames, at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
+from completesplat.files import atomic_path
 
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"

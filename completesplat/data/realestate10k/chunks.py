@@ -16,8 +16,8 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from completesplat.data.pictures.crop import Square, cut_square
-from completesplat.data.pictures.files import decode, picture_size
+from completesplat.data.images.crop import Square, cut_square
+from completesplat.data.images.files import decode, picture_size
 from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError, TensorFileError

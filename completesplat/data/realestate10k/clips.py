@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat.data.pictures.crop import Square, read_square
-from completesplat.data.pictures.files import picture_size
+from completesplat.data.images.crop import Square, read_square
+from completesplat.data.images.files import picture_size
 from completesplat.data.validation import (
     ROTATION_TOLERANCE,
     BadAnnotation,

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
+from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
 from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
-from completesplat.data.pictures.crop import Square, principal_square
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
@@ -20,7 +20,7 @@ from completesplat.data.sequences import Picture, PosedSequence, SequenceSource,
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
-from completesplat.schema import Natural, OneOf, Positive, Share
+from completesplat.settings.schema import Natural, OneOf, Positive, Share
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 

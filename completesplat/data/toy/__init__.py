@@ -7,7 +7,7 @@ from pathlib import Path
 from completesplat.data.toy.objects import write_objects
 from completesplat.data.toy.rooms import write_rooms
 from completesplat.errors import DataError
-from completesplat.schema import Natural, Positive, Side
+from completesplat.settings.schema import Natural, Positive, Side
 
 KINDS: dict[str, Callable[..., Path]] = {
     "objects": write_objects,

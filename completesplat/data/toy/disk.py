@@ -8,10 +8,10 @@ from typing import TypeVar
 from rich.console import Console
 from rich.progress import track
 
-from completesplat.atomic import atomic_folder
 from completesplat.data.processes import map_in_processes
 from completesplat.errors import DataError
-from completesplat.schema import Range
+from completesplat.files import atomic_folder
+from completesplat.settings.schema import Range
 
 FORMAT_VERSION = 2
 MOST_FRAMES = 1000

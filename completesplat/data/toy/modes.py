@@ -11,9 +11,9 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.data.hidden_modes import HiddenModes
+from completesplat.data.images.crop import cut_square, principal_square
 from completesplat.data.loading.scenes import Choice, SceneStore
 from completesplat.data.loading.view_selection import evaluation_views
-from completesplat.data.pictures.crop import cut_square, principal_square
 from completesplat.data.sequences import PosedSequence
 from completesplat.data.toy.disk import FORMAT_VERSION
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame

@@ -11,7 +11,7 @@ from completesplat.data.toy.modes import ToyHiddenModes
 from completesplat.data.toy.objects import SUBSET, write_objects
 from completesplat.data.toy.rooms import ROOMS, write_rooms
 from completesplat.data.validation import MissingFile
-from completesplat.schema import Natural, Positive, Side
+from completesplat.settings.schema import Natural, Positive, Side
 
 OWN_PLACE = Path("outputs/data")
 """Folder below which toy data are written without `make`; `data.root` of `conf/data/toy_*.yaml` lies there."""

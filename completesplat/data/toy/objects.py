@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
-from completesplat.data.pictures.files import save_picture
+from completesplat.data.images.files import save_picture
 from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.mini_scene import draw_mini
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame

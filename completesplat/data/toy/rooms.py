@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from completesplat.data.pictures.files import save_picture
+from completesplat.data.images.files import save_picture
 from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame

@@ -1,0 +1,1 @@
+"""Splatter Image (Szymanowicz et al., CVPR 2024): its network, and its authors' published weights."""

@@ -1,0 +1,229 @@
+"""Strict reader of untrusted image files: the result is complete, upright and has 8 bits, or the file is refused."""
+
+import io
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image, ImageFile, UnidentifiedImageError
+from torch import Tensor
+
+from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
+from completesplat.data.validation import BadPicture, require_file
+from completesplat.errors import ImageError
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
+MOST_PIXELS = 50_000_000
+MOST_BYTES = 2**28
+EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
+SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
+TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
+QUARTER_TURNS = (5, 6, 7, 8)
+TRANSPARENT = "has transparent pixels; lay it over a background first"
+SMALLEST_NORMAL = 2.0**-14  # of float16
+LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
+
+
+def decode(
+    source: Path | bytes, file: str, mode: Literal["RGB", "L"], image_size: tuple[int, int] | None = None
+) -> Image.Image:
+    """Decode one image of a data set to 8 bits, and turn it upright by its EXIF orientation.
+
+    Grey of 16 bits is scaled to 8. Transparent pixels are refused, because metrics depend on the background, which only
+    the data set's maker can choose. Colour is refused for `mode` "L" (a mask), because its brightness is no
+    probability. Colour profiles are ignored, as by the loaders behind all published numbers on these data sets. Of an
+    MPO (a JPEG followed by previews) the first image is used; other files with several frames are refused. PNG's
+    checksums are checked; flipped bits in a JPEG remain unnoticed.
+
+    Args:
+        source: the file, or its content.
+        file: name for error messages.
+        image_size: (height, width) that the upright image must have, if known.
+
+    Raises:
+        MissingFile: the file does not exist.
+        BadPicture: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
+            has pixels whose meaning in this mode is unclear.
+    """
+    with _loaded(source, file, FORMATS) as (picture, exif):
+        orientation = exif.get(ORIENTATION)
+        image = upright(picture, orientation)
+        if image_size is not None:
+            check_annotated_size(image, image_size, orientation)
+        return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
+
+
+def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+    """Return (height, width) of an image file or its content, from its header; errors as in `decode`."""
+    with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
+        return image.height, image.width
+
+
+def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height width"]:
+    """Read a depth map of CO3D, a 16-bit grey PNG whose bits are float16, and multiply it by `scale_adjustment`.
+
+    0 means "unknown", and replaces values that are not finite (`pytorch3d/implicitron/dataset/utils.py`, `load_depth`).
+
+    Raises:
+        MissingFile: the file does not exist.
+        BadPicture: it is no readable 16-bit PNG, the factor is not positive and finite, depths are negative, none is
+            finite, or all are subnormal, as integer depths below 1024 would be.
+    """
+    if not 0 < scale_adjustment < LARGEST_SCALE:
+        raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
+    with _loaded(path, str(path), ("PNG",)) as (picture, _):
+        if picture.mode not in SIXTEEN_BIT_MODES:
+            raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
+        depth = np.asarray(picture).astype(np.uint16).view(np.float16).astype(np.float32)
+        finite = np.isfinite(depth)
+        if not finite.any():
+            raise ImageError("no finite depth in it")
+        depth[~finite] = 0
+        if depth.min() < 0:
+            raise ImageError("negative depths; its bits are no float16")
+        if 0 < depth.max() < SMALLEST_NORMAL:
+            raise ImageError("its values are integers, where the bits of float16 are expected")
+    return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
+
+
+@contextmanager
+def refused_as_bad(file: str) -> Iterator[None]:
+    """Convert an ImageError raised within the context to a BadPicture that names the file."""
+    try:
+        yield
+    except ImageError as error:
+        raise BadPicture(str(error), file) from error.__cause__
+
+
+@contextmanager
+def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+    """Open an image and read its header, but not its pixels; convert Pillow's exceptions within the context.
+
+    Raises:
+        ImageError: the image is damaged, has another format, or has more than 50 million pixels.
+    """
+    # Pillow only warns about images between 89 and 179 million pixels; the limit here is lower and an error.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats) as picture:
+                width, height = picture.size
+                if width * height > MOST_PIXELS:
+                    raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels")
+                yield picture
+        except ImageError:
+            raise
+        except UnidentifiedImageError:
+            raise ImageError(f"not an image in one of the formats {', '.join(formats)}") from None
+        except Image.DecompressionBombError:
+            raise ImageError(f"more than {MOST_PIXELS:,} pixels") from None
+        # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, ...
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise ImageError(f"cannot be decoded: {reason}") from error
+
+
+def check_sums(picture: Image.Image, source: str | Path | io.BytesIO) -> None:
+    """Check all checksums of a PNG file, because decoding ignores those of the pixels."""
+    if picture.format == "PNG":
+        with Image.open(source, formats=("PNG",)) as again:
+            again.verify()
+
+
+def over_white(picture: Image.Image) -> Image.Image:
+    """Composite an image over white and return it in RGB."""
+    return over_grey(picture, 1.0)
+
+
+def over_grey(picture: Image.Image, value: float) -> Image.Image:
+    """Composite an image over a grey value from 0 to 1 and return it in RGB."""
+    grey = Image.new("RGBA", picture.size, (round(255 * value),) * 3)
+    return Image.alpha_composite(grey, picture.convert("RGBA")).convert("RGB")
+
+
+def upright(picture: Image.Image, orientation: object) -> Image.Image:
+    """Turn and mirror an image by its EXIF orientation; undefined values change nothing."""
+    transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
+    return picture if transposition is None else picture.transpose(transposition)
+
+
+def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
+    """Convert grey values of more than 8 bits to float32 in [0, 1]. Pillow's own conversion would clip them at 255.
+
+    The TIFF tags come from the opened file, because images derived from it have none; they are empty for other formats.
+
+    Raises:
+        ImageError: values lie outside the range from black to white.
+    """
+    bits = tiff_tags.get(TIFF_BITS, (16,))
+    values = np.asarray(picture).astype(np.float64)
+    if picture.mode != "F":
+        # Pillow does not scale 12-bit TIFF values; all other images of these modes use 16 bits.
+        values = values / (4095 if bits == (12,) else 65535)
+    # The comparison is false for NaN too.
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ImageError(f"grey values of mode {picture.mode} outside the range from black to white, or not finite")
+    if tiff_tags.get(TIFF_PHOTOMETRIC) == 0:
+        values = 1 - values  # "white is zero", which Pillow inverts for 8 bits only
+    if isinstance(picture.info.get("transparency"), int):
+        values[np.asarray(picture) == picture.info["transparency"]] = 1
+    return values.astype(np.float32)
+
+
+def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+    """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
+    content = io.BytesIO()
+    image.save(content, Image.registered_extensions()[path.suffix], **options)
+    path.write_bytes(content.getvalue())
+
+
+@contextmanager
+def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
+    """Decode an image completely and yield it with its EXIF record; convert its errors to BadPicture."""
+    with refused_as_bad(file):
+        if ImageFile.LOAD_TRUNCATED_IMAGES:
+            raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
+        size = require_file(source).stat().st_size if isinstance(source, Path) else len(source)
+        if not 0 < size <= MOST_BYTES:
+            raise ImageError(f"more than {MOST_BYTES:,} bytes" if size else "the file is empty")
+        content = source.read_bytes() if isinstance(source, Path) else source
+        with opened(content, formats) as picture:
+            frames = getattr(picture, "n_frames", 1)
+            if frames > 1 and picture.format != "MPO":
+                raise ImageError(f"has {frames} frames; one picture is expected")
+            picture.load()
+            check_sums(picture, io.BytesIO(content))
+            yield picture, read_exif(picture)
+
+
+def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
+    """Refuse an image whose (height, width) differs from its annotation."""
+    if image.size != annotated[::-1]:
+        actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
+        if orientation in QUARTER_TURNS and image.size == annotated:
+            actual += f": its size before it is turned as its EXIF orientation {orientation} says; save it upright"
+        raise ImageError(actual)
+
+
+def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, Any], mode: Literal["RGB", "L"]) -> Image.Image:
+    if image.mode in SIXTEEN_BIT_MODES:
+        if (np.asarray(image) == image.info.get("transparency")).any():
+            raise ImageError(TRANSPARENT)
+        image = Image.fromarray(np.rint(255 * deep_grey(image, tiff_tags)).astype(np.uint8))
+    if image.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {image.mode} is not supported")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        if image.getchannel("A").getextrema() != (255, 255):
+            raise ImageError(TRANSPARENT)
+    if mode == "L" and image.mode not in ("1", "L"):
+        red, green, blue = image.convert("RGB").split()
+        if red.tobytes() != green.tobytes() or red.tobytes() != blue.tobytes():
+            raise ImageError("has colours; a mask is grey")
+        return red
+    return image.convert(mode)

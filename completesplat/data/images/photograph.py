@@ -1,0 +1,321 @@
+"""Conversion of any photo to a model's square input image, with its field of view.
+
+Also masks of hidden regions, statistics that characterize a set of images, and removal of the background.
+"""
+
+import io
+import math
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image, ImageCms
+from torch import Tensor
+
+from completesplat.data.images.exif import ORIENTATION, crop_fov, read_exif
+from completesplat.data.images.files import (
+    EIGHT_BIT_MODES,
+    SIXTEEN_BIT_MODES,
+    check_sums,
+    deep_grey,
+    opened,
+    over_grey,
+    upright,
+)
+from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.tensors import TensorDataclass
+
+FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "AVIF", "JPEG2000", "BMP", "GIF", "PPM")
+SMALLEST_SIDE = 8
+DEEP_GREY_MODES = (*SIXTEEN_BIT_MODES, "I", "F")
+LARGEST_OBJECT = 4096  # pixels; larger ones are reduced before they are padded to a square of unbounded size
+LANCZOS_REACH = 3  # radius of the filter, in pixels of the coarser image
+CUTTER = "u2net"  # rembg's default network has a licence for non-commercial use only
+
+
+@dataclass(frozen=True)
+class Photograph(TensorDataclass):
+    """Square image (sRGB, 0 to 1) with the field of view across a side, and the source of the field of view."""
+
+    image: Float[Tensor, "3 size size"]
+    fov_degrees: float
+    fov_source: Literal["given", "exif", "default"]
+
+
+Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
+
+
+def read_photograph(
+    picture: Picture,
+    size: int,
+    fov_degrees: float | None = None,
+    default_fov_degrees: float = 50.0,
+    remove_background: bool = False,
+    background: float = 1.0,
+    object_share: float | None = None,
+) -> Photograph:
+    """Turn an image upright, crop the largest central square and resize it (Lanczos, antialiased).
+
+    Transparency is composited over the background. An animation yields its first frame. An embedded colour profile is
+    converted to sRGB. Grey images of 16 bits are scaled to [0, 1]; grey images of floats must lie in [0, 1].
+
+    Args:
+        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
+            an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
+        fov_degrees: field of view of the square crop, if it is known.
+        default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
+        remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
+        background: grey value from 0 to 1 behind transparent and removed pixels, white by default.
+        object_share: for an image with a transparent or removed background, crop the square around the object such that
+            the object's longer side fills this share of it; None: crop the central square.
+
+    Raises:
+        ImageError: the file is missing or not a complete image of one of these formats, has more than 50 million pixels
+            (checked before decoding) or less than 8 pixels on a side, or its pixel values are ambiguous.
+        CompleteSplatError: the field of view is outside (0, 180) degrees, or errors of `without_background`.
+    """
+    for fov in (fov_degrees, default_fov_degrees):
+        if fov is not None and not 0 < fov < 180:
+            raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
+    try:
+        image, recorded = _square(picture, size, remove_background, background, object_share)
+    except ImageError as error:
+        name = picture if isinstance(picture, (str, Path)) else "the picture"
+        raise ImageError(f"{name}: {error}") from error.__cause__
+    if fov_degrees is not None:
+        return Photograph(image, float(fov_degrees), "given")
+    if recorded is not None:
+        return Photograph(image, recorded, "exif")
+    return Photograph(image, float(default_fov_degrees), "default")
+
+
+def _square(
+    picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
+) -> tuple[Float[Tensor, "3 size size"], float | None]:
+    """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
+    if isinstance(picture, (np.ndarray, Tensor)):
+        picture = _pixels(picture)
+        if isinstance(picture, np.ndarray):
+            if remove_background:
+                raise ImageError("a picture whose background is to be removed is given in bytes, not in floats")
+            return _resized(picture, size), None
+    if not isinstance(picture, Image.Image):
+        _check_file(Path(picture))
+    with nullcontext(picture) if isinstance(picture, Image.Image) else opened(picture, FORMATS) as file:
+        _check_side(*file.size)
+        if not isinstance(picture, Image.Image):
+            check_sums(file, picture)
+        file.load()
+        exif = read_exif(file)
+    seen = upright(file, exif.get(ORIENTATION))
+    if object_share is None:
+        seen = seen.crop(_central_square(*seen.size))
+    if remove_background:
+        seen = _cut_out(seen, background)
+    if object_share is not None:
+        seen = _around_object(seen, object_share) or seen.crop(_central_square(*seen.size))
+    return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
+
+
+def _cut_out(picture: Image.Image, background: float) -> Image.Image:
+    if picture.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {picture.mode} goes without background=remove")
+    return without_background(_to_srgb(picture, background))
+
+
+def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
+    """Crop the square around the opaque part, which may extend beyond the image; None if all pixels are opaque."""
+    if picture.mode not in EIGHT_BIT_MODES or not picture.has_transparency_data:
+        return None
+    cut_out = picture.convert("RGBA")
+    alpha = cut_out.getchannel("A")
+    if alpha.getextrema()[0] == 255:
+        return None
+    box = alpha.getbbox()
+    if box is None:
+        raise ImageError("nothing but transparency")
+    cut_out = cut_out.crop(box)
+    cut_out = cut_out.reduce(-(-max(cut_out.size) // LARGEST_OBJECT))
+    side = round(max(cut_out.size) / share)
+    left, top = (cut_out.width - side) // 2, (cut_out.height - side) // 2
+    return cut_out.crop((left, top, left + side, top + side))
+
+
+def _check_side(width: int, height: int) -> None:
+    if min(width, height) < SMALLEST_SIDE:
+        raise ImageError(f"{width, height} pixels; at least {SMALLEST_SIDE} on a side are needed")
+
+
+def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
+    """Return left, upper, right and lower edge."""
+    side = min(width, height)
+    left, top = (width - side) // 2, (height - side) // 2
+    return left, top, left + side, top + side
+
+
+def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
+    """Convert an array (channel last) or tensor (channel first): bytes to an image, floats to a float32 array."""
+    channel = 0 if isinstance(picture, Tensor) else -1
+    if picture.ndim != 3 or picture.shape[channel] != 3:
+        raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
+    if isinstance(picture, Tensor):  # NumPy has no bfloat16
+        picture = picture.float() if picture.is_floating_point() else picture
+    values = picture.movedim(0, -1).numpy(force=True) if isinstance(picture, Tensor) else picture
+    if values.dtype == np.uint8:
+        return Image.fromarray(values)
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ImageError(f"values are {values.dtype}; bytes, or floats in [0, 1], have one meaning")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ImageError("values outside of [0, 1]")
+    return values.astype(np.float32)
+
+
+def _resized(pixels: Float[np.ndarray, "height width 3"], size: int) -> Float[Tensor, "3 size size"]:
+    height, width = pixels.shape[:2]
+    _check_side(width, height)
+    box = _central_square(width, height)
+    channels = [Image.fromarray(np.ascontiguousarray(channel)).crop(box) for channel in np.moveaxis(pixels, -1, 0)]
+    resized = [np.asarray(channel.resize((size, size), Image.Resampling.LANCZOS)) for channel in channels]
+    return torch.from_numpy(np.stack(resized).clip(0, 1))
+
+
+def _check_file(path: Path) -> None:
+    try:
+        exists = path.is_file()
+    except OSError as error:  # such as a name that is too long
+        raise ImageError(str(error.strerror)) from error
+    if not exists:
+        raise ImageError("no such file")
+    if path.stat().st_size == 0:
+        raise ImageError("the file is empty")
+
+
+def _to_tensor(square: Image.Image, source: Image.Image, size: int, background: float) -> Float[Tensor, "3 size size"]:
+    """Convert pixels to sRGB in [0, 1]; `source` is the opened file, because only it has TIFF tags."""
+    if square.mode in DEEP_GREY_MODES:
+        grey = Image.fromarray(deep_grey(square, getattr(source, "tag_v2", {})))
+        resized = np.asarray(grey.resize((size, size), Image.Resampling.LANCZOS))
+        return torch.from_numpy(resized.clip(0, 1)).expand(3, size, size).contiguous()
+    if square.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {square.mode} is not supported")
+    small = _to_srgb(square, background).resize((size, size), Image.Resampling.LANCZOS)
+    return torch.from_numpy(np.array(small)).permute(2, 0, 1).contiguous().float() / 255
+
+
+def _to_srgb(square: Image.Image, background: float) -> Image.Image:
+    """Composite an image over the background, and convert it from its embedded colour profile, if any, to RGB."""
+    profile = square.info.get("icc_profile")
+    if square.has_transparency_data:
+        square = over_grey(square, background)
+    if profile:
+        # Like image viewers, ignore a damaged profile, or one whose colour model differs from the pixels'.
+        with suppress(ImageCms.PyCMSError, OSError):
+            embedded = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            native = square if square.mode in ("L", "RGB", "CMYK") else square.convert("RGB")
+            converted = ImageCms.profileToProfile(native, embedded, ImageCms.createProfile("sRGB"), outputMode="RGB")
+            return converted if converted is not None else native
+    return square.convert("RGB")
+
+
+def without_background(picture: Image.Image) -> Image.Image:
+    """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg.
+
+    Raises:
+        CompleteSplatError: rembg is not installed, or fails; on first use it downloads the network (176 MB).
+        ImageError: the whole image is background.
+    """
+    try:
+        import rembg
+    except (ImportError, SystemExit) as error:  # rembg exits if onnxruntime is missing
+        advice = 'pip install "completesplat[background]"'
+        raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
+    pixels = Image.fromarray(np.array(picture))  # without EXIF, because rembg would turn the image again
+    try:
+        cut: Image.Image = rembg.remove(pixels, session=_session())
+    except Exception as error:  # from the HTTP library, onnxruntime or the file system
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise CompleteSplatError(f"background=remove: rembg fails with its network {CUTTER} ({reason})") from error
+    if not cut.getchannel("A").getbbox():
+        raise ImageError("background=remove leaves nothing of it: no object is found")
+    return cut
+
+
+@cache
+def _session() -> Any:
+    import rembg
+
+    return rembg.new_session(CUTTER)
+
+
+def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
+    """Return mean and standard deviation of red, green and blue, and two measures of detail; all lie in [0, 1].
+
+    The measures of detail are the mean absolute differences between neighbours in a row, and in a column.
+    """
+    means, deviations = images.mean((-2, -1)), images.std((-2, -1), correction=0)
+    steps = [images.diff(dim=axis).abs().mean((-3, -2, -1))[..., None] for axis in (-1, -2)]
+    return torch.cat([means, deviations, *steps], dim=-1)
+
+
+def outside_of_box(photograph: Path, box: Sequence[float], size: int) -> Float[Tensor, "1 size size"]:
+    """Return 1 where the square of a photo is visible, 0 where a box hides it; see `visible`.
+
+    Args:
+        box: left, upper, right and lower edge, as fractions (0 to 1) of the photo's central square.
+
+    Raises:
+        CompleteSplatError: the box is not four numbers, or not of positive size within the square.
+    """
+    if len(box) != 4:
+        raise CompleteSplatError(f"box={list(box)}: give [x0,y0,x1,y1]")
+    left, upper, right, lower = box
+    if not (0 <= left < right <= 1 and 0 <= upper < lower <= 1):
+        raise CompleteSplatError(f"box={list(box)}: needs 0 <= x0 < x1 <= 1 and 0 <= y0 < y1 <= 1")
+    side = square_side(photograph)
+    hidden = np.zeros((side, side), dtype=bool)
+    hidden[math.floor(upper * side) : math.ceil(lower * side), math.floor(left * side) : math.ceil(right * side)] = True
+    return visible(hidden, size)
+
+
+def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1 size size"]:
+    """Return the same for a mask image, which is white where the photo is hidden, and is cropped like the photo."""
+    hidden = read_photograph(mask, square_side(photograph)).image.mean(0).numpy() > 0.5
+    if not hidden.any():
+        raise CompleteSplatError(f"{mask}: hides nothing; a mask is white where the photograph is hidden")
+    return visible(hidden, size)
+
+
+def square_side(photograph: Path) -> int:
+    """Return the side in pixels of the largest square of a readable image."""
+    with Image.open(photograph) as picture:
+        return min(picture.size)
+
+
+def visible(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "1 size size"]:
+    """Return 1 for those of size x size pixels to which no hidden pixel contributes in resizing, else 0.
+
+    Resizing blurs by three pixels of the result, so the hidden region grows by as much, and leaves no traces outside.
+    """
+    for _ in range(2):
+        hidden = _touched(hidden, size).T
+    return torch.from_numpy(~hidden).float()[None]
+
+
+def _touched(hidden: Bool[np.ndarray, "side _"], size: int) -> Bool[np.ndarray, "size _"]:
+    side = len(hidden)
+    if side == size:  # the image is not resized
+        return hidden
+    scale = side / size
+    centers = (np.arange(size) + 0.5) * scale
+    reach = LANCZOS_REACH * max(scale, 1)
+    first = np.clip(np.floor(centers - reach), 0, side).astype(int)
+    last = np.clip(np.ceil(centers + reach), 0, side).astype(int)
+    counts = np.concatenate([np.zeros((1, hidden.shape[1]), dtype=int), hidden.cumsum(axis=0)])
+    touched: np.ndarray = counts[last] > counts[first]
+    return touched

@@ -1,0 +1,193 @@
+"""Files and folders that are written whole or not at all, and file names that are safe to print and to write."""
+
+import errno
+import os
+import re
+import shutil
+import unicodedata
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from completesplat.errors import CompleteSplatError, DiskError
+
+NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+UNUSABLE = {errno.EIO, errno.EROFS, errno.EACCES, errno.ESTALE, errno.ENODEV}
+BAD_NAME = {errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM}
+PROBE_BYTES = 2**16
+BLOCK_BYTES = 512  # unit of `st_blocks`
+LONGEST = 100  # bytes of UTF-8
+MOST_SHOWN = 500  # characters
+UNNAMED = "unnamed"
+# Control characters, line breaks, and the surrogates that stand for bytes that are not UTF-8.
+UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+SEPARATORS = re.compile(r"[/\\]")
+
+
+@contextmanager
+def atomic_path(path: str | Path, name: str | None = None, size: int = 0) -> Iterator[Path]:
+    """Yield a temporary path beside `path` that replaces it when the block ends without an exception.
+
+    The folder must exist, because a folder that is removed during a run must not come back without its other files.
+    After an exception the old file is unchanged and the temporary one removed. A link at `path` is not followed.
+
+    Args:
+        name: name of the temporary file; by default a unique one with the suffix of `path`.
+        size: bytes that the file needs at least, if known beforehand.
+
+    Raises:
+        DiskError: the file cannot be written. A test write finds the reason if the writing library hides it.
+    """
+    path = Path(path)
+    temporary = path.with_name(name or f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    try:
+        with _asking_the_disk(path, temporary, size):
+            temporary.unlink(missing_ok=True)
+            yield temporary
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder that becomes the missing `folder` when the block ends without an exception.
+
+    The unfinished folder is removed after an exception, and so is one that a killed process left behind.
+
+    Raises:
+        DiskError: as `atomic_path`.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    try:
+        with _asking_the_disk(folder, unfinished):
+            unfinished.mkdir()
+            yield unfinished
+            unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+@contextmanager
+def writing(path: Path, size: int = 0) -> Iterator[None]:
+    """Raise DiskError if the operating system refuses what the block writes to `path`, `size` bytes at least."""
+    try:
+        yield
+    except OSError as error:
+        if (refusal := _disk_error(error, path, size)) is None:
+            raise
+        raise refusal from error
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file whole or not at all, with the errors of `atomic_path`."""
+    with atomic_path(path, size=len(content)) as temporary:
+        temporary.write_bytes(content)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, if it is missing, in an existing one.
+
+    Raises:
+        CompleteSplatError: the folder is a link, through which results would be written elsewhere.
+        DiskError: the folder above is gone, or the disk is full.
+    """
+    if folder.is_symlink():
+        raise CompleteSplatError(f"{folder}: is a link, and results are not written through links; remove it")
+    with writing(folder):
+        folder.mkdir(exist_ok=True)
+
+
+def file_refusal(error: BaseException) -> CompleteSplatError | None:
+    """Return the error to show for an OSError about a named file: no space, or an unusable name; None for others."""
+    name = (error.filename2 or error.filename) if isinstance(error, OSError) else None
+    if not isinstance(error, OSError) or not isinstance(name, str):
+        return None
+    if error.errno in BAD_NAME:
+        return CompleteSplatError(f"{printable(name)}: cannot be used: {error.strerror}; choose another name")
+    return _disk_error(error, Path(name)) if error.errno in {*NO_SPACE, errno.EROFS} else None
+
+
+@contextmanager
+def _asking_the_disk(path: Path, temporary: Path, size: int = 0) -> Iterator[None]:
+    """Raise DiskError if `temporary`, a file or folder that is to become `path`, cannot be written."""
+    try:
+        yield
+    except CompleteSplatError:
+        raise
+    except Exception as error:
+        cause = error if isinstance(error, OSError) and error.errno is not None else _asked(temporary)
+        if cause is None or (refusal := _disk_error(cause, path, size, temporary)) is None:
+            raise
+        raise refusal from error
+
+
+def _asked(path: Path) -> OSError | None:
+    """Write more to a file or folder, which is no longer needed, and return the operating system's error, if any."""
+    try:
+        with (path / "more" if path.is_dir() else path).open("ab") as file:
+            file.write(bytes(PROBE_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        return error
+    return None
+
+
+def _disk_error(error: OSError, path: Path, size: int = 0, temporary: Path | None = None) -> DiskError | None:
+    """Return the error to show, None if it is not the disk's; `temporary` will be removed, so its space is free."""
+    from rich.filesize import decimal
+
+    if not path.parent.is_dir():
+        return DiskError(f"{path}: cannot be written, {path.parent} is not there any more")
+    if error.errno in NO_SPACE:
+        files = [] if temporary is None else [temporary, *temporary.rglob("*")]
+        taken = [file.stat() for file in files if file.is_file()]
+        size = max(size, sum(file.st_size for file in taken))
+        needed = f"{decimal(size)} or more are needed" if size else "more is needed"
+        free = shutil.disk_usage(path.parent).free + sum(file.st_blocks for file in taken) * BLOCK_BYTES
+        return DiskError(f"{path}: {error.strerror}: {needed}, {decimal(free)} are free on this disk")
+    return DiskError(f"{path}: cannot be written: {error.strerror}") if error.errno in UNUSABLE else None
+
+
+def printable(text: str) -> str:
+    """Return one line to print: escape unprintable characters as in Python (`\\n`), omit the middle of a long text."""
+    line = UNPRINTABLE.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+    return line if len(line) <= MOST_SHOWN else f"{line[: MOST_SHOWN // 2 - 5]} ... {line[-MOST_SHOWN // 2 :]}"
+
+
+def safe_name(text: str, ending: str = "") -> str:
+    """Return a name for a file or folder that resembles the text and cannot lead to another folder.
+
+    It is never empty, has no separators, leading dots or unprintable characters, and at most 100 bytes of UTF-8.
+    `ending`, such as a number, is added to a name that is not empty without it.
+    """
+    plain = SEPARATORS.sub("_", UNPRINTABLE.sub("_", text)).lstrip(".")
+    shortened = plain.encode()[: LONGEST - len(ending)].decode(errors="ignore")
+    return (shortened or UNNAMED) + ending
+
+
+def folder_names(stems: Iterable[str]) -> list[str]:
+    """Return a safe name for each stem, with `_2`, `_3` and so on behind names that are taken.
+
+    Names that differ only in case or Unicode form count as equal, because they are equal on some file systems.
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for stem in stems:
+        name, number = safe_name(stem), 2
+        while (key := unicodedata.normalize("NFC", name).casefold()) in taken:
+            name, number = safe_name(stem, f"_{number}"), number + 1
+        taken.add(key)
+        names.append(name)
+    return names

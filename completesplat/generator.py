@@ -1,0 +1,314 @@
+"""Models from one image to complete scenes, without Lightning, for use in other programs.
+
+model = CompleteSplat.from_pretrained("toy_objects")
+scenes = model("photo.jpg", samples=4, seed=0)
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from safetensors.torch import load_file
+from torch import Tensor
+
+from completesplat.baselines.splatter_image.files import is_published
+from completesplat.diffusion.guidance import allowed_skip_weight
+from completesplat.diffusion.sampling import draw_noise, in_parts, with_forward_process
+from completesplat.errors import WeightsError
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.parts import (
+    architecture_of_run,
+    build,
+    check_architecture,
+    check_sizes,
+    read_architecture,
+    sizes_in,
+    untrained,
+)
+from completesplat.published import PublishedGenerator
+from completesplat.scene import Views
+from completesplat.scene_model import SceneModel, require_one
+from completesplat.settings.schema import Positive, Seed
+from completesplat.tensors import concatenate
+from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
+from completesplat.weights.checkpoint_reading import not_finite, read_checkpoint
+
+
+class CompleteSplat(SceneModel):
+    """Conditioning, denoiser, sampler and the frozen autoreconstructor: everything that inference needs.
+
+    The four parts are given as configs (`_target_` and arguments, as in `conf/`), which are written beside the weights,
+    so that `from_pretrained` can build the parts again.
+
+    Args:
+        autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
+        image_size: side of the square images, in pixels.
+        training: facts about the training images (`completesplat.parts.TrainingPictures`).
+
+    Raises:
+        WeightsError: a config has a part or an option that weights may not name (`parts`).
+    """
+
+    latent_mean: Tensor
+    latent_std: Tensor
+
+    draws_samples = True
+
+    def __init__(
+        self,
+        autoreconstructor: Mapping[str, Any],
+        conditioning: Mapping[str, Any],
+        denoiser: Mapping[str, Any],
+        sampler: Mapping[str, Any],
+        image_size: int,
+        training: Mapping[str, Any] | None = None,
+    ) -> None:
+        parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
+        saved = {name: untrained(part) for name, part in parts.items()}
+        facts = {} if training is None else {"training": dict(training)}
+        architecture = {**saved, "sampler": dict(sampler), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
+        # Its weights come from a trained stage, so Stable Diffusion's are not needed.
+        self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
+        self.conditioning = build(conditioning)
+        self.denoiser = build(denoiser)
+        self.sampler = build(sampler)
+        # The training stage measures these on the training set.
+        channels = self.denoiser.latent_channels
+        self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
+        self.register_buffer("latent_std", torch.ones(channels, 1, 1))
+
+    @property
+    def reconstructing(self) -> Any:
+        """Return the autoreconstructor."""
+        return self.autoreconstructor
+
+    def train(self, mode: bool = True) -> "CompleteSplat":
+        """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""
+        super().train(mode)
+        self.autoreconstructor.eval()
+        return self
+
+    @torch.no_grad()
+    def encode(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        views: Views | None = None,
+        depth_range: Float[Tensor, "batch 2"] | None = None,
+    ) -> Float[Tensor, "batch channel _ _"]:
+        """Draw each scene's standardised latent from the frozen posterior ("we also sample latent codes", supplement).
+
+        The arguments are those of `VariationalAutoReconstructor.posterior`.
+        """
+        return self.standardised(self.autoreconstructor.posterior(images, views, depth_range)[0].sample())
+
+    def set_latent_moments(self, mean: Sequence[float], std: Sequence[float]) -> None:
+        """Set the mean and standard deviation of each latent channel on the training set."""
+        self.latent_mean.copy_(torch.tensor(mean)[:, None, None])
+        self.latent_std.copy_(torch.tensor(std)[:, None, None])
+
+    def standardised(self, latent: Float[Tensor, "batch channel _ _"]) -> Float[Tensor, "batch channel _ _"]:
+        """Scale latents for the denoiser: mean 0 and standard deviation 1 in each channel over the training set."""
+        return (latent - self.latent_mean) / self.latent_std
+
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: Positive = 1,
+        skip_weight: float | None = None,
+        guidance_weight: float = 0.0,
+        steps: int | None = None,
+        seed: Seed | Sequence[Seed] = 0,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        batch: Positive | None = None,
+        on_step: Callable[[int, int, Gaussians], None] | None = None,
+    ) -> Gaussians:
+        """Draw `samples` scenes for each image.
+
+        All noise is drawn first, so `batch` changes nothing but the rounding of float32.
+
+        Args:
+            skip_weight: default 1, the most faithful (supplement, "Diverse Sampling"), or 0 if something is hidden.
+            guidance_weight: share of the unconditional prediction; more gives more diverse samples.
+            steps: denoising steps; by default the sampler's number.
+            seed: seed of all noise, or one for each image, whose samples then do not depend on the other images.
+            visible: 0 where an image is hidden; hidden pixels have no influence.
+            batch: the largest number of latents at a time; all by default, or fewer if a GPU's memory does not suffice.
+            on_step: called after each denoiser call of each batch with its number, the timestep, the estimated scenes.
+
+        Returns:
+            Gaussians [batch * samples], the samples of one image next to each other, in the frame of its camera.
+
+        Raises:
+            CompleteSplatError: a weight lies outside of [0, 1], skips meet hidden pixels, or the steps are impossible.
+        """
+        weight = allowed_skip_weight(skip_weight, visible)
+        images = images if visible is None else images * visible
+        conditioning = self.conditioning(images)
+        stage1 = self.autoreconstructor
+        features = stage1.encoder.features(images, stage1.reconstructor.feature_levels) if weight else []
+        shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
+        noise = draw_noise(len(images), samples, shape, seed).to(images.device)
+        image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
+        decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
+
+        def draw(part: slice) -> Any:
+            watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
+            return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
+
+        # Sample first, then decode: if a GPU's memory does not suffice to decode a part, its latents are not lost.
+        latents = torch.cat(in_parts(draw, len(noise), batch))
+        return concatenate(in_parts(lambda part: decode(latents[part], part), len(noise), batch))
+
+    def _decode(
+        self,
+        image_of: Tensor,
+        features: Sequence[Tensor],
+        skip_weight: float,
+        cameras: Cameras,
+        depth_range: Tensor,
+        latent: Tensor,
+        part: slice,
+    ) -> Gaussians:
+        """Decode the latents of a part of all samples; `image_of` maps each sample to the index of its image."""
+        indices = image_of[part]
+        skips = [feature[indices] for feature in features], skip_weight
+        splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)
+        gaussians: Gaussians = splatter_image.gaussians(cameras[indices], depth_range[indices])
+        return gaussians
+
+    def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
+        """Use another sampler from now on, with the noise schedule and prediction type of training."""
+        config = with_forward_process(sampler, self.architecture["sampler"])
+        check_architecture({**self.architecture, "sampler": config})
+        self.sampler = build(config)
+        self.architecture["sampler"] = config
+
+    @staticmethod
+    def from_pretrained(path: Path | str) -> "SceneModel":
+        """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
+
+        Args:
+            path: a folder of weights or of a run, a checkpoint of a run, a name of weights in the package, or an id on
+                the Hugging Face hub (`weights_folder`). `splatter_image:NAME`, or a file or folder of these weights,
+                gives a `PublishedGenerator`.
+
+        Raises:
+            WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
+                `parts` does not allow; or the run's model makes no scene from a photo.
+        """
+        try:
+            if is_published(path):
+                model: SceneModel = PublishedGenerator(str(path))
+            elif (checkpoint := checkpoint_of(path)) is not None:
+                model = _read_checkpoint(checkpoint)
+            else:
+                model = _read_folder(weights_folder(path))
+            name = not_finite(model.state_dict())
+        except WeightsError:
+            raise
+        except Exception as error:
+            reason = str(error).strip().splitlines()
+            raise WeightsError(f"{path}: cannot be loaded: {reason[0] if reason else type(error).__name__}") from error
+        if name is not None:
+            raise WeightsError(f"{path}: {name} is not finite")
+        return model
+
+
+class OneAnswer(SceneModel):
+    """Model of one pass from a photo to its scene: stage 1 at its posterior's mode, or the baseline Splatter Image.
+
+    Args:
+        network: config of the network, as in `conf/`.
+        image_size: side of the square images, in pixels.
+        training: facts about the training images (`completesplat.parts.TrainingPictures`).
+
+    Raises:
+        WeightsError: the config has a part or an option that weights may not name (`parts`).
+    """
+
+    def __init__(self, network: Mapping[str, Any], image_size: int, training: Mapping[str, Any] | None = None) -> None:
+        facts = {} if training is None else {"training": dict(training)}
+        architecture = {"network": untrained(network), "image_size": image_size, **facts}
+        check_architecture(architecture)
+        super().__init__(architecture)
+        self.network = build(self.architecture["network"])
+
+    @property
+    def reconstructing(self) -> Any:
+        """Return the network."""
+        return self.network
+
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: int = 1,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        **settings: Any,
+    ) -> Gaussians:
+        """Reconstruct the scene of each image, in its camera's frame.
+
+        Args:
+            visible: 0 where an image is hidden; hidden pixels have no influence.
+            **settings: sampling options of `CompleteSplat.generate`; they have no effect.
+
+        Raises:
+            CompleteSplatError: several samples are asked for.
+        """
+        require_one(samples)
+        splatter_image = self.eval().network(images if visible is None else images * visible).splatter_image
+        gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
+        return gaussians
+
+    @staticmethod
+    def with_trained(
+        architecture: Mapping[str, Any], network: Mapping[str, Tensor], camera: Mapping[str, Any]
+    ) -> "OneAnswer":
+        """Return a model with a trained network's weights, and with its training set's typical camera.
+
+        Raises:
+            WeightsError: the camera lacks `fov_degrees`, `depth_range` or `up`, or they are no numbers.
+        """
+        with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
+            model = OneAnswer(**architecture)
+        names = ("fov_degrees", "depth_range", "up")
+        try:
+            measured = {name: torch.tensor(camera[name], dtype=torch.float32) for name in names}
+        except (KeyError, TypeError, ValueError) as error:
+            raise WeightsError("the training set's typical camera is not known") from error
+        model.load_state_dict({f"network.{name}": x for name, x in network.items()} | measured)
+        return model.eval()
+
+
+def _read_folder(folder: Path) -> SceneModel:
+    architecture = read_architecture(folder)
+    check_sizes(architecture, sizes_in(folder / WEIGHTS_FILE), (WEIGHTS_FILE, CONFIG_FILE))
+    model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
+    model.load_state_dict(load_file(folder / WEIGHTS_FILE))
+    return model.eval()
+
+
+def _read_checkpoint(checkpoint: Path) -> SceneModel:
+    """Return the model of a run's checkpoint, with averaged weights if the run averages them."""
+    architecture, prefix = architecture_of_run(checkpoint)
+    contents = read_checkpoint(checkpoint)
+    state = {k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
+    whose = "network." if "network" in architecture else ""
+    sizes = {f"{whose}{name}": value.shape for name, value in state.items()}
+    check_sizes(architecture, sizes, (checkpoint.name, RUN_CONFIG_FILE))
+    if whose:
+        return OneAnswer.with_trained(architecture, state, contents.get(CAMERA, {}))
+    model = CompleteSplat(**architecture)
+    model.load_state_dict(state)
+    return model.eval()

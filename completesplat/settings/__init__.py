@@ -1,0 +1,1 @@
+"""Options in `conf/`, the checks of their values, and the arguments and help of commands."""

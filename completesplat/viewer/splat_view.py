@@ -1,0 +1,281 @@
+"""The 3D part of the page: splats, the places of samples, and the viewpoint."""
+
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import viser
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from completesplat.export.images import color_depth
+from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
+from completesplat.geometry.rotations import matrix_to_quaternion
+from completesplat.geometry.trajectories import orbit
+from completesplat.viewer.sample import Sample
+
+LARGEST_COVARIANCE = 3e4
+GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
+ORBIT_CAMERAS = 12
+REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """A row of samples and its camera. A single sample is seen exactly as by its reference camera.
+
+    Attributes:
+        pivots: the point that each sample turns about, before it is moved to its place.
+        right, spacing: direction of the row, and distance between neighbours (1.25 image widths at the pivot).
+        position, look_at: place and target of the page's camera.
+        fov: its vertical field of view, in radians, in windows that are not narrower than `aspect`.
+        aspect: width / height of the region that must be visible.
+    """
+
+    pivots: list[Float[Tensor, "3"]]
+    right: Float[np.ndarray, "3"]
+    spacing: float
+    position: Float[np.ndarray, "3"]
+    look_at: Float[np.ndarray, "3"]
+    fov: float
+    aspect: float
+
+    @property
+    def distance(self) -> float:
+        """Distance from the camera to its target."""
+        return float(np.linalg.norm(self.look_at - self.position))
+
+    def shift(self, index: int) -> Float[np.ndarray, "3"]:
+        """Return a sample's offset; the middle of the row is where the first sample was."""
+        return self.right * self.spacing * (index - (len(self.pivots) - 1) / 2)
+
+    def fov_in(self, aspect: float) -> float:
+        """Return the vertical field of view, in radians, that shows the row in a window of this width / height."""
+        return 2 * math.atan(math.tan(self.fov / 2) * max(1.0, self.aspect / aspect))
+
+    def beside(self, index: int, part: Gaussians) -> Gaussians:
+        """Return the Gaussians that reach at most half-way to a neighbour; all of them for a single sample."""
+        if len(self.pivots) == 1:
+            return part
+        reach = (part.means - self.pivots[index].to(part.means)).norm(dim=-1) + 2 * part.scales.amax(-1)
+        return part.keep(reach <= self.spacing / 2)
+
+    def looks_like(self, other: "Arrangement") -> bool:
+        """Return whether a camera placed for `other` may stay: equal number of samples, nearly equal camera."""
+        apart = np.linalg.norm(self.look_at - other.look_at) + np.linalg.norm(self.position - other.position)
+        return len(self.pivots) == len(other.pivots) and float(apart) < SAME * other.distance
+
+
+def arrangement_of(samples: Sequence[Sample]) -> Arrangement:
+    """Return a row of samples, seen by the first one's reference camera, moved back until all are visible."""
+    reference = samples[0].reference
+    pivots = [sample.pivot() for sample in samples]
+    pose = reference.camera_to_world.cpu().numpy()
+    pivot, eye = pivots[0].cpu().numpy(), pose[:3, 3]
+    forward, distance = pose[:3, 2], float(np.linalg.norm(pivot - eye))
+    height, width = reference.image_size
+    tangent = height / 2 / reference.intrinsics[1, 1].item()
+    aspect = width / 2 / reference.intrinsics[0, 0].item() / tangent
+    spacing = GAP * 2 * distance * tangent * aspect
+    if len(samples) > 1:
+        aspect = NARROWEST_WINDOW
+        distance = max(distance, len(samples) * spacing / 2 / (tangent * aspect))
+    position = pivot - forward * distance
+    return Arrangement(pivots, pose[:3, 0], spacing, position, pivot, 2 * math.atan(tangent), aspect)
+
+
+class SplatView:
+    """Splats and cameras on the page: one sample or all side by side, all layers or some, in colour or by depth.
+
+    `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads. The
+    direction up and the cameras [view] of a data set are in the reference camera's frame.
+
+    Side by side, only the middle part of each sample is shown, because scenes are wider than an image and would hide
+    each other.
+    """
+
+    def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
+        self.server = server
+        self.data_cameras = data_cameras
+        self.samples: list[Sample] = []
+        self.chosen: int | None = 0
+        self.hidden_layers: set[int] = set()
+        self.depth = False
+        self.cameras: set[str] = set()
+        self._arrangement: Arrangement | None = None
+        self._splats: dict[str, viser.GaussianSplatHandle] = {}
+        self._frusta: list[viser.CameraFrustumHandle] = []
+        self._lock = threading.RLock()
+        self.up = np.asarray(up, float)
+        server.scene.set_up_direction(self.up)
+        server.on_client_connect(self._welcome)
+
+    @property
+    def shown(self) -> list[Sample]:
+        """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
+        samples, chosen = self.samples, self.chosen
+        return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
+
+    def show(self, samples: Sequence[Sample]) -> None:
+        """Replace the samples, and draw the new ones."""
+        with self._lock:
+            self.samples = list(samples)
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Draw the state of the attributes; move the cameras of browsers only if the arrangement has changed."""
+        with self._lock, self.server.atomic():
+            samples = self.shown
+            if not samples:
+                return
+            arrangement = arrangement_of(samples)
+            self._draw_splats(samples, arrangement)
+            self._draw_cameras(samples, arrangement)
+            if self._arrangement is None or not arrangement.looks_like(self._arrangement):
+                self._arrangement = arrangement
+                self.look_from_the_front()
+
+    def forget_view(self) -> None:
+        """Make the next drawing be seen from the front, because it shows another image."""
+        with self._lock:
+            self._arrangement = None
+
+    def look_from_the_front(self, client: viser.ClientHandle | None = None) -> None:
+        """Move a browser's camera (None: those of all present and future browsers) to where the photo was taken."""
+        with self._lock:
+            if self._arrangement is None:
+                return
+            view, start = self._arrangement, self.server.initial_camera
+            start.position, start.look_at, start.fov = view.position, view.look_at, view.fov
+            for browser in list(self.server.get_clients().values()) if client is None else [client]:
+                with browser.atomic():
+                    camera = browser.camera
+                    camera.up_direction = self.up
+                    camera.position, camera.look_at = view.position, view.look_at
+                    camera.fov = view.fov_in(camera.image_width / camera.image_height)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Let narrow windows of a new browser (a phone's, upright) show the whole image, as wide ones do."""
+        seen: float | None = None
+
+        def fit(camera: viser.CameraHandle) -> None:
+            nonlocal seen
+            aspect, view = camera.image_width / max(camera.image_height, 1), self._arrangement
+            if view is not None and aspect > 0 and aspect != seen:
+                seen = aspect
+                camera.fov = view.fov_in(aspect)
+
+        client.camera.on_update(fit)
+        fit(client.camera)
+
+    def _draw_splats(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
+        scenes = [sample.for_viewers() for sample in shown]
+        if self.depth:
+            scenes = depth_colored(scenes)
+        wanted = {
+            f"/sample_{i}/layer_{layer}": (
+                arrangement.beside(i, layer_of(scene, layer, sample.layers)), arrangement.shift(i), layer
+            )
+            for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True))
+            for layer in range(sample.layers)
+        }  # fmt: skip
+        for name in self._splats.keys() - wanted.keys():
+            self._splats.pop(name).remove()
+        for name, (gaussians, shift, layer) in wanted.items():
+            splats = to_splats(gaussians)
+            arrays = splats.centers, splats.covariances, splats.colors, splats.opacities
+            handle = self._splats.get(name)
+            if handle is None:
+                handle = self._splats[name] = self.server.scene.add_gaussian_splats(name, *arrays)
+            else:
+                handle.set_gaussians(*arrays)
+            handle.scale, handle.position = splats.scale, shift
+            handle.visible = layer not in self.hidden_layers
+
+    def _draw_cameras(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
+        for frustum in self._frusta:
+            frustum.remove()
+        self._frusta = []
+        for i, sample in enumerate(shown):
+            reference = sample.reference
+            up = reference.intrinsics.new_tensor(self.up.tolist())
+            groups = {
+                "reference": (reference[None], REFERENCE_COLOR),
+                "orbit": (orbit(reference, arrangement.pivots[i], up, ORBIT_CAMERAS), ORBIT_COLOR),
+                "data set": (self.data_cameras, DATA_COLOR),
+            }
+            for name, (cameras, color) in groups.items():
+                if name in self.cameras and cameras is not None:
+                    self._add_frusta(f"/cameras/{i}/{name.replace(' ', '_')}", cameras, color, arrangement, i)
+
+    def _add_frusta(
+        self, name: str, cameras: Cameras, color: tuple[int, int, int], arrangement: Arrangement, index: int
+    ) -> None:
+        height, width = cameras.image_size
+        poses = cameras.camera_to_world
+        for i, (pose, intrinsics) in enumerate(zip(poses, cameras.intrinsics, strict=True)):
+            self._frusta.append(
+                self.server.scene.add_camera_frustum(
+                    f"{name}/{i}",
+                    fov=2 * math.atan(height / 2 / intrinsics[1, 1].item()),
+                    aspect=width / height,
+                    scale=0.08 * arrangement.distance,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    color=color,
+                    wxyz=matrix_to_quaternion(pose[:3, :3]).cpu().numpy(),
+                    position=(pose[:3, 3].cpu().numpy() + arrangement.shift(index)),
+                )
+            )
+
+
+class ViserSplats(NamedTuple):
+    """Arguments of `add_gaussian_splats`, in units of `scale` scene units.
+
+    viser stores covariances as float16, which ends at 65504 and has few digits below 6e-5. In this unit, the largest
+    covariance is just below that end, and thin Gaussians keep their shape.
+    """
+
+    centers: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colors: UInt8[np.ndarray, "gaussian 3"]
+    opacities: UInt8[np.ndarray, "gaussian 1"]
+    scale: float
+
+
+def to_splats(gaussians: Gaussians) -> ViserSplats:
+    """Convert one unbatched set; leave out Gaussians that are not finite, and clamp colours to [0, 1]."""
+    finite = gaussians.keep(gaussians.finite()).to("cpu")
+    largest = finite.scales.max().item() if finite.count else 1.0
+    scale = max(largest, 1e-12) / math.sqrt(LARGEST_COVARIANCE)
+    unit = replace(finite, means=finite.means / scale, scales=finite.scales / scale)
+    return ViserSplats(
+        unit.means.float().numpy(),
+        unit.covariances().float().numpy(),
+        _bytes(finite.colors),
+        _bytes(finite.opacities[:, None]),
+        scale,
+    )
+
+
+def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
+    return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
+
+
+def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
+    """Return one layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
+    size = gaussians.count // layers
+    return gaussians[layer * size : (layer + 1) * size]
+
+
+def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:
+    """Colour scenes by depth (z), near bright and far dark, on one scale for all of them."""
+    depths = torch.cat([scene.means[:, 2] for scene in scenes])
+    colors, _ = color_depth(depths[None, None, :])
+    parts = torch.split(colors[:, 0].T, [scene.count for scene in scenes])
+    return [replace(scene, colors=part) for scene, part in zip(scenes, parts, strict=True)]

@@ -1,0 +1,248 @@
+"""Which run stands in which of the paper's tables or in one of our own, and what its cells say."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from completesplat.errors import CompleteSplatError
+from completesplat.results.paper_figures import tables
+from completesplat.results.runs import find
+from completesplat.results.tables import SSIM_NOTE, Table
+
+HYDRANTS = {"name": "co3d", "data_set": "co3d/hydrant", "resolution": 128, "image_size": 128, "scenes": 77}
+HYDRANTS |= {"subset": "fewview_dev", "scenes_listed": 77}
+HYDRANTS |= {"protocol_views": "reference: a sequence's first frame; targets: its other frames"}
+ROOMS = {
+    "data_set": "realestate10k",
+    "image_size": 128,
+    "protocol_views": "index in pixelSplat's format, SHA-256 fbcff9b4b131",
+}
+ALL_ROOMS = ROOMS | {"name": "realestate10k_128", "resolution": 128, "scenes": 6473}
+FAR = {"protocol_views": "reference: first frame; 1 targets, the last 150 frames away"}
+SOME_ROOMS = ROOMS | FAR | {"name": "realestate10k_100", "resolution": 128, "scenes": 100}
+PAPERS = ["full_images", "realestate10k", "ablations", "objects_only"]
+
+
+def made(runs) -> dict[str, Table]:
+    return {table.name: table for table in tables(find(runs))}
+
+
+def texts(table: Table) -> list[dict[str, str]]:
+    """The rows by heading."""
+    names = [heading.joined(" ") for heading in table.headings]
+    return [{name: cell.text for name, cell in zip(names, row.cells, strict=True)} for row in table.rows]
+
+
+def ours(table: Table) -> list[dict[str, str]]:
+    """The rows that are not the paper's, by heading."""
+    return [row for row, found in zip(texts(table), table.rows, strict=True) if found.source != "paper"]
+
+
+def test_a_run_by_the_papers_protocol_stands_below_its_rows_in_its_own_columns(runs, run) -> None:
+    alone = tables(None)
+    assert [table.name for table in alone] == PAPERS
+    assert not any(ours(table) for table in alone)
+    run("a", 17.456, **HYDRANTS)
+    found = made(runs)
+    assert list(found) == PAPERS
+    (row,) = ours(found["full_images"])
+    assert row["method"] == "completesplat: VariationalAutoReconstructor [1]"
+    assert (row["Hydrants PSNR ↑"], row["Teddybears PSNR ↑"]) == ("17.46", "-")
+    assert (row["time per sequence inference"], row["time per sequence rendering"]) == ("15.7 ms", "4.1 min")
+    assert (row["scenes"], row["pixels"]) == ("77", "128")
+    assert ours(found["objects_only"])[0]["Hydrants PSNR ↑"] == "18.46"
+
+
+@pytest.mark.parametrize(
+    "different",
+    [
+        {"name": "images"},
+        {"resolution": 64},
+        {"skipped": 3},
+        {"subset": "fewview_train"},
+        {"scenes": 76},
+        {"scenes_listed": None},
+        {"data_set": "toy_objects"},
+        {"skip_weight": 0.0},  # for completing what is hidden; the tables are scored with skip connections
+        {"protocol_views": "reference: a sequence's first frame; targets: 5 others"},
+        SOME_ROOMS | {"scenes": 99},
+        SOME_ROOMS | {"scenes": 6473},
+        SOME_ROOMS | {"protocol_views": "reference: first frame; 3 targets, the last 30 frames away"},
+        ALL_ROOMS | {"scenes": 100},
+        ALL_ROOMS | {"resolution": 64},
+        ALL_ROOMS | {"protocol_views": "index in pixelSplat's format, SHA-256 0123456789ab"},
+        ALL_ROOMS | FAR,
+    ],
+)
+def test_a_run_by_another_protocol_stands_in_a_table_of_its_own(runs, run, different) -> None:
+    run("a", 17.5, **(HYDRANTS | different))
+    found = made(runs)
+    assert not any(ours(found[name]) for name in PAPERS)
+    (row,) = ours(found["own_1"])
+    assert row["all pixels, novel views PSNR ↑"] == "17.50"
+
+
+def test_numbers_of_scenes_and_resolutions_of_the_paper_are_let_in_and_one_scene_more_is_explained(runs, run) -> None:
+    sizes = [(100, 128), (6473, 128), (6473, 256), (6474, 128)]
+    large = ALL_ROOMS | {"name": "realestate10k_256", "resolution": 256}
+    for index, protocol in enumerate([SOME_ROOMS, ALL_ROOMS, large, ALL_ROOMS | {"scenes": 6474}]):
+        run(f"run{index}", 20.0, **protocol)
+    run("too many", 20.0, **ALL_ROOMS | {"scenes": 6475})
+    table = made(runs)["realestate10k"]
+    assert [(int(row["scenes"]), int(row["pixels"])) for row in ours(table)] == sizes
+    below = " ".join(table.below())
+    assert "6,474" in below
+    assert "39" in below  # of the 100 scenes, which nobody can have
+
+
+@pytest.mark.parametrize(("samples", "table"), [(20, "full_images"), (8, "own_1")])
+def test_an_oracle_stands_beside_one_of_as_many_samples_only(runs, run, samples, table) -> None:
+    several = {"samples": samples, "sampler": "DDIMScheduler", "method": "LatentDiffusion"}
+    run("a", 17.0, {"best_of_k": 18.0, "best_of_k_by_metric": 18.5}, **HYDRANTS, **several, criterion="psnr")
+    found = made(runs)
+    labels = [row["method"] for row in ours(found[table])]
+    for chosen in ("PSNR", "each metric"):
+        assert f"completesplat: LatentDiffusion, {samples}-best oracle by {chosen} [1]" in labels
+    assert ours(found["full_images"])[0]["method"] == "completesplat: LatentDiffusion, single sample [1]"
+    assert ("own_1" in found) == (samples != 20)
+
+
+def test_what_has_seen_its_views_is_not_beside_the_paper(runs, run) -> None:
+    path = run("a", 30.0, **HYDRANTS)
+    tested = json.loads(path.read_text())
+    run("b", 20.0, **HYDRANTS)
+    seen = tested | {"model": tested["model"] | {"upper_bound": True}}
+    for results in (seen, {"upper_bound": True, "test": tested}):  # as `test` and `fit` write it
+        path.write_text(json.dumps(results))
+        found = made(runs)
+        assert [row["Hydrants PSNR ↑"] for row in ours(found["full_images"])] == ["20.00"]
+        assert "(upper bound)" in ours(found["own_1"])[0]["method"]
+
+
+def test_own_tables_hold_only_what_was_measured_alike(runs, run) -> None:
+    changes = [{}, {"name": "other"}, {"scenes": 19}, {"views": 79}, {"data_fingerprint": "x"}, {"crop": "y"}]
+    for index, change in enumerate([{}, *changes]):
+        run(f"run{index}", 20.0 + index, **change)
+    rows = [len(ours(table)) for name, table in made(runs).items() if name.startswith("own_")]
+    assert sorted(rows) == [1] * 5 + [2]
+
+
+def test_best_and_second_of_our_own_are_marked_and_naive_predictors_are_not(runs, run) -> None:
+    for name, psnr in {"a": 20.0, "b": 22.0, "c": 21.0}.items():
+        run(name, psnr, {"mean_image": 99.0})
+    table = made(runs)["own_1"]
+    column = [heading.text for heading in table.headings].index("PSNR ↑")
+    cells = [(row.cells[column].text, row.cells[column].mark) for row in table.rows]
+    assert cells == [("20.00", ""), ("22.00", "best"), ("21.00", "second"), ("99.00", "")]  # and once only
+    assert any(SSIM_NOTE in line for line in table.below())
+
+
+def test_what_is_missing_says_why_below_the_table(runs, run) -> None:
+    run("a", 17.5, **HYDRANTS, missing={"lpips": "missing: no weights of VGG"})
+    table = made(runs)["full_images"]
+    (row,) = ours(table)
+    reasons = {"LPIPS ↓": "lpips: missing: no weights of VGG", "KID ↓": "kid: not measured for model"}
+    for column, reason in reasons.items():
+        text = row[f"Hydrants {column}"]
+        assert text.startswith("missing: note ")
+        assert f"[{text.removeprefix('missing: note ')}] {reason}" in table.below()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[1]", "holds no mapping"),
+        ('{"steps": 9}', "does not say how it was measured"),
+        ('{"protocol": {"data_set": "x", "scenes": 1}, "model": {}}', "its protocol does not say resolution"),
+        ('{"protocol": {"data_set": "x", "scenes": 1, "resolution": 2}, "model": {"full": {"novel": 1}}}', "no scores"),
+    ],
+)
+def test_a_broken_or_foreign_file_is_left_out_with_a_line(runs, run, content, said) -> None:
+    run("good", 20.0)
+    (runs / "bad").mkdir()
+    (runs / "bad/metrics.json").write_text(content)
+    tree = find(runs)
+    (warning,) = tree.warnings
+    assert warning.startswith(f"{runs / 'bad/metrics.json'}: left out, ")
+    assert said in warning
+    assert "\n" not in warning
+    assert len(tables(tree)) == len(PAPERS) + 1
+
+
+def test_a_folder_without_results_is_refused_with_what_makes_them(runs) -> None:
+    with pytest.raises(CompleteSplatError, match="completesplat test"):
+        tables(find(runs))
+    with pytest.raises(CompleteSplatError, match="no such folder"):
+        find(runs / "nowhere")
+
+
+def test_hidden_modes_have_a_table_of_their_own_unless_a_protocol_is_missing(runs) -> None:
+    scores = {"coverage": 0.5, "total_variation": 0.25, "sharpness": 1.0, "rejected": 0.125, "scenes": 4, "samples": 32}
+    protocol = {"scenes": ["x", "y"], "method": "LatentDiffusion", "samples": 32, "data_fingerprint": "f00d"}
+    for name in ("a", "b", "lacking"):
+        (runs / name).mkdir()
+        modes = {"true_sampler": scores, "model": scores | {"coverage": 0.75}}
+        (runs / name / "hidden_modes.json").write_text(json.dumps(modes))
+        (runs / name / "protocol.json").write_text(json.dumps(protocol))
+    (runs / "lacking/protocol.json").unlink()
+    assert "protocol.json is missing beside it" in find(runs).warnings[0]
+    table = made(runs)["hidden_modes_1"]
+    rows = ours(table)
+    assert table.title == "Hidden modes, data f00d"
+    assert "[1] a: scenes 2, samples 32, data f00d." in table.below()
+    assert [row["method"] for row in rows] == ["LatentDiffusion [1]", "LatentDiffusion [2]", "true sampler [1]"]
+    assert [row["coverage ↑"] for row in rows] == ["0.750", "0.750", "0.500"]
+    assert (rows[0]["samples"], rows[0]["total variation ↓"]) == ("32", "0.250")
+
+
+SWEPT = {"data_set": "toy_objects", "resolution": 32, "scenes": 9, "missing": {"lpips": "missing: no weights"}}
+
+
+@pytest.fixture
+def job(runs: Path, sweep):
+    """Writes a finished job of the sweep `runs/sweep`."""
+    sweep.folder = runs / "sweep"
+
+    def write(ablation: str, seed: int, psnr: float, **protocol) -> None:
+        seconds = {"inference": 2.0 + seed, "rendering": 0.5}
+        model = {"scenes": 9, "views": 9, "seconds": seconds, "full": {"novel": {"psnr": psnr, "ssim": 0.5}}}
+        mean_image = {"scenes": 9, "views": 9, "full": {"novel": {"psnr": 10.0}}}
+        test = {"protocol": SWEPT | protocol, "model": model, "mean_image": mean_image}
+        sweep.add(f"ablation={ablation}", f"seed={seed}", test=test)
+        sweep.plan([])
+
+    return write
+
+
+def test_a_sweep_stands_beside_the_papers_rows_in_columns_of_its_own(runs, job) -> None:
+    for seed in (0, 1):
+        job("full", seed, 20.0 + seed)
+        job("no_skips", seed, 15.0)
+    found = made(runs)
+    assert list(found) == ["full_images", "realestate10k", "ablations_sweep", "objects_only"]  # and no table of jobs
+    table = found["ablations_sweep"]
+    lines = {row["published row of the paper"]: row for row in texts(table) if row["setting"] != "mean_image"}
+    assert len(lines) == 9
+    full = lines["Our AutoReconstructor"]
+    assert (full["published PSNR ↑"], full["published LPIPS ↓"]) == ("17.59", "0.471")
+    own = "ours: toy_objects, 32 pixels"
+    assert (full[f"{own} PSNR ↑"], full[f"{own} seeds"], full[f"{own} scenes"]) == ("20.50 ± 0.71", "2", "9")
+    assert (full[f"{own} inference"], full[f"{own} rendering"]) == ("2.5 sec", "500.0 ms")
+    assert lines["No skip connections"][f"{own} PSNR ↑"] == "15.00 ± 0.00"
+    assert lines["No SSIM"][f"{own} PSNR ↑"] == "-"
+    number = full[f"{own} LPIPS ↓"].removeprefix("missing: note ")
+    assert f"[{number}] lpips: missing: no weights" in table.below()
+
+
+def test_jobs_tested_by_different_protocols_do_not_share_a_table(runs, job) -> None:
+    job("full", 0, 20.0)
+    job("no_skips", 0, 15.0, resolution=64)
+    assert [table.name for table in tables(find(runs))].count("ablations_sweep") == 2
+
+
+def test_a_sweep_without_ablations_is_a_number_of_runs(runs, job) -> None:
+    job("nothing_of_the_paper", 0, 20.0)
+    job("nothing_of_the_paper", 1, 21.0)
+    assert [table.name for table in tables(find(runs))] == [*PAPERS, "own_1"]

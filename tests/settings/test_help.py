@@ -1,0 +1,96 @@
+"""What `VERB --help` says: each setting with its comment, its kind and choices, in lines that fit."""
+
+import re
+
+import pytest
+
+from completesplat.cli import VERBS
+from completesplat.errors import CompleteSplatError
+from completesplat.settings.help import WIDTH, page
+from completesplat.settings.options import (
+    TASKS,
+    about_groups,
+    choices_of_verb,
+    groups,
+    options,
+    parse,
+    settings_of_option,
+    settings_of_verb,
+)
+
+WITH_TASKS = [(verb, task) for verb in VERBS for task in (options(f"{verb}_task") if verb in TASKS else [None])]
+
+
+@pytest.mark.parametrize(("verb", "task"), WITH_TASKS)
+def test_each_own_setting_is_explained_in_conf(verb, task):
+    places = {choice.place.partition(".")[0] for choice in choices_of_verb(verb, task)} | {"stage1", "stage2"}
+    settings = [setting for setting in settings_of_verb(verb, task) if setting.key.partition(".")[0] not in places]
+    assert settings[0].key == "out"
+    unexplained = [setting.key for setting in settings if not setting.comment and "." not in setting.key]
+    assert unexplained == []
+
+
+@pytest.mark.parametrize(("verb", "task"), [one for one in WITH_TASKS if one[1] in (None, "check", "html", "samplers")])
+def test_a_page_has_examples_settings_and_parts_and_fits(verb, task):
+    text = page(verb, [task] if task else [])
+    assert text.startswith(f"completesplat {verb}: ")
+    assert max(map(len, text.splitlines())) <= WIDTH
+    assert "Examples:\n  completesplat " in text
+    for setting in settings_of_verb(verb, task):
+        assert re.search(rf"^  {re.escape(setting.key)}(=| |$)", text, re.MULTILINE), setting.key
+    for choice in choices_of_verb(verb, task):
+        assert re.search(rf"^  {re.escape(choice.place)}(=| |$)", text, re.MULTILINE), choice
+    assert "_target_" not in text
+
+
+def test_kinds_ranges_and_choices_are_shown():
+    text = " ".join(page("predict", []).split())
+    assert "samples=4 Drawn of each photograph. [whole number, 1 to 1000]" in text
+    assert "[number, 0 to 1 or null]" in text
+    assert "image needed; A photograph" in text
+    assert "rasterizer=auto what draws Gaussians [auto, cuda, reference, tiled]" in text
+
+
+def test_a_part_shows_its_settings_with_what_its_class_says_of_them():
+    text = " ".join(page("fit", ["data=co3d_hydrants"]).split())
+    assert "data.evaluation_batch_size=4 scenes of an evaluation batch; 1 is used if" in text
+    assert "data.on_bad=skip What cannot be read: skip" in text
+    assert "[skip, raise]" in text
+    assert "data.category=hydrant" in text
+    assert "Made by completesplat.data.co3d.module.CO3DDataModule." in text
+    assert "optimizer.lr=5.0e-5" in page("fit", ["optimizer"])
+    assert "trainer.max_steps=" in page("fit", ["trainer"])
+    pages = [page("fit", [group]) for group in ("data", "model", "evaluation", "ablation")]
+    assert max(len(line) for text in pages for line in text.splitlines()) <= WIDTH
+
+
+def test_what_there_is_no_help_on_is_answered_with_the_nearest():
+    with pytest.raises(CompleteSplatError, match=r"no data 'toy_object': there are .*; did you mean toy_objects"):
+        page("fit", ["data=toy_object"])
+    with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean model\?"):
+        page("fit", ["modle"])
+
+
+def test_every_group_is_explained_and_every_option_is_read():
+    assert set(groups()) <= about_groups().keys()
+    for group in groups():
+        for option in options(group):
+            assert settings_of_option(group, option) is not None
+
+
+def test_a_files_lines_are_read_as_they_explain_themselves():
+    written = parse(
+        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n# Of all.\npart:\n"
+        "  # Of the inner\n  # one.\n  c: x\n  d: null\n"
+        "defaults:\n  - _base\n  - override /data@here: toy # why\n  - _self_\n"
+    )
+    assert (written.about, written.package) == ("About it.", "_global_")
+    assert [tuple(one) for one in written.settings if one.key != "defaults"] == [
+        ("a", "1", "Of the first."),
+        ("b", "[1, 2]", "of the second"),
+        ("part", "", "Of all."),
+        ("part.c", "x", "Of the inner one."),
+        ("part.d", "null", ""),
+    ]
+    assert [tuple(one) for one in written.choices] == [("data", "here", "toy", "why")]
+    assert written.bases == ["_base"]

@@ -1,0 +1,67 @@
+"""Settings are held against the signature of the function that they start."""
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, TypedDict
+
+import pytest
+
+from completesplat.errors import CompleteSplatError
+from completesplat.settings.schema import Entries, Natural, OneOf, Positive, Range, check_settings
+
+
+class Part(TypedDict):
+    size: Positive
+
+
+def task(
+    count: Positive,
+    share: Annotated[float, Range(0, 1)],
+    flag: bool,
+    kind: Literal["a", "b"],
+    words: Annotated[Sequence[Annotated[str, OneOf(("x", "y"))]], Entries(1)],
+    workers: Natural | None,
+    by_name: Mapping[str, Sequence[Positive]],
+    part: Part | Literal[False],
+    anything: Any,
+) -> None: ...
+
+
+GOOD: dict[str, Any] = {
+    **{"count": 1, "share": 0.5, "flag": True, "kind": "b", "words": ["x"], "workers": None, "by_name": {"a": [1]}},
+    **{"part": {"size": 2}, "anything": {"_target_": "x"}, "_target_": "task", "out": 3},
+}
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "said"),
+    [
+        ("count", 0, "must be at least 1"),
+        ("count", 1.5, "must be a whole number"),
+        ("count", True, "must be a whole number"),
+        ("count", None, "must be a whole number"),
+        ("share", "half", "must be a number"),
+        ("share", float("nan"), "must lie between 0 and 1"),
+        ("flag", 1, "must be true or false"),
+        ("kind", "c", "choose one of a, b"),
+        ("words", "x", "must be a list, such as words=[x]"),
+        ("words", [], "must not be empty"),
+        ("words", ["x", "z"], "choose one of x, y"),
+        ("workers", -1, "must be at least 0"),
+        ("by_name", [1], "must be a mapping"),
+    ],
+)
+def test_what_does_not_fit_is_named_with_what_it_may_be(setting, value, said):
+    with pytest.raises(CompleteSplatError) as caught:
+        check_settings(task, GOOD | {setting: value})
+    assert str(caught.value) == f"{setting}={value}: {said}"
+
+
+def test_what_fits_is_accepted_and_what_lies_deeper_is_named_with_its_place():
+    for other in ({}, {"workers": 0}, {"part": False}, {"share": 1}, {"by_name": {}}):
+        check_settings(task, GOOD | other)
+    for wrong, place in (
+        ({"by_name": {"a": [1], "b": [0]}}, r"by_name\.b=\[0\]"),
+        ({"part": {"size": 0}}, "part.size=0"),
+    ):
+        with pytest.raises(CompleteSplatError, match=f"^{place}: must be at least 1"):
+            check_settings(task, GOOD | wrong)

@@ -1,0 +1,60 @@
+"""Whatever a picture is called, its folder lies in `out`, and its name can be printed."""
+
+import os
+from pathlib import Path
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from completesplat.files import LONGEST, MOST_SHOWN, folder_names, printable, safe_name
+
+# What a file system may hold (any bytes but NUL and the slash), and what only a program may hand over.
+FILES = st.binary(min_size=1, max_size=300).map(os.fsdecode)
+ODD = st.text(st.sampled_from("./\\\0\n\r\t\x1b\x7f\x85\u2028\udc80\ud800aÄß \u00e9e\u0301:*?"), max_size=300)
+STEMS = st.one_of(FILES, ODD, st.text(st.characters(), max_size=300))
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.lists(STEMS, max_size=8))
+@example(["..", ".", "...", "", "/", "\\", "../../x", "\0", "\udcff", "\ud800"])
+@example(["ä" * 255, "ä" * 254, "Ä" * 255, "a" * 255, "a" * 99 + "é"])
+@example(["é", "e\u0301", "É", "a", "a_2", "A", "a", "a_2"])
+@example(["x" * 100] * 12)
+def test_every_name_stays_in_the_folder_and_is_its_own(stems):
+    out = Path("/out")
+    names = folder_names(stems)
+    assert len(names) == len(stems)
+    for name in names:
+        assert Path(os.path.normpath(out / name)).parent == out
+        assert Path(os.path.normpath(out / name)).name == name
+        assert not name.startswith(".")
+        assert "\\" not in name
+        assert 0 < len(name.encode()) <= LONGEST
+        assert printable(name) == name
+    assert len({name.casefold() for name in names}) == len(names)
+
+
+@settings(max_examples=300, deadline=None)
+@given(STEMS)
+def test_what_is_shown_is_one_line_and_can_be_written(text):
+    shown = printable(text)
+    assert shown.encode().decode() == shown
+    assert len(shown.splitlines()) <= 1
+    assert printable(shown) == shown
+    assert "\x1b" not in shown
+    assert len(printable(text * 10)) <= MOST_SHOWN
+
+
+def test_plain_names_stay_as_they_are():
+    for name in ("a", "c.tar", "Bär 3", "雪", "👩‍🚀", "a:b", "x" * 100, "a\u202fb"):
+        assert safe_name(name) == printable(name) == name
+    assert [safe_name(dots) for dots in (".", "..", ".a", "..a.b")] == ["unnamed", "unnamed", "a", "a.b"]
+    assert printable("a\n\udcff\x1b[31m") == "a\\n\\udcff\\x1b[31m"
+
+
+def test_names_that_can_be_made_can_be_made(tmp_path):
+    stems = ["..", "...", "\udcff", "a\nb", "ä" * 300, "/etc/passwd", ""]
+    for name in folder_names(stems):
+        (tmp_path / name).mkdir()
+    assert len(list(tmp_path.iterdir())) == len(stems)
+    assert [path.parent for path in tmp_path.rglob("*")] == [tmp_path] * len(stems)

@@ -1,0 +1,304 @@
+import copy
+import json
+import math
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import product
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from published_weights import write_published
+from safetensors.torch import load_file, save
+from support import compose_config, tiny_generator
+
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.generator import CompleteSplat
+from completesplat.geometry.cameras import Cameras, look_at, pinhole
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_generator()
+
+
+@pytest.fixture
+def folder(model, tmp_path):
+    model.save_pretrained(tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+@pytest.fixture(scope="module")
+def picture(toy_root):
+    return sorted(toy_root.glob("*/*/images/*.jpg"))[0]
+
+
+def same(first, second) -> bool:
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in vars(first))
+
+
+def test_what_is_saved_is_loaded_bit_for_bit(model, folder, picture):
+    loaded = CompleteSplat.from_pretrained(folder)
+    assert loaded.architecture == model.architecture == json.loads(json.dumps(model.architecture))
+    for name, value in model.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value)
+    for ours, theirs in zip(model(picture, samples=2), loaded(picture, samples=2), strict=True):
+        assert same(ours, theirs)
+
+
+def test_no_lightning_is_needed_to_generate(folder, picture):
+    program = "import sys; from completesplat.generator import CompleteSplat; "
+    program += f"scenes = CompleteSplat.from_pretrained({str(folder)!r})({str(picture)!r}, samples=1, steps=1); "
+    program += "print(len(scenes), 'lightning' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["1", "False"]
+
+
+def test_seeds_decide_and_samples_differ(model, picture):
+    (first, second), again, other = (model(picture, samples=2, seed=seed) for seed in (3, 3, 4))
+    assert same(first, again[0])
+    assert same(second, again[1])
+    assert not torch.equal(first.means, second.means)
+    assert not torch.equal(first.means, other[0].means)
+
+
+def test_one_model_draws_in_four_threads_what_it_draws_one_after_the_other(model, picture):
+    def draw(seed: int):
+        return model(picture, samples=2, seed=seed, steps=(2, 4, 5, 8)[seed % 4])
+
+    alone = [draw(seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(draw, range(8)))
+    assert all(same(*pair) for scenes in zip(alone, together, strict=True) for pair in zip(*scenes, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"samples": "4"}, "samples=4: must be a whole number"),
+        ({"samples": 1.5}, "samples=1.5: must be a whole number"),
+        ({"samples": 0}, "samples=0: must be at least 1"),
+        ({"batch": 0}, "batch=0: must be at least 1"),
+        ({"batch": "all"}, "batch=all: must be a whole number"),
+        ({"seed": None}, "seed=None: must be a whole number"),
+        ({"seed": 0.5}, "seed=0.5: must be a whole number"),
+        ({"seed": 2**70}, "seed=1180591620717411303424: must lie between"),
+        ({"seed": [1, 2]}, "seed=[1, 2]: 2 seeds for 1 images"),
+    ],
+)
+def test_settings_of_wrong_kinds_are_named(model, picture, settings, message):
+    with pytest.raises(CompleteSplatError) as caught:
+        model(picture, **{"samples": 1, "steps": 1} | settings)
+    assert str(caught.value).startswith(message)
+
+
+def test_samples_of_a_batch_stand_next_to_each_other(model, picture):
+    photograph = model.read(picture)
+    images = torch.stack([photograph.image, photograph.image.flip(-1)])
+    cameras = model.camera(photograph)[None].map(lambda tensor: tensor.expand(2, *tensor.shape[1:]))
+    ranges = model.depth_range.expand(2, 2)
+    scenes = model.generate(images, cameras, ranges, samples=3, skip_weight=1.0, steps=2)
+    assert scenes.means.shape[0] == 6
+    # With one skip of weight one the picture reaches its own samples only: a changed second picture moves those alone.
+    changed = model.generate(images * torch.tensor([1.0, 0.5]).view(2, 1, 1, 1), cameras, ranges, samples=3, steps=2)
+    moved = (changed.means - scenes.means).abs().amax((1, 2)) > 1e-6
+    assert moved.tolist() == [False] * 3 + [True] * 3
+
+
+def test_all_gaussians_lie_on_rays_of_the_stated_field_of_view(model, picture):
+    scene = model(model.read(picture, fov_degrees=90), samples=1)[0]
+    near, far = model.depth_range.tolist()
+    # The offset is small at first: depth stays near the range and |x / z| near tan(45 degrees).
+    assert near - 1 < scene.means[:, 2].min()
+    assert scene.means[:, 2].max() < far + 1
+    assert 0.8 < (scene.means[:, 0] / scene.means[:, 2]).abs().max() < 2
+
+
+def test_training_mode_leaves_the_autoreconstructor_frozen(model):
+    model.train()
+    assert model.denoiser.training
+    assert not model.autoreconstructor.training
+    assert not any(p.requires_grad for p in model.autoreconstructor.parameters())
+    assert all(p.requires_grad for p in model.denoiser.parameters())
+
+
+@pytest.fixture
+def half(model):
+    """The right half is hidden."""
+    visible = torch.ones(1, model.image_size, model.image_size)
+    visible[..., model.image_size // 2 :] = 0
+    return visible
+
+
+@pytest.mark.parametrize(("batch", "guidance_weight"), [(1, 0.5), (3, 0.0), (3, 0.5), (7, 0.0)])
+def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, picture, batch, guidance_weight):
+    sizes = []
+    reconstructor = model.autoreconstructor.reconstructor
+    hook = reconstructor.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    settings = {"samples": 5, "seed": 1, "steps": 2, "guidance_weight": guidance_weight}
+    together, split = model(picture, **settings), model(picture, **settings, batch=batch)
+    hook.remove()
+    assert sizes == [5, *[batch] * (5 // batch), *[5 % batch] * (5 % batch > 0)] if batch < 5 else [5, 5]
+    for one, other in zip(together, split, strict=True):
+        for name in vars(one):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-4, rtol=1e-4)
+
+
+def calls_of(model, **settings) -> dict[str, list[int]]:
+    """Batch sizes with which the networks are called in a drawing of one picture."""
+    encoder, reconstructor = model.autoreconstructor.encoder.network, model.autoreconstructor.reconstructor
+    networks = {"conditioning": model.conditioning, "denoiser": model.denoiser, "reconstructor": reconstructor}
+    networks |= {"first level": encoder.conv_in, "second level": encoder.down_blocks[1].resnets[0]}
+    networks |= {"latent": encoder.mid_block, "skip": reconstructor.skips["0"]}
+    sizes = {name: [] for name in networks}
+    hooks = [
+        network.register_forward_pre_hook(lambda _, inputs, seen=sizes[name]: seen.append(len(inputs[0])))
+        for name, network in networks.items()
+    ]
+    size = model.image_size
+    camera = Cameras(torch.eye(4), pinhole(50.0, size), (size, size))[None]
+    model.generate(torch.rand(1, 3, size, size), camera, model.depth_range[None], **settings)
+    for hook in hooks:
+        hook.remove()
+    return {name: seen for name, seen in sizes.items() if seen}
+
+
+@pytest.mark.parametrize(("guidance_weight", "passes"), [(0.0, 1), (0.5, 2)])
+def test_a_picture_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
+    model, guidance_weight, passes
+):
+    found = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
+    once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
+    assert found == {**once, "denoiser": [20 * passes] * 4}
+
+
+def test_without_skips_a_picture_is_not_encoded(model):
+    found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
+    assert found == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
+
+
+def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, picture, monkeypatch):
+    whole, decode, sizes = model(picture, samples=5, steps=2), model._decode, []
+
+    def small(*inputs):
+        sizes.append(len(inputs[-2]))
+        if sizes[-1] > 2:
+            raise torch.cuda.OutOfMemoryError
+        return decode(*inputs)
+
+    monkeypatch.setattr(model, "_decode", small)
+    denoised = []
+    hook = model.denoiser.register_forward_pre_hook(lambda _, inputs: denoised.append(len(inputs[0])))
+    parts = model(picture, samples=5, steps=2)
+    hook.remove()
+    assert (denoised, sizes) == ([5, 5], [5, 3, 2, 2, 1])
+    for one, other in zip(whole, parts, strict=True):
+        torch.testing.assert_close(one.means, other.means, atol=1e-4, rtol=1e-4)
+
+
+def test_what_is_hidden_has_no_influence_at_all(model, picture, half):
+    photograph = model.read(picture)
+    other = replace(photograph, image=torch.where(half > 0, photograph.image, 1 - photograph.image))
+    assert not torch.equal(other.image, photograph.image)
+    for first, second in zip(model(photograph, half, samples=2), model(other, half, samples=2), strict=True):
+        assert same(first, second)
+    assert not same(model(photograph)[0], model(other)[0])
+    other = replace(photograph, image=torch.where(half > 0, 1 - photograph.image, photograph.image))
+    assert not same(model(photograph, half)[0], model(other, half)[0])
+
+
+def test_skips_are_off_where_something_is_hidden_and_weights_out_of_place_refused(model, picture, half):
+    assert same(model(picture, half)[0], model(picture, half, skip_weight=0.0)[0])
+    everything = torch.ones_like(half)
+    assert same(model(picture, everything, skip_weight=1.0)[0], model(picture)[0])
+    with pytest.raises(CompleteSplatError, match=r"skip_weight=0\.5: must be 0"):
+        model(picture, half, skip_weight=0.5)
+    for visible, (name, weight) in product((None, half), {"skip_weight": -0.5, "guidance_weight": math.nan}.items()):
+        with pytest.raises(CompleteSplatError, match=f"{name}={weight:g}: must lie between 0 and 1"):
+            model(picture, visible, steps=1, **{name: weight})
+
+
+def test_the_scenes_of_all_steps_are_shown(model, picture):
+    shown = []
+    scenes = model(picture, samples=3, steps=4, batch=2, on_step=lambda *step: shown.append(step))
+    assert [(step, level) for step, level, _ in shown] == 2 * [(0, 999), (1, 749), (2, 499), (3, 249)]
+    last = [scene for _, _, part in (shown[3], shown[7]) for scene in (part[i] for i in range(len(part.means)))]
+    for scene, estimate in zip(scenes, last, strict=True):
+        torch.testing.assert_close(scene.means, estimate.means, atol=1e-4, rtol=1e-4)
+    assert not torch.allclose(shown[0][2].means, shown[3][2].means, atol=1e-3)
+
+
+def test_another_sampler_is_saved_with_the_weights(model, picture, tmp_path):
+    changed = copy.deepcopy(model)
+    changed.replace_sampler(OmegaConf.to_container(compose_config("fit", "sampler=dpm20").sampler))
+    assert not same(changed(picture)[0], model(picture)[0])
+    changed.save_pretrained(tmp_path / "changed")
+    loaded = CompleteSplat.from_pretrained(tmp_path / "changed")
+    assert loaded.sampler.steps == 20
+    assert same(loaded(picture)[0], changed(picture)[0])
+
+
+def test_files_that_are_damaged_missing_or_of_another_model_are_refused(folder):
+    (folder / SUMS_FILE).unlink()
+    path = folder / WEIGHTS_FILE
+    content, weights = path.read_bytes(), load_file(path)
+    weights.pop("latent_std")
+    for damaged in (save(weights), content[:-1000]):
+        path.write_bytes(damaged)
+        with pytest.raises(WeightsError, match="cannot be loaded"):
+            CompleteSplat.from_pretrained(folder)
+    for name in (WEIGHTS_FILE, CONFIG_FILE):
+        (folder / name).unlink()
+        with pytest.raises(WeightsError, match=name):
+            CompleteSplat.from_pretrained(folder)
+
+
+def test_weights_that_are_not_finite_are_refused(folder, tmp_path):
+    (folder / SUMS_FILE).unlink()
+    path = folder / WEIGHTS_FILE
+    weights = load_file(path)
+    for value in (torch.nan, torch.inf):
+        path.write_bytes(save(weights | {"latent_std": torch.full_like(weights["latent_std"], value)}))
+        with pytest.raises(WeightsError, match=rf"^{folder}: latent_std is not finite$"):
+            CompleteSplat.from_pretrained(folder)
+    published = write_published(tmp_path, "hydrants")
+    contents = torch.load(published, weights_only=True)
+    name = next(name for name in contents["model_state_dict"] if name.endswith("out.bias"))
+    contents["model_state_dict"][name][0] = torch.nan
+    torch.save(contents, published)
+    with pytest.raises(WeightsError, match=rf"{name} is not finite$"):
+        CompleteSplat.from_pretrained(published)
+
+
+@pytest.mark.parametrize("target", ["os.system", "completesplat.generator.torch.load"])
+def test_a_configuration_cannot_name_foreign_code(model, folder, target):
+    (folder / SUMS_FILE).unlink()
+    with pytest.raises(WeightsError, match="no part of a model"):
+        model.replace_sampler({"_target_": target, "scheduler": {}})
+    config = json.loads((folder / CONFIG_FILE).read_text())
+    config["sampler"]["scheduler"] = {"_target_": target, "f": "canary"}
+    (folder / CONFIG_FILE).write_text(json.dumps(config))
+    with pytest.raises(WeightsError, match="no part of a model"):
+        CompleteSplat.from_pretrained(folder)
+
+
+def test_cameras_of_any_units_come_to_where_gaussians_start(model):
+    eyes = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]])
+    poses = look_at(eyes, torch.zeros(3), torch.tensor([0.0, -1, 0]))
+    cameras = Cameras(poses, pinhole(50.0, 32).expand(3, 3, 3), (32, 32))
+    cameras = cameras.relative_to(cameras[0])
+    near, far = model.depth_range.tolist()
+    start = near + model.autoreconstructor.reconstructor.parameterization.first_depth * (far - near)
+    for units in (1.0, 0.01, 30.0):
+        placed = model.in_own_units(cameras.scale_world(torch.tensor(units)))
+        assert placed.centers.norm(dim=1).tolist() == pytest.approx(
+            [0, math.sqrt(2) * start, placed.centers[2].norm().item()], rel=1e-4
+        )
+    with pytest.raises(CompleteSplatError, match="do not look at one place"):
+        model.in_own_units(cameras[[0, 0]])
+    turned = look_at(eyes, 2 * eyes, torch.tensor([0.0, -1, 0]))
+    with pytest.raises(CompleteSplatError, match="do not look at one place"):
+        model.in_own_units(replace(cameras, world_to_camera=turned))

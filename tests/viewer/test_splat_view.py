@@ -1,0 +1,125 @@
+"""Where samples stand on the page, from where they are seen, and the splats that viser takes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from viewer_scenes import balls, balls_sample
+
+from completesplat.gaussians import concatenate
+from completesplat.geometry.cameras import look_at
+from completesplat.viewer.splat_view import arrangement_of, depth_colored, layer_of, to_splats
+
+
+def test_one_sample_is_seen_as_its_reference_camera_sees_it():
+    sample = balls_sample()
+    eye = torch.tensor([1.0, -2.0, 0.5])
+    pose = look_at(eye, torch.tensor([0.0, 0.0, 4.0]), torch.tensor([0.0, -1.0, 0.0]))
+    arrangement = arrangement_of([replace(sample, reference=replace(sample.reference, world_to_camera=pose))])
+    assert arrangement.position == pytest.approx(eye.numpy(), abs=1e-5)
+    direction = (arrangement.look_at - arrangement.position) / arrangement.distance
+    assert direction == pytest.approx(pose[2, :3].numpy(), abs=1e-5)
+    assert np.degrees(arrangement.fov) == pytest.approx(50, abs=1e-3)
+    assert arrangement.shift(0).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_all_of_a_row_are_in_view_and_none_overlap(count):
+    arrangement = arrangement_of([balls_sample()] * count)
+    shifts = np.stack([arrangement.shift(i) for i in range(count)])
+    assert shifts.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-5)
+    picture = 2 * arrangement.pivots[0][2].item() * np.tan(np.radians(25))  # the width that its camera sees there
+    assert (np.diff(shifts[:, 0]) > picture).all()
+    half_width = arrangement.distance * np.tan(arrangement.fov / 2) * 1.1  # a window a little wider than high
+    assert abs(shifts[:, 0]).max() + picture / 2 < half_width
+
+
+def test_side_by_side_samples_reach_no_further_than_to_the_middle_between_them():
+    """A scene's floor and walls are far larger than the picture of its object: whole ones would hide each other."""
+    sample, wall = balls_sample(), balls()
+    wall = replace(wall, means=wall.means * torch.tensor([30.0, 30, 1]))
+    large = replace(wall[:4], means=sample.pivot().expand(4, 3), scales=torch.full((4, 3), 3.0))
+    scene = concatenate([sample.gaussians, wall, large])
+    both = arrangement_of([replace(sample, gaussians=scene)] * 2)
+    kept = both.beside(1, scene)
+    assert kept.count >= sample.gaussians.count - 60  # the yellow ball's far side is outside
+    reach = (kept.means - both.pivots[1]).norm(dim=-1) + 2 * kept.scales.amax(-1)
+    assert reach.max() <= both.spacing / 2
+    alone = arrangement_of([replace(sample, gaussians=scene)])
+    assert alone.beside(0, scene).count == scene.count
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_narrow_windows_show_as_much_to_the_sides_as_wide_ones(count):
+    arrangement = arrangement_of([balls_sample()] * count)
+    assert arrangement.fov_in(2.0) == arrangement.fov
+    sides = [np.tan(arrangement.fov_in(aspect) / 2) * aspect for aspect in (0.3, 390 / 844, arrangement.aspect)]
+    assert sides == pytest.approx([sides[0]] * 3)
+
+
+def test_a_camera_stays_while_the_scene_changes_a_little():
+    sample = balls_sample()
+    one = arrangement_of([sample])
+    nudged = replace(sample, gaussians=replace(sample.gaussians, means=sample.gaussians.means * 1.01))
+    assert arrangement_of([nudged]).looks_like(one)
+    assert not arrangement_of([sample, sample]).looks_like(one)
+    aside = look_at(torch.tensor([3.0, 0, 4]), torch.tensor([0.0, 0, 4]), torch.tensor([0.0, -1, 0]))
+    turned = replace(sample, reference=replace(sample.reference, world_to_camera=aside))
+    assert not arrangement_of([turned]).looks_like(one)
+
+
+def test_covariances_stretch_directions_as_the_axes_say():
+    """The variance along each of a Gaussian's axes, found by rotating unit vectors one by one, is its scale squared."""
+    gaussians = balls(points=5)
+    splats = to_splats(gaussians)
+    parts = gaussians.quaternions.numpy(), gaussians.scales.numpy(), splats.covariances
+    for quaternion, scales, covariance in zip(*parts, strict=True):
+        w, *xyz = (quaternion / np.linalg.norm(quaternion)).tolist()
+        for axis, scale in zip(np.eye(3), scales, strict=True):
+            turned = axis + 2 * np.cross(xyz, np.cross(xyz, axis) + w * axis)  # of the quaternion product q v q*
+            assert turned @ covariance @ turned * splats.scale**2 == pytest.approx(scale**2, rel=1e-4)
+            assert covariance @ turned == pytest.approx(turned * (scale / splats.scale) ** 2, rel=1e-3, abs=1e-1)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1e4])
+def test_half_precision_keeps_the_shapes_at_every_size(size):
+    gaussians = balls(points=5)
+    scaled = to_splats(replace(gaussians, scales=gaussians.scales * size))
+    halves = scaled.covariances.astype(np.float16).astype(np.float64)
+    assert np.isfinite(halves).all()
+    for half, scales in zip(halves, gaussians.scales.numpy() * size, strict=True):
+        found = np.sqrt(np.linalg.eigvalsh(half)) * scaled.scale
+        assert found == pytest.approx(np.sort(scales), rel=0.01)
+
+
+def test_centers_and_bytes_of_what_is_finite():
+    gaussians = balls(points=2)
+    gaussians.colors[0] = torch.tensor([2.0, 0.5, 0.0])
+    splats = to_splats(gaussians)
+    assert splats.centers * splats.scale == pytest.approx(gaussians.means.numpy(), rel=1e-5, abs=1e-5)
+    assert splats.colors[0].tolist() == [255, 128, 0]
+    assert splats.opacities.tolist() == [[204]] * gaussians.count
+    gaussians.means[3, 1], gaussians.scales[5, 0] = torch.nan, torch.inf
+    splats = to_splats(gaussians)
+    assert len(splats.centers) == gaussians.count - 2
+    assert all(np.isfinite(part).all() for part in splats[:4])
+    assert to_splats(gaussians[:0]).centers.shape == (0, 3)
+
+
+def test_the_layers_are_the_parts_in_order():
+    gaussians = balls(points=3)
+    parts = [layer_of(gaussians, layer, 4) for layer in range(4)]
+    assert [part.count for part in parts] == [3] * 4
+    torch.testing.assert_close(vars(concatenate(parts)), vars(gaussians), atol=0, rtol=0)
+
+
+def test_depth_colours_brighten_towards_the_camera_on_one_scale():
+    near, far = balls(points=50), balls(points=50)
+    far.means[:, 2] += 1
+    scenes = depth_colored([near, far])
+    depths = torch.cat([near.means[:, 2], far.means[:, 2]])
+    lightness = torch.cat([scene.colors.sum(-1) for scene in scenes])[depths.argsort()]
+    assert (lightness.diff() <= 1e-5).all()
+    assert lightness[0] > lightness[-1] + 1
+    assert torch.equal(scenes[1].means, far.means)
