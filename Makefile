@@ -1,6 +1,6 @@
 # Every target works as the first command on a fresh machine: .venv is made when it is missing or out of date.
 .DEFAULT_GOAL := help
-.PHONY: help demo demo-train test test-slow test-wheel test-browser fuzz reliability check lock bench gpu docs notebooks clean
+.PHONY: help demo demo-train test test-processes test-slow test-wheel test-browser fuzz reliability check lock bench gpu docs notebooks clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -59,6 +59,9 @@ demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, co
 # modules, rewriting every assertion takes ten seconds each time.
 test: check ## Lint, types and the tests (CPU, 6 to 12 minutes on two cores)
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
+
+test-processes: $(READY) ## The tests that start processes and servers, send signals, damage files at random, fill disks
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m processes --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
