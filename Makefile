@@ -61,7 +61,7 @@ test: check ## Lint, types and the tests (CPU, 6 to 12 minutes on two cores)
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-processes: $(READY) ## The tests that start processes and servers, send signals, damage files at random, fill disks
-	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m processes --numprocesses auto --maxprocesses 4 --dist worksteal
+	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -m "processes and not slow" --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-slow: $(READY) ## The tests that take minutes each
 	$(BIN)/python -m pytest -q -m slow
