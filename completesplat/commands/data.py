@@ -3,9 +3,9 @@
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_text
@@ -17,23 +17,36 @@ Split = Literal["train", "val", "test"]
 Splits = Annotated[Sequence[Split], Entries(1)]
 
 
-def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
+@runtime_checkable
+class DataModule(Protocol):
+    """Parts of `SceneDataModule`, which takes seconds to import."""
+
+    root: Path
+    policy: tuple[str, float]
+
+    def prepare_data(self) -> None: ...
+
+    def source(self, split: str) -> Any: ...
+
+    def packed_settings(self) -> dict[str, str | int | float | bool | None]: ...
+
+
+def check(data: DataModule, splits: Splits, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
-    from completesplat.data.audit import Findings, show
-    from completesplat.data.audit import check as check_sources
+    from completesplat.data.validation import audit
 
     try:
-        findings = check_sources(_sources(data, splits), workers)
+        findings = audit.check(_sources(data, splits), workers)
     except DataError as error:  # concerns the data set as a whole
-        findings = Findings(0, 0, [error], {}, {})
+        findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
-    show(findings)
+    audit.show(findings)
     if not findings.sequences:
         print(out)
         sys.exit(1)
 
 
-def stats(data: Any, splits: Splits, out: Path) -> None:
+def stats(data: DataModule, splits: Splits, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
@@ -47,7 +60,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
+def show(data: DataModule, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
     """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
@@ -61,7 +74,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures:
 
 
 def prepare(
-    data: Any,
+    data: DataModule,
     splits: Splits,
     out: Path,
     codec: str,
@@ -71,13 +84,12 @@ def prepare(
     max_bad_fraction: float,
 ) -> None:
     """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
-    from completesplat.data.packed.manifest import is_packed
-    from completesplat.data.packed.writing import prepare as prepare_sources
+    from completesplat.data.packed import manifest, writing
 
-    if is_packed(data.root):
+    if manifest.is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
-    sources, bad = _sources(data, splits), (on_bad, max_bad_fraction)
-    prepare_sources(sources, data.packed_settings(), out, codec, sequences_per_shard, workers, *bad)
+    sources, settings = _sources(data, splits), data.packed_settings()
+    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, on_bad, max_bad_fraction)
 
 
 def latents(
@@ -116,10 +128,10 @@ def latents(
         store = encode_training_set(
             autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, fabric.device
         )
-    logger.info("deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
+    logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
+def _sources(data: DataModule, splits: Sequence[str]) -> dict[str, Any]:
     """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()
@@ -136,7 +148,7 @@ def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
     return sources
 
 
-def _readable(source: Any, names: Any) -> Iterator[Any]:
+def _readable(source: Any, names: Iterable[str]) -> Iterator[Any]:
     for name in names:
         try:
             yield source.read(name)

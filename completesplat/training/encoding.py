@@ -88,7 +88,7 @@ def check_cache(
     if shape != store.latent_shape:
         raise DataError(f"latents of {store.latent_shape}, the autoreconstructor's are {shape}", str(store.folder))
     if conditioning is not None and store.origin.conditioning != features_fingerprint(conditioning):
-        held = "pictures" if store.holds_pictures else "features of another conditioning"
+        held = "pictures" if store.holds_images else "features of another conditioning"
         raise WeightsError(f"{store.folder}: holds {held}; encode the training set again with this run's conditioning")
 
 

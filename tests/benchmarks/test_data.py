@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from support import strict_json
 
-from completesplat.data.toy import rooms
+from completesplat.data.toy import writing
 
 QUICK = [
     *("bench", "data", "repeats=1"),
@@ -22,7 +22,7 @@ QUICK = [
 def quick(command, tmp_path, monkeypatch):
     """Runs the benchmark; gives its results, what it printed and its folder."""
     # Twelve clips that are not for testing, one of which is for validation, in three chunks.
-    monkeypatch.setattr(rooms, "CLIPS_PER_CHUNK", 4)
+    monkeypatch.setattr(writing, "CLIPS_PER_CHUNK", 4)
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # so few files are sooner written by this process alone
 
     def run(*arguments: str) -> tuple[dict[str, Any], str, Path]:

@@ -15,7 +15,7 @@ from completesplat.data.co3d.source import (
     upright_axes,
 )
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
-from completesplat.data.toy.objects import SUBSET
+from completesplat.data.toy.writing import SUBSET
 from completesplat.data.validation import BadPicture, BadPlacement, MissingFile, UnreadableFile
 
 CENTER = np.array([3.0, -2.0, 5.0])

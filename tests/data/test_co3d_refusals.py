@@ -14,7 +14,6 @@ import torch
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
 from PIL import Image
 
-from completesplat.data.audit import check
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
 from completesplat.data.sequences import SPLITS
@@ -27,6 +26,7 @@ from completesplat.data.validation import (
     OutsidePath,
     UnreadableFile,
 )
+from completesplat.data.validation.audit import check
 from completesplat.errors import CompleteSplatError, DataError
 
 POLICIES = pytest.mark.parametrize("policy", ["raise", "skip"])
@@ -333,5 +333,5 @@ def test_a_background_that_is_no_grey_value_or_is_not_that_of_encoded_pictures_i
     for background in (-0.1, 1.5):
         with pytest.raises(CompleteSplatError, match=r"data\.background"):
             module(category.parent, "skip", background=background)
-    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is of pictures as they are"):
+    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is of images as they are"):
         module(category.parent, "skip", background=0.0, latent_cache="x")

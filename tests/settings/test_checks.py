@@ -55,7 +55,7 @@ ODD = [
     ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
     ("fit", "model=preoptimized_vae model.kl_weight=-1", "model.kl_weight=-1: must be at least 0"),
     ("fit", "trainer.gradient_clip_val=-1", "trainer.gradient_clip_val=-1: must be at least 0"),
-    ("fit", "data.workers=4000", "data.workers=4000: must not be above 4 for each of "),
+    ("fit", "data.workers=4000", "data.workers=4000: must lie between 0 and 256"),
     ("data", "workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),

@@ -133,14 +133,15 @@ def parsed(kind: Any, value: Any, name: str = "the content") -> Any:
     raise BadAnnotation(f"{name} must be {getattr(kind, '__name__', kind)}, not of type {type(value).__name__}")
 
 
-def write_json(path: Path, content: Any, header: Mapping[str, str | int] | None = None) -> None:
+def write_json(path: Path, content: object, header: Mapping[str, str | int] | None = None) -> None:
     """Write a dictionary or a dataclass to a JSON file atomically."""
     write_text(path, json_text(content, header))
 
 
-def json_text(content: Any, header: Mapping[str, str | int] | None = None) -> str:
+def json_text(content: object, header: Mapping[str, str | int] | None = None) -> str:
     """Return the text that `write_json` writes."""
     entries = asdict(content) if is_dataclass(content) and not isinstance(content, type) else content
+    assert isinstance(entries, Mapping)
     return json.dumps({**(header or {}), **entries}, indent=1, allow_nan=False) + "\n"
 
 
@@ -160,8 +161,8 @@ def settings_must_match(root: Path, settings: Mapping[str, Scalar]) -> None:
         raise DataError(f"prepared with {differing}: {advice}", str(root))
 
 
-def differences(found: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> str:
+def differences(stored: Mapping[str, Scalar], wanted: Mapping[str, Scalar]) -> str:
     """Return `image_size=128 (asked for: 64), ...` for all settings that differ."""
     # 1 and 1.0 are equal, because neither JSON nor any use of the settings distinguishes them.
-    keys = [key for key in sorted({*found, *wanted}) if found.get(key) != wanted.get(key)]
-    return ", ".join(f"{key}={found.get(key)} (asked for: {wanted.get(key)})" for key in keys)
+    keys = [key for key in sorted({*stored, *wanted}) if stored.get(key) != wanted.get(key)]
+    return ", ".join(f"{key}={stored.get(key)} (asked for: {wanted.get(key)})" for key in keys)
