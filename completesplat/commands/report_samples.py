@@ -1,7 +1,7 @@
 """`completesplat report`: studies of a trained model's samples.
 
 Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
-and, if it draws samples, `diffusion_of`. Skip and guidance weights outside of [0, 1] are refused.
+and, if it draws samples, `diffusion_of`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, Column, table
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
@@ -27,7 +27,7 @@ from completesplat.studies import stage1 as stage1_study
 from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
 
-Numbers = Annotated[Sequence[float], Entries(1)]
+Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
@@ -44,8 +44,8 @@ class Run(TypedDict):
 def samplers(
     samplers: Mapping[str, Mapping[str, Any]],
     steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     out: Path,
     **run: Unpack[Run],
 ) -> None:
@@ -77,7 +77,7 @@ def samplers(
 
 
 def controls(
-    skip_weights: Numbers, guidance_weights: Numbers, near_degrees: float, shown: int, out: Path, **run: Unpack[Run]
+    skip_weights: Weights, guidance_weights: Weights, near_degrees: float, shown: int, out: Path, **run: Unpack[Run]
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
@@ -98,7 +98,7 @@ def controls(
     Console(width=120).print(table("Faithfulness (PSNR, dB) and diversity", CONTROLS, rows))
 
 
-def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[Run]) -> None:
+def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: Share, out: Path, **run: Unpack[Run]) -> None:
     """Write `masked.png`: inputs with boxes over them, and several completions of each.
 
     Boxes are [x0, y0, x1, y1] in fractions of the image (`check_box`); see `conf/report_task/masked.yaml` for the rest.
@@ -113,8 +113,8 @@ def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float,
 
 
 def depth(
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     shown_scenes: Positive,
     shown: Positive,
     far_degrees: Annotated[float, Range(0, 180)],

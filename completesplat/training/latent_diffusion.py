@@ -10,7 +10,6 @@ from torch import Tensor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.loading.distributed import gathered
 from completesplat.data.loading.latent_cache import LatentCache
-from completesplat.diffusion.guidance import allowed_skip_weight, check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
@@ -44,7 +43,6 @@ class LatentDiffusion(Stage):
         **rendering_and_optimization: see `Stage`.
 
     Raises:
-        CompleteSplatError: a weight of the samples outside of [0, 1].
         WeightsError: a checkpoint is unusable, or both are given.
     """
 
@@ -70,8 +68,7 @@ class LatentDiffusion(Stage):
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
         self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
-        check_guidance_weight(guidance_weight)
-        self.skip_weight = allowed_skip_weight(skip_weight)
+        self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
         self.noise_draws = noise_draws

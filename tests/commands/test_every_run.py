@@ -53,7 +53,7 @@ def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(comma
         out = tmp_path / str(len(found))
         finished = command("predict", f"image={photograph}", f"weights={weights}", "samples=2", f"out={out}", *FEW)
         assert finished.status == 0, finished.err
-        assert ("one answer for each picture" in finished.out) == (samples == 1)
+        assert ("one answer for each image" in finished.out) == (samples == 1)
         found.append(scenes(out / photograph.stem))
         assert strict_json(out / photograph.stem / "scene.json")["settings"]["samples"] == samples
         assert settings_of(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
@@ -137,7 +137,7 @@ def test_the_viewer_shows_the_one_answer(command, pipeline, tmp_path):
     ]
     shown = command("view", *map(str, given))
     assert shown.status == 0, shown.err
-    assert "one answer for each picture" in shown.out
+    assert "one answer for each image" in shown.out
     assert (tmp_path / "page.html").is_file()
 
 
