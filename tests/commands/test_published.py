@@ -177,7 +177,7 @@ def test_the_page_has_no_sliders_for_one_answer(tmp_path):
     page = make_page(start_server(0), compose_config("view", *settings), tmp_path)
     try:
         assert page.worker.wait(LIMIT)
-        assert [sample.gaussians.count for sample in page.stage.samples] == [16 * 16]
+        assert [sample.gaussians.count for sample in page.view.samples] == [16 * 16]
         handles = page.server.gui._gui_input_handle_from_uuid.values()
         shown = [getattr(handle, "label", "") for handle in handles if handle.visible]
         assert "Samples" not in shown
