@@ -10,7 +10,7 @@ from completesplat.files import atomic_path
 from completesplat.results.html_page import page
 from completesplat.results.paper_figures import tables as published_tables
 from completesplat.results.runs import find, origin
-from completesplat.results.sweeps import show_summary, write_summary
+from completesplat.results.sweeps import write_summary
 from completesplat.results.tables import show, write_tables
 from completesplat.settings.schema import Positive, Range
 
@@ -48,7 +48,7 @@ def summary(sweeps: Sequence[str], out: Path) -> None:
     for folder in folders:
         if not folder.is_dir():
             raise CompleteSplatError(f"sweeps={folder}: no such folder")
-    show_summary(write_summary(out, *folders))
+    show(write_summary(out, *folders), width=160)
 
 
 def html(runs: str, most: Most, out: Path) -> None:

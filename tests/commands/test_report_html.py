@@ -11,7 +11,7 @@ from report_pages import FRAMES, HOSTILE, SAMPLES, Page, grey, write_results
 from support import compose_config, refused
 
 from completesplat.commands.jobs import start
-from completesplat.results.html_page import strip
+from completesplat.results.html_page import frame_strip
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_every_sample_turns_as_its_video_does_and_a_short_video_gives_all_its_fr
         for frame in range(6):
             middle = drawn.getpixel((frame * side + side // 2, side // 2))
             assert middle == pytest.approx(255 * grey(sample, frame * FRAMES // 6), abs=6)
-    whole, frames = strip(results / "predictions/x/orbit_00.mp4", 48)
+    whole, frames = frame_strip(results / "predictions/x/orbit_00.mp4", 48)
     assert (frames, whole.width) == (FRAMES, FRAMES * whole.height)
 
 

@@ -7,6 +7,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
 from completesplat.export.splat_transform import PACKAGE, SplatTransform, around_the_target, find_splat_transform
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def bin_folder(tmp_path, monkeypatch):

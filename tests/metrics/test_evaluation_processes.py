@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import distributed, multiprocessing
 
@@ -13,13 +14,14 @@ from completesplat.metrics.image_sets import Patches
 from completesplat.metrics.scoring import Evaluation
 from completesplat.scene import Views
 
+pytestmark = pytest.mark.processes
 COUNTS = (1, 2, 5)
 BATCH = 2
 
 
 def scored(count: int, skipped: set[str]) -> dict[str, Any]:
-    """Results of so many scenes, of which this process scores its share."""
-    store = SceneStore.__new__(SceneStore)  # of names alone: nothing is read
+    """Return the results of some scenes, of which this process scores its share."""
+    store = SceneStore.__new__(SceneStore)  # with names alone, because nothing is read
     store.names = [f"scene {index}" for index in range(count)]
     evaluation = Evaluation(samples=2, sets={"swd": Patches(patches=2)})
     cameras = Cameras(torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3), (16, 16))

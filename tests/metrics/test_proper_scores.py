@@ -36,8 +36,9 @@ def test_noise_around_the_mean_does_not_improve_the_energy_score():
     assert mean_energy(lambda i: FORMS.mean(0) + noise) > 0.375 * D * 1.4
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_an_independent_implementation():
-    import scoringrules  # compiles for seconds when it is loaded: not in every process that collects the tests
+    import scoringrules  # compiles for seconds when it is loaded
 
     samples = torch.rand(6, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     truth = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
