@@ -19,7 +19,7 @@ from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.errors import CompleteSplatError
 from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.results.machine import machine
-from completesplat.results.tables import SSIM_NOTE, Column, table
+from completesplat.results.tables import SSIM_NOTE, records_table, show
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Entries, Positive, Range
 from completesplat.studies import controls as controls_study
@@ -80,7 +80,7 @@ def samplers(
     write_json(out / "samplers.json", report)
     title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
     samplers_study.plot_samplers(rows, out / "samplers.png", title)
-    Console(width=120).print(table(f"Samplers, from the same noise. {SSIM_NOTE}", SAMPLERS, map(asdict, rows)))
+    show(records_table(f"Samplers, from the same noise. {SSIM_NOTE}", list(map(asdict, rows))))
     print(
         f"fewest denoiser calls within {samplers_study.CLOSE} dB of {rows[0].sampler} with {rows[0].steps} steps: "
         f"{best.calls} ({best.sampler}, {best.steps} steps, {best.psnr - rows[0].psnr:+.2f} dB)"
@@ -110,7 +110,7 @@ def controls(
     controls_study.plot_controls(rows, out / "controls.png", title)
     title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
     _write_sheet(grid, out / "controls_grid.png", title)
-    Console(width=120).print(table("Faithfulness (PSNR, dB) and diversity", CONTROLS, rows))
+    show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
 def masked(
@@ -149,7 +149,7 @@ def depth(
     title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
     _write_sheet(sheet, out / "depth.png", title)
-    Console(width=120).print(table("Deviation of depth over samples, scene units", DEPTH, rows))
+    show(records_table("Deviation of depth over samples, scene units", rows))
 
 
 def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: Unpack[Run]) -> None:
@@ -159,7 +159,7 @@ def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: U
         rows = stage1_study.rows_of_views(module, counts, scenes, tick)
     write_json(out / "views.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
     stage1_study.plot_views(rows, out / "views.png", f"{run['scenes']} scenes, posterior's mean")
-    Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
+    show(records_table("PSNR (dB) of other views by the number of views", rows))
 
 
 def layers(out: Path, **run: Unpack[Run]) -> None:
@@ -168,7 +168,7 @@ def layers(out: Path, **run: Unpack[Run]) -> None:
     with _status() as tick:
         rows = stage1_study.rows_of_layers(module, scenes, tick)
     write_json(out / "layers.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
-    Console(width=120).print(table("Layers on the object, behind what the image shows (scene units)", LAYERS, rows))
+    show(records_table("Layers on the object, behind the front (scene units)", rows))
 
 
 def _open(run: Run) -> tuple[Stage, list[SceneBatch]]:
@@ -195,34 +195,3 @@ def _write_sheet(rows: Sequence[Sequence[SheetCell | None]], path: Path, title: 
 def _status() -> Iterator[Callable[[str], None]]:
     with Console(stderr=True).status("drawing") as status:
         yield lambda text: status.update(f"drawing: {text}")
-
-
-SAMPLERS: list[Column] = [
-    ("sampler", "sampler", ""),
-    ("steps", "steps", "d"),
-    ("calls", "calls", "d"),
-    ("PSNR", "psnr", ".2f"),
-    ("SSIM", "ssim", ".4f"),
-    ("diversity", "diversity", ".4f"),
-    ("agreement", "agreement", ".1f"),
-    ("ms", "ms", ".1f"),
-]
-WEIGHTS: list[Column] = [("skip", "skip_weight", "g"), ("guidance", "guidance_weight", "g")]
-CONTROLS: list[Column] = [
-    *WEIGHTS,
-    ("reference", "reference_psnr", ".2f"),
-    ("near object", "near_object_psnr", ".2f"),
-    ("diversity", "diversity", ".4f"),
-]
-VIEWS: list[Column] = [("views", "views", "d"), ("all pixels", "psnr", ".2f"), ("object", "object_psnr", ".2f")]
-LAYERS: list[Column] = [
-    ("", "layer", ""),
-    ("opacity", "opacity", ".2f"),
-    ("behind the front", "behind", ".3f"),
-    ("of the thickness", "ratio", ".0%"),
-    ("pixels on the back", "on_back", ".0%"),
-]
-DEPTH = [*WEIGHTS]
-for _view in ("reference", "far"):
-    DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]
-    DEPTH += [("measured", f"{_view}_measured", ".0%")]

@@ -36,16 +36,8 @@ def distances(samples: Samples, modes: Modes) -> Float[Tensor, "sample mode"]:
 
 
 def classify(samples: Samples, modes: Modes, probabilities: Probabilities) -> Int64[Tensor, " sample"]:
-    """Return the mode of each sample, or `REJECTED` if it is not near enough to one.
-
-    Raises:
-        ValueError: fewer than two modes, equal modes, or no pixels.
-    """
-    if len(modes) < 2 or not modes.shape[1]:
-        raise ValueError("needs two modes and a pixel")
+    """Return the mode of each sample, or `REJECTED` if it is not near enough to one of at least two modes."""
     between = distances(modes, modes).fill_diagonal_(torch.inf)
-    if not between.min() > 0:
-        raise ValueError("two modes are equal")
     nearest, mode = distances(samples, modes).min(dim=1)
     from_mean = distances(samples, mean_of(modes, probabilities)[None])[:, 0]
     accepted = (nearest < between.min() / 2) & (nearest < from_mean)
@@ -60,8 +52,6 @@ def mean_of(modes: Float[Tensor, "mode *image _"], probabilities: Float[Tensor, 
 
 def scores(samples: Samples, modes: Modes, probabilities: Probabilities) -> HiddenModeScores:
     """Score one scene; samples and modes are the region's pixels of all views in one row."""
-    if not len(samples):
-        raise ValueError("needs a sample")
     classes = classify(samples, modes, probabilities)
     shares = torch.stack([(classes == mode).float().mean() for mode in range(len(modes))])
     rejected = (classes == REJECTED).float().mean()

@@ -8,7 +8,7 @@ from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypedDict
+from typing import Annotated, TypedDict
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -19,7 +19,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.results.measured import entries, mode_tables, score_tables
 from completesplat.results.paper_figures import tables as compared
 from completesplat.results.runs import CONFIG, MODES, ROWS, SCENE, SCORES, find, origin, read_mapping
-from completesplat.results.tables import Table, table
+from completesplat.results.tables import Table, records_table
+from completesplat.settings.schema import Positive, Range
 
 WIDEST, MOST_PIXELS = 1600, 50_000_000
 """Width to which wider images are reduced; and pixels of the largest image that is read."""
@@ -42,12 +43,12 @@ UNFOLDED = 3  # up to this number, all runs are unfolded; beyond it, only runs w
 class Limits(TypedDict):
     """Limits on the contents of a page; `conf/report_task/html.yaml` explains each."""
 
-    frames: int
-    samples: int
-    predictions: int
-    runs: int
-    pictures: int
-    megabytes: float
+    frames: Positive
+    samples: Positive
+    predictions: Positive
+    runs: Positive
+    pictures: Positive
+    megabytes: Annotated[float, Range(1)]
 
 
 @dataclass(frozen=True)
@@ -156,17 +157,6 @@ def _more(count: int, what: str) -> list[Embedded]:
     return [Embedded("", f"{count} {what} left out")] if count > 0 else []
 
 
-def rows_table(title: str, rows: Sequence[Mapping[str, object]]) -> Table:
-    """Return a table of records with the same keys, such as those that `completesplat report samplers` writes."""
-    kinds: dict[str, set[type]] = {}
-    for row in rows:
-        for key, value in row.items():
-            kinds.setdefault(key, set()).add(type(value))
-    plain = {key: types for key, types in kinds.items() if types <= {type(None), str, bool, int, float}}
-    columns = [(key.replace("_", " "), key, ".4g" if float in types else "") for key, types in plain.items()]
-    return table(title, columns, rows)
-
-
 def _shows(path: Path) -> bool:
     """Return whether a run has images, scores or rows."""
     images = any(any((path / part).glob(pattern)) for part, pattern in IMAGES.items())
@@ -178,7 +168,7 @@ def _run_section(path: Path, name: str, tables: Sequence[Table], most: int, imag
     embedded, tables = list[Embedded](), [*tables]
     for file in ROWS:
         rows = read_mapping(path / file).get("rows")
-        tables += [rows_table(Path(file).stem, rows)] if isinstance(rows, list) else []
+        tables += [records_table(Path(file).stem, rows)] if isinstance(rows, list) else []
     for part, pattern in IMAGES.items():
         paths = sorted((path / part).glob(pattern))
         # The last images of a run's progress, the first of a report's figures.

@@ -196,7 +196,8 @@ def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]])
             settings, protocol = sweep_rows(group), group[0].protocol
             note = notes.number(f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}.")
             for row, cells in zip(settings, figures(settings, names), strict=True):
-                label = f"{OURS}{row.label}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
+                theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
+                label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
                 pairs = zip(names, cells, strict=True)
                 scores = [cell if cell.text else _missing(score, protocol, notes) for score, cell in pairs]
                 rows.append(TableRow("ours", [Cell(label), *scores]))

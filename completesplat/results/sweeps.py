@@ -1,4 +1,4 @@
-"""Summary of a sweep: a table of its settings over seeds, as in the paper, and a chart."""
+"""Summary of a sweep: a table of its settings over seeds, as in the paper."""
 
 import logging
 import math
@@ -6,13 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 
-from completesplat.files import atomic_path
 from completesplat.results.machine import machine
 from completesplat.results.runs import MODEL, SEED, UPPER_BOUND, Job, collect, typed
 from completesplat.results.tables import (
@@ -29,11 +28,8 @@ from completesplat.results.tables import (
     write_documents,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-# Hydra imports this file for every run, even to print the help, so torch, rich and matplotlib are imported only when a
-# job has ended.
+# Hydra imports this file for every run, even to print the help, so torch and rich are imported only when a job has
+# ended.
 log = logging.getLogger(__name__)
 
 CAPTION = (
@@ -43,12 +39,8 @@ CAPTION = (
 NOTHING = "No job of this sweep has finished."
 PROPOSED = "full"  # the unchanged method among the ablations: the last row, as in the paper
 IDENTITY = ["ablation", "seeds", "scenes", "steps", UPPER_BOUND]
-AGREEMENT = 1e-4  # relative difference between a naive predictor's scores in two jobs that the summary ignores
 ALWAYS = ["full_novel_psnr", "full_novel_ssim", "object_novel_psnr", "object_novel_ssim", "full_reference_psnr"]
 WHERE_MEASURED = ["full_novel_lpips", "full_novel_fid", "full_novel_kid"]  # scores in the table of a sweep
-COLUMN = "full_novel_psnr"
-AXIS = "PSNR of novel views, all pixels (dB)"
-LINES = {"mean_image": "--", "copy_reference": ":"}
 
 
 class SweepSummary(Callback):
@@ -107,12 +99,8 @@ def sweep_rows(finished: Sequence[Job]) -> list[SweepRow]:
         return [(part == PROPOSED, part) for part in row.label.split(", ")]
 
     ours = sorted((_row(jobs[0].label, jobs) for jobs in settings.values()), key=order)
-    return [*ours, *(_row(predictor, jobs, predictor) for predictor, jobs in _naive_predictors(finished).items())]
-
-
-def _naive_predictors(jobs: Sequence[Job]) -> dict[str, list[Job]]:
-    names = dict.fromkeys(predictor for job in jobs for predictor in job.test if predictor != MODEL)
-    return {name: [job for job in jobs if name in job.test] for name in names}
+    naive = dict.fromkeys(predictor for job in finished for predictor in job.test if predictor != MODEL)
+    return [*ours, *(_row(name, [job for job in finished if name in job.test], name) for name in naive)]
 
 
 def _row(label: str, jobs: Sequence[Job], predictor: str = MODEL) -> SweepRow:
@@ -138,11 +126,6 @@ def _common(values: Iterable[int]) -> int | str | None:
     return different[0] if len(different) == 1 else "/".join(map(str, different)) or None
 
 
-def headline(rows: Sequence[SweepRow]) -> list[str]:
-    """Return the names of the metrics that a table of rows shows."""
-    return [*ALWAYS, *(name for name in WHERE_MEASURED if any(name in row.means for row in rows))]
-
-
 def figures(rows: Sequence[SweepRow], names: Sequence[str]) -> list[list[Cell]]:
     """Return a cell for each row and metric: `21.34 ± 0.12`, best and second best marked, empty if not measured.
 
@@ -164,7 +147,8 @@ def summarize(*folders: Path) -> tuple[list[SweepRow], Table]:
     """Return rows and table of all jobs in a sweep's folder, or in its parts on several machines, finished or not."""
     jobs = collect(*folders)
     rows = sweep_rows([job for job in jobs if job.finished])
-    names, body = headline(rows), []
+    names = [*ALWAYS, *(name for name in WHERE_MEASURED if any(name in row.means for row in rows))]
+    body = []
     for row, cells in zip(rows, figures(rows, names), strict=True):
         identity = [Cell("" if value is None else str(value)) for value in (row.label, row.seeds, row.scenes)]
         body.append(TableRow("naive" if row.seeds is None else "ours", [*identity, *cells]))
@@ -189,11 +173,6 @@ def _remarks(jobs: Sequence[Job], rows: Sequence[SweepRow]) -> list[str]:
     remarks += [f"{row.label}: its jobs were tested on different scenes ({row.scenes})." for row in mixed]
     if len({row.scenes for row in ours}) > 1:
         remarks.append("The rows were not tested on equally many scenes and do not compare.")
-    for predictor, tested in _naive_predictors(finished).items():
-        first, *others = (job.test[predictor] for job in tested)
-        pairs = [(first[name], other[name]) for other in others for name in first.keys() & other if "_novel_" in name]
-        if not all(math.isclose(*pair, rel_tol=AGREEMENT) for pair in pairs):
-            remarks.append(f"{predictor} has different scores in the jobs, so their test data differ; its mean.")
     recorded = [job.record for job in jobs if job.record]
     commits = list(dict.fromkeys(record["commit"] or "unknown" for record in recorded))
     remarks.append(f"Commit{'s' if len(commits) > 1 else ''} {', '.join(commits) or 'unknown'}.")
@@ -205,7 +184,7 @@ def _remarks(jobs: Sequence[Job], rows: Sequence[SweepRow]) -> list[str]:
 
 
 def write_summary(folder: Path, *parts: Path) -> Table:
-    """Write `summary.csv` (all metrics), `summary.md`, `summary.tex` and `summary.png`; return the table.
+    """Write `summary.csv` (all metrics), `summary.md` and `summary.tex`; return the table.
 
     `parts` are the folders of one sweep on several machines; the files then cover all of them.
     """
@@ -218,46 +197,4 @@ def write_summary(folder: Path, *parts: Path) -> Table:
         lines.append([row.label, row.seeds, row.scenes, row.steps, row.upper_bound, *scores])
     write_csv(folder / "summary.csv", header, lines)
     write_documents([table], folder / "summary")
-    _plot(rows, folder / "summary.png")
     return table
-
-
-def _plot(rows: Sequence[SweepRow], path: Path) -> None:
-    """Plot a bar for each setting with its standard deviation over seeds, and naive predictors as vertical lines."""
-    from matplotlib.figure import Figure
-
-    ours = [row for row in rows if row.seeds is not None]
-    figure = Figure(figsize=(9, 1.6 + 0.42 * max(len(ours), 2)), layout="constrained")
-    axes = figure.subplots()
-    if not ours:
-        axes.text(0.5, 0.5, NOTHING, ha="center", va="center")
-        axes.set_axis_off()
-    else:
-        _draw(axes, ours, [row for row in rows if row.seeds is None])
-    if axes.get_legend_handles_labels()[0]:
-        figure.legend(loc="outside upper right", ncols=len(LINES))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-
-
-def _draw(axes: "Axes", ours: Sequence[SweepRow], naive: Sequence[SweepRow]) -> None:
-    means, deviations = ([_finite(row, kind) for row in ours] for kind in ("means", "deviations"))
-    bars = axes.barh(range(len(ours)), means, xerr=deviations, capsize=3, color="C0", height=0.7)
-    axes.set_yticks(range(len(ours)), [row.label for row in ours])
-    axes.bar_label(bars, ["" if math.isnan(mean) else f"{mean:.2f}" for mean in means], padding=4)
-    for row in naive:
-        value = _finite(row, "means")
-        if row.label in LINES and not math.isnan(value):
-            label = f"{row.label.replace('_', ' ')}, {value:.2f}"
-            axes.axvline(value, color="black", linestyle=LINES[row.label], label=label)
-    axes.invert_yaxis()  # as in the table, the first row is on top
-    axes.margins(x=0.1)
-    axes.set(xlim=(0, None), xlabel=AXIS)
-    axes.grid(axis="x", alpha=0.3)
-    axes.set_axisbelow(True)
-
-
-def _finite(row: SweepRow, kind: str) -> float:
-    """Return a value, or NaN, which is not drawn, if it is missing or infinite."""
-    value = getattr(row, kind).get(COLUMN, math.nan)
-    return value if math.isfinite(value) else math.nan

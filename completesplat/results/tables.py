@@ -170,6 +170,18 @@ def table(title: str, columns: Sequence[Column], records: Iterable[Mapping[str, 
     return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows)
 
 
+def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
+    """Return a table of records with the same keys, which are its headings; values that are no text are left out."""
+    kinds: dict[str, set[type]] = {}
+    for record in records:
+        for key, value in record.items():
+            kinds.setdefault(key, set()).add(type(value))
+    plain = {key: types for key, types in kinds.items() if types <= {type(None), str, bool, int, float}}
+    return table(
+        title, [(key.replace("_", "\n"), key, ".4g" if float in types else "") for key, types in plain.items()], records
+    )
+
+
 def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
     records: list[Mapping[str, object]] = []

@@ -17,7 +17,7 @@ from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings,
 
 CELL = 216
 GREY, MASK = (190, 190, 190), (255, 220, 0)
-LEGEND = """Images: one cross stands at one place of each scene and must stick to it, its square level as a floor;
+LEGEND = """Images: one cross stands at one place of each scene and must stick to it;
 red: to the first camera's right, green: up, blue: ahead; yellow: mask.
 Cameras: black: the first, then dark blue to orange with time; the tick is the image's upper edge;
 grey bar: near to far of the first (without a tick: farther); right, up and ahead are the first camera's."""
@@ -59,12 +59,11 @@ def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
     cell = _with_outline(picture)
     camera, draw = sequence.cameras[index], ImageDraw.Draw(cell)
     nearest = NEAREST * cross.arms.norm(dim=-1)[0].item()
-    sides, arms = (visible_segments(camera, segments, nearest) for segments in (cross.square(), cross.ends()))
-    lines = [(ends, "white", 2) for _, ends in sides] + [(ends, CROSS_COLORS[arm], 3) for arm, ends in arms]
-    for ends, color, width in lines:
+    arms = visible_segments(camera, cross.ends(), nearest)
+    for arm, ends in arms:
         points = [(x, y) for x, y in (CELL / camera.image_size[1] * ends).tolist()]
-        draw.line(points, INK, width + 2)  # a dark edge keeps it visible on any image
-        draw.line(points, color, width)
+        draw.line(points, INK, 5)  # a dark edge keeps it visible on any image
+        draw.line(points, CROSS_COLORS[arm], 3)
     inside = any(((ends > 0) & (ends < camera.image_size[1])).all(dim=-1).any() for _, ends in arms)
     return SheetCell(_tensor(cell), label + ("" if inside else ": cross outside" if arms else ": cross behind"))
 

@@ -23,15 +23,13 @@ ARM = 0.3
 # Root mean squares. The horizon follows from image axes that turn at least this much (radians). Cameras look at one
 # thing if their optical axes spread at least this much and miss their common point by at most this share of its depth.
 LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
-# Number of places for the cross along an axis; and share of an image at its borders where the cross counts as unseen.
-DEPTHS, BORDER = 16, 0.1
 # Share of an arm's length; lines nearer to a camera's plane are not drawn.
 NEAREST = 0.05
 
 
 @dataclass(frozen=True)
 class Cross:
-    """Three arms from one place, and a level square around it; rows of `arms`: right, up and ahead."""
+    """Three arms from one place; rows of `arms`: right, up and ahead."""
 
     center: Float[Tensor, "3"]
     arms: Float[Tensor, "3 3"]
@@ -40,21 +38,16 @@ class Cross:
         """Return the two ends of each arm in the world; the first is the centre."""
         return torch.stack([self.center.expand(3, 3), self.center + self.arms], dim=1)
 
-    def square(self) -> Float[Tensor, "4 2 3"]:
-        """Return the two ends of each side of the square in the world."""
-        right, _, ahead = self.arms
-        corners = self.center + torch.stack([right + ahead, right - ahead, -right - ahead, -right + ahead])
-        return torch.stack([corners, corners.roll(-1, 0)], dim=1)
-
 
 def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
     """Place a cross where the optical axes of cameras [view] meet, if they meet in front of all cameras.
 
-    Otherwise place it on the axis of the first, the middle or the last camera, where most cameras see it. Of equally
-    good places take the nearest, beyond the middle of the first camera's depth range in terms of 1 / depth.
+    Otherwise place it on the axis of the middle camera, in the middle of the depth range in terms of 1 / depth.
     """
-    met = _common_point(cameras)
-    center = _most_seen_point(cameras, depth_range) if met is None else met
+    center = _common_point(cameras)
+    if center is None:
+        middle = (len(cameras.centers) - 1) // 2
+        center = cameras.centers[middle] + 2 / (1 / depth_range).sum() * cameras.world_to_camera[middle, 2, :3]
     depth = transform_points(cameras.world_to_camera[0], center[None])[0, 2].abs()
     length = ARM * depth * cameras.image_size[1] / 2 / cameras.intrinsics[0, 0, 0]
     return Cross(center, length * level_axes(cameras))
@@ -102,21 +95,6 @@ def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     misses = (across @ offsets[:, :, None]).square().sum(dim=(1, 2))
     met = (depths > 0).all() and misses.mean().sqrt() < LARGEST_MISS * depths.mean()
     return point if met else None
-
-
-def _most_seen_point(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Float[Tensor, "3"]:
-    near, far = depth_range.double().tolist()
-    depths = torch.logspace(math.log10(2 / (1 / near + 1 / far)), math.log10(far), DEPTHS).to(cameras.intrinsics)
-    count = len(cameras.centers)
-    chosen = [0, count // 2, count - 1]
-    origins, forward = cameras.centers[chosen], cameras.world_to_camera[chosen, 2, :3]
-    # Points are ordered by depth, so the first of the best is the nearest.
-    points = (origins + depths[:, None, None] * forward).flatten(0, 1)
-    pixels, depth = project(cameras, points)
-    height, width = cameras.image_size
-    shares = pixels / torch.tensor([width, height]).to(pixels)
-    seen = ((shares - 0.5).abs() < 0.5 - BORDER).all(dim=-1) & (depth > near)
-    return points[seen.sum(dim=0).argmax()]
 
 
 FRUSTUM = 0.14

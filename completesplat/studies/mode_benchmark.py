@@ -115,13 +115,13 @@ class Measured:
     """Measurements so far: scores by method and scene.
 
     `energies` are the energy scores in views that show the modes, of the pixels that the reference hides and of the
-    others; `classes` are those of all samples, by method and the modes' probabilities; `shown` are rows of the figure.
+    others; `classes` are those of all samples, by method and the modes' probabilities; `rows` are those of the figure.
     """
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
     energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     classes: dict[str, dict[tuple[float, ...], list[Tensor]]] = field(default_factory=dict)
-    shown: list[list[SheetCell]] = field(default_factory=list)
+    rows: list[list[SheetCell]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
@@ -145,7 +145,7 @@ class Measured:
         labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
         cells = [SheetCell(scene.scene.reference.images[0], scene.scene.names[0])]
         cells += [SheetCell(*cell) for cell in zip([*scene.truths[:, 0], *images[:count, 0]], labels, strict=True)]
-        self.shown.append(cells)
+        self.rows.append(cells)
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Return means over the scenes by method."""
@@ -234,7 +234,7 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
 
 
 def draw(measured: Measured, samples: int, path: Path) -> None:
-    """Write a PNG with a row for each scene of `Measured.show`."""
+    """Write a PNG with a row for each scene of `Measured.rows`."""
     title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
-    headings = [""] * max(map(len, measured.shown))
-    write_png(path, image_sheet(headings, measured.shown, f"{title}samples with their modes"))
+    headings = [""] * max(map(len, measured.rows))
+    write_png(path, image_sheet(headings, measured.rows, f"{title}samples with their modes"))

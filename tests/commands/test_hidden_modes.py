@@ -32,5 +32,5 @@ def test_every_method_is_scored(command, pipeline, tmp_path, stage):
 
 
 def test_too_small_numbers_are_refused():
-    said = refused("test", "evaluation=hidden_modes", "ckpt=none", "evaluation.samples=1")
-    assert said == "evaluation.samples=1: must be at least 2"
+    message = refused("test", "evaluation=hidden_modes", "ckpt=none", "evaluation.samples=1")
+    assert message == "evaluation.samples=1: must be at least 2"

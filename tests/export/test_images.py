@@ -57,7 +57,7 @@ def test_nearer_is_brighter_on_one_scale_for_all_images():
     assert 19 < far <= 20
 
 
-def test_what_is_not_seen_is_grey_and_moves_the_scale_as_little_as_stray_depths():
+def test_missing_depths_are_grey_and_stray_depths_hardly_move_the_scale():
     depth = torch.linspace(1, 2, 400).view(1, 20, 20)
     colors, ends = color_depth(depth)
     holes = torch.cat([depth, torch.tensor([0.0, -1, torch.nan, torch.inf]).expand(1, 20, 4)], dim=-1)

@@ -34,8 +34,8 @@ def test_every_image_stands_upright_in_its_row_and_column_below_the_title(tmp_pa
     above = torch.ones(3, 1, 3, 36, 48)
     above[0] = reference
     expected = torch.cat([above, images, color_depth(depths)[0][:, None]], dim=1)
-    found = cells(sheet.crop((0, 30, *sheet.size)), 36, 48)
-    torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
+    result = cells(sheet.crop((0, 30, *sheet.size)), 36, 48)
+    torch.testing.assert_close(result, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
 CAMERA = Cameras(torch.eye(4), pinhole(60, 16), (16, 16))

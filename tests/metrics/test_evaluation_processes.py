@@ -44,7 +44,7 @@ def one_of_two(rank: int, folder: str) -> None:
     distributed.destroy_process_group()
 
 
-def test_two_processes_tell_what_one_tells_for_any_number_of_scenes(tmp_path):
+def test_two_processes_have_the_scores_of_one_for_any_number_of_scenes(tmp_path):
     multiprocessing.spawn(one_of_two, (str(tmp_path),), nprocs=2)
     alone = json.loads(json.dumps([scored(count, {"unreadable", "unreadable 0", "unreadable 1"}) for count in COUNTS]))
     for rank in (0, 1):

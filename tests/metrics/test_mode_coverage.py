@@ -73,9 +73,3 @@ def test_rejected_samples_count_as_mass_on_no_mode_and_scenes_the_same():
     perfect, blurred = scores(MODES, MODES, EVEN), scores(mean_of(MODES, EVEN)[None], MODES, EVEN)
     mean = mean_scores([perfect, blurred, blurred, perfect])
     assert (mean.coverage, mean.total_variation, mean.rejected) == (0.5, 0.5, 0.5)
-
-
-def test_modes_that_cannot_be_told_apart_are_refused():
-    for modes in (MODES[:1], MODES[[0, 0]], MODES[:, :0]):
-        with pytest.raises(ValueError, match="mode"):
-            scores(modes, modes, torch.full((len(modes),), 1 / len(modes)))

@@ -79,7 +79,7 @@ def test_a_run_by_another_protocol_stands_in_a_table_of_its_own(runs, run, diffe
     assert row["all pixels, novel views PSNR ↑"] == "17.50"
 
 
-def test_numbers_of_scenes_and_resolutions_of_the_paper_are_let_in_and_one_scene_more_is_explained(runs, run) -> None:
+def test_runs_with_the_papers_scenes_and_resolutions_are_listed(runs, run) -> None:
     sizes = [(100, 128), (6473, 128), (6473, 256), (6474, 128)]
     large = ALL_ROOMS | {"name": "realestate10k_256", "resolution": 256}
     for index, protocol in enumerate([SOME_ROOMS, ALL_ROOMS, large, ALL_ROOMS | {"scenes": 6474}]):
@@ -104,7 +104,7 @@ def test_an_oracle_stands_beside_one_of_as_many_samples_only(runs, run, samples,
     assert ("own_1" in by_name) == (samples != 20)
 
 
-def test_what_has_seen_its_views_is_not_beside_the_paper(runs, run) -> None:
+def test_models_that_have_seen_their_views_are_not_beside_the_paper(runs, run) -> None:
     path = run("a", 30.0, **HYDRANTS)
     tested = json.loads(path.read_text())
     run("b", 20.0, **HYDRANTS)
@@ -134,7 +134,7 @@ def test_best_and_second_of_our_own_are_marked_and_naive_predictors_are_not(runs
     assert any(SSIM_NOTE in line for line in table.below())
 
 
-def test_what_is_missing_says_why_below_the_table(runs, run) -> None:
+def test_missing_scores_have_a_reason_below_the_table(runs, run) -> None:
     run("a", 17.5, **HYDRANTS, missing={"lpips": "missing: no weights of VGG"})
     table = made(runs)["full_images"]
     (row,) = ours(table)
@@ -220,14 +220,14 @@ def test_a_sweep_stands_below_the_papers_rows_by_protocol(runs, job) -> None:
     assert list(by_name) == PAPERS  # and no table of jobs
     table = by_name["ablations"]
     rows = {next(iter(row.values())).removeprefix("completesplat: "): row for row in ours(table)}
-    full = next(row for label, row in rows.items() if label.startswith("full, 2 seeds"))
+    full = next(row for label, row in rows.items() if label.startswith("full (Our AutoReconstructor), 2 seeds"))
     assert full["PSNR ↑"] == "20.50 ± 0.71"
     assert len({label[-3:] for label in rows}) == 2  # notes on two protocols
     assert f"[{full['LPIPS ↓'].removeprefix('missing: note ')}] lpips: missing: no weights" in table.below()
     assert any("resolution 64" in line for line in table.below())
 
 
-def test_a_sweep_without_ablations_is_a_number_of_runs(runs, job) -> None:
+def test_a_sweep_without_ablations_counts_as_single_runs(runs, job) -> None:
     job("nothing_of_the_paper", 0, 20.0)
     job("nothing_of_the_paper", 1, 21.0)
     assert [table.name for table in tables(find(runs))] == [*PAPERS, "own_1"]

@@ -99,7 +99,7 @@ def test_the_heading_says_which_direction_is_better(name, arrow) -> None:
     assert metric(f"full_novel_{name}") == arrow
 
 
-def test_what_a_record_lacks_stays_empty(capsys) -> None:
+def test_missing_entries_of_records_stay_empty(capsys) -> None:
     shown = table("Title", [("name", "name", ""), ("figure", "figure", ".1f")], [{"name": "[red]"}, {"figure": 1.25}])
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
     show(shown)

@@ -26,14 +26,6 @@ def cells(sheet, sequences, images):
     return np.stack([[sheet[top : top + CELL, left : left + CELL] for left in lefts] for top in tops])
 
 
-def test_the_sheet_grows_by_equal_steps(orbit, tmp_path):
-    counts = [(1, 4), (2, 4), (3, 4), (1, 5)]
-    sizes = [sheet_of([orbit(4)] * rows, tmp_path, images).shape for rows, images in counts]
-    assert sizes[2][0] - sizes[1][0] == sizes[1][0] - sizes[0][0] > CELL
-    assert sizes[3][1] - sizes[0][1] == CELL + GAP
-    assert sizes[0][1] == 2 * MARGIN + 6 * CELL + 5 * GAP
-
-
 def test_images_are_evenly_spaced_in_time(orbit, tmp_path):
     sequence = orbit(24, read=lambda i: Picture(torch.full((3, SIZE, SIZE), 10 * i, dtype=torch.uint8), None))
     shown = cells(sheet_of([sequence], tmp_path, 6), 1, 6)[0]

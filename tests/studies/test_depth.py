@@ -84,22 +84,22 @@ def depths() -> torch.Tensor:
 
 @pytest.mark.parametrize(("far_degrees", "views"), [(89, [1, 2]), (91, [2]), (1, [1, 2, 3])])
 def test_far_is_an_angle_and_the_object_is_its_mask(far_degrees, views):
-    found = deviations(depths(), scene(), far_degrees)
+    result = deviations(depths(), scene(), far_degrees)
     mean = np.mean(views) / np.sqrt(2)
-    assert found["far_object_deviation"] == pytest.approx(2 * mean)
-    assert found["far_deviation"] == pytest.approx(mean * (1 + 1 / SIZE))
-    assert (found["reference_deviation"], found["far_measured"]) == (0, 1)
+    assert result["far_object_deviation"] == pytest.approx(2 * mean)
+    assert result["far_deviation"] == pytest.approx(mean * (1 + 1 / SIZE))
+    assert (result["reference_deviation"], result["far_measured"]) == (0, 1)
 
 
-def test_what_is_not_seen_is_not_measured():
+def test_hidden_pixels_are_not_measured():
     depth = depths()
     depth[0, 2, :, : SIZE // 2] = 0
     assert deviations(depth, scene(), 91)["far_measured"] == 0.5
     depth[0, 2] = 0
-    found = deviations(depth, scene(), 91)
-    assert (found["far_deviation"], found["far_object_deviation"], found["far_measured"]) == (None, None, 0)
-    found = deviations(depths(), scene(), 180)
-    assert {found[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
+    result = deviations(depth, scene(), 91)
+    assert (result["far_deviation"], result["far_object_deviation"], result["far_measured"]) == (None, None, 0)
+    result = deviations(depths(), scene(), 180)
+    assert {result[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
 
 
 def test_a_row_shows_the_truth_some_samples_from_behind_and_where_all_disagree():

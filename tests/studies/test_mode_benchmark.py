@@ -86,7 +86,7 @@ def test_shares_are_of_all_scenes_with_the_same_probabilities():
 
 
 def test_the_figure_shows_the_class_of_each_sample():
-    (row,) = measured([3, 0, 1, 1]).shown
+    (row,) = measured([3, 0, 1, 1]).rows
     assert [cell.label for cell in row] == ["scene 0", "a", "b (true)", "c", "d", "d", "a", "b"]
     assert torch.equal(torch.stack([cell.image for cell in row[1:]]), SCENES[0].truths[[0, 1, 2, 3, 3, 0, 1], 0])
 
