@@ -238,7 +238,7 @@ def page(folder: Path, out: Path, most: Limits, made: Mapping[str, str]) -> tupl
         made="; ".join(f"{key} {value}" for key, value in made.items() if value),
         version=__version__,
     )
-    return text, tree.warnings
+    return text.lstrip(), tree.warnings
 
 
 def _name(path: Path, root: Path) -> str:
