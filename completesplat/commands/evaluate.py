@@ -133,7 +133,7 @@ def run_hidden_modes(
     logger: Mapping[str, Any] | None,
     out: Path,
 ) -> None:
-    """Write the JSON files of hidden_modes, shares, calibration and protocol, `hidden_modes.png`, and print the table.
+    """Write the JSON files of hidden_modes, shares and protocol, `hidden_modes.png`, and print the table.
 
     Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
     `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
@@ -159,13 +159,12 @@ def run_hidden_modes(
         evaluation["shown_samples"],
         progress,
     )
-    results, calibration = measured.results(samples), measured.calibration()
+    results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
-    write_json(out / "calibration.json", calibration)
     write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
     write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
-    draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
+    draw(measured, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
         log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)

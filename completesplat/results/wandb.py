@@ -18,8 +18,8 @@ from completesplat.export.video import orbit_views, write_video
 from completesplat.files import make_folder
 from completesplat.metrics.scoring import BEST, MODEL, Evaluation
 from completesplat.results.paper_figures import tables
-from completesplat.results.runs import find
-from completesplat.results.tables import Table, by_name
+from completesplat.results.runs import find, flat
+from completesplat.results.tables import Table
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.loggers import wandb_runs
 from completesplat.training.sample_images import evenly_spaced
@@ -118,7 +118,7 @@ def log_shown(results: dict[str, Any], scenes: SceneTable | None, trainer: Train
     if not runs:
         return
     media = {} if scenes is None else scenes.media()
-    media |= {"test/predictors": predictor_table({predictor: by_name(scores) for predictor, scores in results.items()})}
+    media |= {"test/predictors": predictor_table({predictor: flat(scores) for predictor, scores in results.items()})}
     ours = [table for table in tables(find(out)) if any(row.source == "ours" for row in table.rows)]
     media |= {f"report/{table.name}": as_wandb(table) for table in ours}
     for run in runs:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.export.cleaning import storable, with_screen_space_dilation
-from completesplat.export.images import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.images import SheetCell, color_depth, image_sheet, write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_text
@@ -184,7 +184,7 @@ def up_of(module: Stage) -> Float[Tensor, "3"]:
 
 def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
     """Draw a sheet with a column for each panel and a row for each scene."""
-    return picture_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
+    return image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
 
 
 def scene_panels(

@@ -9,7 +9,7 @@ from lightning import Trainer
 from PIL import Image
 from torch import Tensor
 
-from completesplat.export.images import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.images import SheetCell, color_depth, image_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
@@ -115,7 +115,7 @@ def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
         samples = [labelled(f"sample {i + 1}", images) for i, images in enumerate(scene.samples)]
         rows += [labelled("true", scene.true), *samples, labelled("depth of 1", color_depth(scene.depth[0])[0])]
     most = max(map(len, rows))
-    return picture_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
+    return image_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
 
 
 def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
@@ -124,7 +124,7 @@ def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
     rows = [
         labelled(name, images) for scene in drawn for name, images in zip(views, scene.strip.unbind(1), strict=True)
     ]
-    return picture_sheet(["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)], rows)
+    return image_sheet(["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)], rows)
 
 
 def labelled(name: str, images: Float[Tensor, "picture 3 height width"]) -> list[SheetCell | None]:
