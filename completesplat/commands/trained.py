@@ -174,9 +174,7 @@ def diffusion_of(module: Any) -> Any:
     Raises:
         CompleteSplatError: the module is another model.
     """
-    from completesplat.training.latent_diffusion import LatentDiffusion
-
-    if not isinstance(module, LatentDiffusion):
+    if not module.draws_samples:
         raise CompleteSplatError("this checkpoint is of a model that draws no samples; a diffusion model is needed")
     return module.completesplat
 
