@@ -3,12 +3,11 @@
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, is_dataclass
-from functools import lru_cache
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json, require_file
+from completesplat.data.validation import BadAnnotation, UnreadableFile, at, field, read_json
 from completesplat.errors import DataError
 from completesplat.files import write_text
 
@@ -84,16 +83,7 @@ def is_packed(root: Path) -> bool:
 
 def read_manifest(root: Path) -> PackedManifest:
     """Read the manifest of a store; errors as in `read_as`."""
-    path = root / MANIFEST
-    with at(file=path):
-        now = require_file(path).stat()
-    return _read_manifest(path, now.st_mtime_ns, now.st_size)
-
-
-@lru_cache(maxsize=1)
-def _read_manifest(path: Path, *_: int) -> PackedManifest:
-    """Read a manifest once for all splits and checks; that of all RealEstate10K clips takes a third of a second."""
-    return read_as(PackedManifest, path, HEADER, "prepare the data again")
+    return read_as(PackedManifest, root / MANIFEST, HEADER, "prepare the data again")
 
 
 def read_as(kind: type[T], path: Path, header: Mapping[str, str | int], remedy: str) -> T:

@@ -42,16 +42,15 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
             # The header is checked before the pixels are decoded, so that no file unpacks to a huge image.
-            wrong = image.size != (size, size) or len(image.getbands()) != channels
-            if not wrong and wanted != size:
+            if image.size != (size, size) or image.mode != {1: "L", 3: "RGB"}[channels]:
+                raise ValueError(f"no image of {size} x {size} pixels with {channels} channels of 8 bits")
+            if wanted != size:
                 return cut_square(image, Square(0, 0, size), wanted)
-            pixels = None if wrong else np.array(image)
+            pixels = np.array(image).reshape(size, size, channels)
     # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
         raise BadPicture(f"cannot be decoded: {error}") from error
-    if pixels is None or pixels.dtype != np.uint8:
-        raise BadPicture(f"is no image of {size} x {size} pixels with {channels} channels of 8 bits")
-    return torch.from_numpy(np.ascontiguousarray(pixels.reshape(size, size, channels).transpose(2, 0, 1)))
+    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
 @cache
