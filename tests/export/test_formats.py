@@ -11,8 +11,7 @@ from fake_converter import COPY, calls, install
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import FORMATS, write_formats, write_splat
-from completesplat.export.gltf import write_glb
+from completesplat.export.formats import FORMATS, write_formats, write_glb, write_splat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, upright, viewer_settings
 from completesplat.gaussians import Gaussians
