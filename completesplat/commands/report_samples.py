@@ -1,7 +1,7 @@
 """`completesplat report`: studies of a trained model's samples.
 
 Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
-and, if it draws samples, `diffusion_of`. Skip and guidance weights outside of [0, 1] are refused.
+and, if it draws samples, `diffusion_of`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.results.machine import machine
 from completesplat.results.tables import SSIM_NOTE, records_table, show
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
@@ -29,7 +29,7 @@ from completesplat.studies import stage1 as stage1_study
 from completesplat.studies.samples import SampleRenderer, first_scenes
 from completesplat.training.stage import Stage
 
-Numbers = Annotated[Sequence[float], Entries(1)]
+Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
@@ -51,8 +51,8 @@ class SampledRun(Run):
 def samplers(
     samplers: Mapping[str, Mapping[str, object]],
     steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     out: Path,
     **run: Unpack[SampledRun],
 ) -> None:
@@ -88,8 +88,8 @@ def samplers(
 
 
 def controls(
-    skip_weights: Numbers,
-    guidance_weights: Numbers,
+    skip_weights: Weights,
+    guidance_weights: Weights,
     near_degrees: float,
     shown: int,
     out: Path,
@@ -114,7 +114,7 @@ def controls(
 
 
 def masked(
-    boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[SampledRun]
+    boxes: Sequence[Sequence[float]], views: int, guidance_weight: Share, out: Path, **run: Unpack[SampledRun]
 ) -> None:
     """Write `masked.png`: inputs with boxes over them, and several completions of each.
 
@@ -130,8 +130,8 @@ def masked(
 
 
 def depth(
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     shown_scenes: Positive,
     shown: Positive,
     far_degrees: Annotated[float, Range(0, 180)],
