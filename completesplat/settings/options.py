@@ -94,7 +94,7 @@ class ConfFile(NamedTuple):
 
 def conf_folder() -> Path:
     """Return the folder of configs, inside an installed package or beside the package in the repository."""
-    package = Path(__file__).parent
+    package = Path(__file__).parents[1]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
