@@ -42,9 +42,9 @@ def main() -> None:
     if arguments[0] in ("--complete", "completion"):
         return _complete(arguments[1:], script=arguments[0] == "completion")
     if arguments[0] not in VERBS:
-        from completesplat.settings.options import meant
+        from completesplat.settings.options import did_you_mean
 
-        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{meant(arguments[0], VERBS)}"))
+        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{did_you_mean(arguments[0], VERBS)}"))
 
     # This must be set before torch is loaded. By default its idle threads (GNU OpenMP's) spin for milliseconds and
     # so keep the rasterizer's threads and other processes off the cores.
@@ -67,7 +67,7 @@ def main() -> None:
 
 def _complete(words: list[str], script: bool) -> None:
     """Print completions of the last word, or the script with which a shell asks for them."""
-    from completesplat.settings.options import SCRIPTS, candidates
+    from completesplat.settings.completion import SCRIPTS, candidates
 
     if not script:
         return print("\n".join(candidates(words, VERBS)))
