@@ -67,7 +67,7 @@ def main() -> None:
 
 def _complete(words: list[str], script: bool) -> None:
     """Print completions of the last word, or the script with which a shell asks for them."""
-    from completesplat.settings.completion import SCRIPTS, candidates
+    from completesplat.settings.options import SCRIPTS, candidates
 
     if not script:
         return print("\n".join(candidates(words, VERBS)))

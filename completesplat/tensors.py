@@ -22,7 +22,7 @@ class TensorDataclass:
     def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
         """Return the same dataclass with `function` applied to every tensor, including nested ones."""
 
-        def apply(value: Any) -> Any:
+        def apply(value: object) -> object:
             if isinstance(value, Tensor):
                 return function(value)
             return value.map(function) if isinstance(value, TensorDataclass) else value
@@ -71,22 +71,23 @@ def stack(items: Sequence[T]) -> T:
 def concatenate(items: Sequence[T], axis: int = 0) -> T:
     """Concatenate the items' tensors along an existing axis; static values are those of the first item."""
 
-    def join(values: list[Any]) -> Any:
-        if isinstance(values[0], Tensor):
-            return torch.cat(values, dim=axis)
-        return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
+    def join(values: list[object]) -> object:
+        if tensors := [value for value in values if isinstance(value, Tensor)]:
+            return torch.cat(tensors, dim=axis)
+        parts = [value for value in values if isinstance(value, TensorDataclass)]
+        return concatenate(parts, axis) if parts else values[0]
 
     joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
     return replace(items[0], **joined)
 
 
-def _merge(values: list[Any]) -> Any:
+def _merge(values: list[object]) -> object:
     first = values[0]
     if isinstance(first, Tensor):
         # Like `torch.stack`, but a loader's worker process writes directly into memory that it shares with training.
         return default_collate(values)
     if isinstance(first, TensorDataclass):
-        return stack(values)
+        return stack([value for value in values if isinstance(value, TensorDataclass)])
     if isinstance(first, str):
         return tuple(values)
     if any(value != first for value in values):

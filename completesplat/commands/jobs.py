@@ -26,7 +26,7 @@ from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path, writing
 from completesplat.settings.checks import check_verb
-from completesplat.settings.composition import use_working_folder
+from completesplat.settings.composition import resolved_settings, use_working_folder
 from completesplat.settings.options import did_you_mean
 from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
@@ -114,8 +114,7 @@ def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> fl
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
-    resolved = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(resolved, dict)
+    resolved = resolved_settings(config)
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
@@ -176,7 +175,7 @@ def start(verb: str, config: DictConfig, out: Path) -> None:
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
         else:
-            check_settings(get_method(config.task._target_), OmegaConf.to_container(config.task, resolve=True))
+            check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
     run()
 
@@ -227,13 +226,8 @@ def _differences(first: object, second: object, key: str = "") -> set[str]:
 def _record(path: Path, command: list[str], overrides: list[str]) -> None:
     """Write `run.json`: version, command and overrides, and the times of the start and of continuations."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record = {
-        "version": __version__,
-        "commit": git_commit(),
-        "command": command,
-        "overrides": overrides,
-        "started": now,
-    }
+    record = {"version": __version__, "commit": git_commit(), "command": command, "overrides": overrides}
+    record |= {"started": now}
     if path.is_file() and (path.parent / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}

@@ -58,8 +58,8 @@ def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
-    `data TASK` is short for `data_task=TASK`, `predict A B` for `image=[A,B]`, `view PATH` for `path=PATH`, `new KIND NAME`
-    for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally, whatever it contains: `a,b.jpg`.
+    `data TASK` is short for `data_task=TASK`, `predict A B` for `image=[A,B]`, `view PATH` for `path=PATH`, and
+    `new KIND NAME` for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally, as `a,b.jpg`.
 
     Raises:
         CompleteSplatError: a flag lacks its value, there are too many words, a setting is given both ways, a word is no

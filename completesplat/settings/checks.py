@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, ListConfig, Node, OmegaConf
@@ -65,6 +65,9 @@ class Predict(SceneSettings):
     samples: Annotated[int, Range(1, 1000)]
     seed: Seed
     batch: Positive | None
+    mask: str | None
+    box: Sequence[float] | None
+    cameras: str | None
     screen_space_dilation: bool
     maps: bool
 
@@ -105,6 +108,7 @@ def check_verb(verb: str, config: DictConfig) -> None:
 def check_parts(config: Container, place: str = "") -> None:
     """Check each mapping with a `_target_`, and all below it, against the arguments of that class or function."""
     hints, complete = _arguments(config)
+    name: Any
     for name in config if isinstance(config, DictConfig) else range(len(config)):
         if OmegaConf.is_missing(config, name):
             continue
@@ -133,7 +137,7 @@ def _arguments(config: Container) -> tuple[Mapping[str, object], bool]:
         return {}, False
 
 
-def _origin(config: Container, name: str | int, place: str) -> str:
+def _origin(config: Container, name: Any, place: str) -> str:
     """Return the setting to which a place refers for its value, or the place itself."""
     root, raw = config._get_root(), config._get_node(name)
     while isinstance(raw, Node) and (reference := REFERENCE.fullmatch(str(raw._value()))) is not None:

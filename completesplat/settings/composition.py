@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 from hydra import compose as compose_by_hydra
 from hydra import initialize_config_dir
@@ -64,6 +65,11 @@ def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
         return compose_by_hydra(verb, overrides=list(overrides))
 
 
+def resolved_settings(config: DictConfig) -> dict[str, object]:
+    """Return a config as a plain mapping without references."""
+    return cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
+
+
 @contextmanager
 def nearest_names(verb: str, arguments: Sequence[str]) -> Iterator[None]:
     """Raise CompleteSplatError with the nearest names in place of Hydra's error about an unknown name."""
@@ -100,7 +106,7 @@ def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | No
 
 def _keys(config: DictConfig, place: str = "") -> Iterator[str]:
     """Yield all keys of a config with their places, without following references."""
-    for name in config:
+    for name in map(str, config):
         yield f"{place}{name}"
         followed = OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name)
         if not followed and isinstance(config[name], DictConfig):

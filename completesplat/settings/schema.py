@@ -170,7 +170,7 @@ def refused(annotation: object, value: object) -> list[Refused]:
         typed = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else {}
         kinds = [(key, part, typed.get(key, object) if typed else arguments[1]) for key, part in value.items()]
         return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
-    if annotation in KINDS and not _is_a(annotation, value):
+    if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
     return []
 
@@ -194,7 +194,7 @@ def described(annotation: object) -> str:
     return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
 
 
-def _is_a(kind: object, value: object) -> bool:
+def _is_a(kind: type, value: object) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)

@@ -78,5 +78,5 @@ def test_refusals_are_one_line_and_status_two(command, arguments, said):
 
 
 def test_two_launches_in_one_second_do_not_share_a_directory():
-    program = "import os, hydra; os.fork(); from completesplat.commands import RUN_NAME; print(RUN_NAME)"
+    program = "import os, hydra; os.fork(); from completesplat.settings.composition import RUN_NAME; print(RUN_NAME)"
     assert len(set(python(program).splitlines())) == 2

@@ -130,7 +130,7 @@ def test_pictures_that_cannot_be_taken_together_are_refused(runs, tiny_weights, 
     pictures = f"image=[{tmp_path / 'frame0.png'},{tmp_path / 'frame1.png'}]"
     cameras = f"cameras={tmp_path / 'transforms.json'}"
     weights = f"weights={runs / 'diffusion/weights'}"
-    assert "two pictures or more" in refused("predict", f"image={tmp_path / 'frame0.png'}", cameras, weights)
+    assert "two images or more" in refused("predict", f"image={tmp_path / 'frame0.png'}", cameras, weights)
     assert "box does not go with cameras" in refused("predict", pictures, cameras, weights, "box=[0,0,1,0.5]")
     assert "trained with posterior=image" in refused("predict", pictures, cameras, f"weights={tiny_weights}")
 

@@ -83,7 +83,7 @@ def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp
     assert all(row["reference_deviation"] > 0 and 0 < row["reference_measured"] <= 1 for row in results["rows"])
     assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "far_degrees": 45}
     assert imageio.imread(tmp_path / "out/depth.png").ndim == 3
-    assert "Deviation of depth" in said
+    assert "Standard deviation of depth" in said
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,10 @@ from omegaconf import OmegaConf
 from support import SMALL, call, script, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.jobs import LONGEST_NAME, is_finished, job_name, sweep_arguments, swept_keys
+from completesplat.commands.jobs import is_finished
 from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
+from completesplat.settings.composition import LONGEST_NAME, job_name, swept_keys
 
 LAST = "checkpoints/last.ckpt"
 
@@ -85,12 +86,10 @@ def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
 
 
 @pytest.mark.parametrize(("name", "value"), [("LOCAL_RANK", "0"), ("SLURM_STEP_NUM_TASKS", "2")])
-def test_a_sweep_is_not_started_by_each_process_of_a_launcher(monkeypatch, name, value):
-    given = ["-m", "experiment=toy_var", "seed=0,1"]
-    assert sweep_arguments("fit", given, "run")
+def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    with pytest.raises(CompleteSplatError, match="start it once"):
-        sweep_arguments("fit", given, "run")
+    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
+    assert (refused.status, "start it once" in refused.err) == (2, True)
 
 
 def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:

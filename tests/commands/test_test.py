@@ -137,7 +137,7 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
         (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
         (["evaluation=realestate10k_100", "evaluation.data.scene_list=FILE"], "have no setting scene_list"),
         (["evaluation=co3d"], "evaluation=co3d is of co3d, this run's data are toy_objects"),
-        (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores pictures only"),
+        (["evaluation=hidden_modes"], "evaluation=hidden_modes: fit scores images only"),
         (["evaluation.resolution=48"], r"prepared with image_size=32 \(asked for: 48\)"),
     ],
 )

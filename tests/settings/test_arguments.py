@@ -85,9 +85,9 @@ def test_words_and_flags_become_settings(verb, typed, given):
 @pytest.mark.parametrize(
     ("verb", "typed", "said"),
     [
-        ("predict", ["a.png", "image=b.png"], "give pictures by their names or as image=, not both: a.png"),
-        ("view", ["a.ply", "b.ply"], "give one path to look at, not a.ply b.ply"),
-        ("view", ["a.ply", "--export"], "--export needs a file: --export page.html"),
+        ("predict", ["a.png", "image=b.png"], "give files by their names or as image=, not both: a.png"),
+        ("view", ["a.ply", "b.ply"], "give one path, not a.ply b.ply"),
+        ("view", ["a.ply", "--export"], "--export: lacks its value; give --export VALUE"),
         ("fit", ["--config-dir"], "--config-dir: lacks its value; give --config-dir VALUE"),
         ("new", ["loss", "a", "b"], "give one kind and one name, not loss a b"),
         ("fit", ["nonsense"], "nonsense: no setting, which are given as key=value"),

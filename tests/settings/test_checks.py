@@ -17,6 +17,7 @@ ODD = [
     ("predict", "samples=-1", "samples=-1: must lie between 1 and 1000"),
     ("predict", "guidance_weight=nan", "guidance_weight=nan: must lie between 0 and 1"),
     ("predict", "maps=perhaps", "maps=perhaps: must be true or false"),
+    ("predict", "box=[a,b,c,d]", f"box=['a', 'b', 'c', 'd']: {NUMBER}"),
     ("predict", "weights=[a]", "weights=['a']: must be a text"),
     ("view", "port=none", f"port=none: {WHOLE}"),
     ("view", "samples=1.5", f"samples=1.5: {WHOLE}"),

@@ -80,15 +80,16 @@ def test_every_group_is_explained_and_every_option_is_read():
 
 def test_a_files_lines_are_read_as_they_explain_themselves():
     written = parse(
-        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n# Of all.\npart:\n"
+        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n"
+        "e: # With entries.\n  - 1\n# Of all.\npart:\n"
         "  # Of the inner\n  # one.\n  c: x\n  d: null\n"
         "defaults:\n  - _base\n  - override /data@here: toy # why\n  - _self_\n"
     )
     assert (written.about, written.package) == ("About it.", "_global_")
-    assert [tuple(one) for one in written.settings if one.key != "defaults"] == [
+    assert [tuple(setting) for setting in written.settings] == [
         ("a", "1", "Of the first."),
         ("b", "[1, 2]", "of the second"),
-        ("part", "", "Of all."),
+        ("e", "", "With entries."),
         ("part.c", "x", "Of the inner one."),
         ("part.d", "null", ""),
     ]

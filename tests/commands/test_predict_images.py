@@ -1,4 +1,4 @@
-"""Several pictures at once, file formats, videos, and what is said about them."""
+"""Predictions of several images at once, file formats, videos, warnings and refusals."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from PIL import Image
 from safetensors.torch import load_file, save_file
 from support import compose_config, refused, some_gaussians, strict_json
 
-from completesplat.commands.predict import find_pictures, run, unusual_field_of_view
+from completesplat.commands.predict import find_images, run, unusual_field_of_view
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.files import folder_names
@@ -58,7 +58,7 @@ def test_what_a_folder_has_that_is_no_file_is_named(tmp_path, caplog):
     os.mkfifo(tmp_path / "photos/pipe.png")
     (tmp_path / "photos/link.png").symlink_to("nowhere")
     (tmp_path / "photos/same.png").symlink_to("a.png")
-    assert [path.name for path in find_pictures(str(tmp_path / "photos"))] == ["a.png", "same.png"]
+    assert [path.name for path in find_images(str(tmp_path / "photos"))] == ["a.png", "same.png"]
     assert caplog.messages == [f"{tmp_path}/photos: left out, because they are no files: link.png, pipe.png"]
 
 
@@ -68,12 +68,12 @@ def test_a_folder_is_its_pictures_sorted_and_not_those_of_its_folders(tmp_path):
     (tmp_path / "photos/c.png").mkdir()
     (tmp_path / "photos/notes.txt").write_text("no picture")
     folder, single = tmp_path / "photos", tmp_path / "x.raw"
-    assert find_pictures(str(folder)) == [folder / "a.PNG", folder / "b.jpg"]
-    assert find_pictures([str(single), str(folder)]) == [single, folder / "a.PNG", folder / "b.jpg"]
-    with pytest.raises(CompleteSplatError, match="no picture in this folder"):
-        find_pictures(str(folder / "c.png"))
+    assert find_images(str(folder)) == [folder / "a.PNG", folder / "b.jpg"]
+    assert find_images([str(single), str(folder)]) == [single, folder / "a.PNG", folder / "b.jpg"]
+    with pytest.raises(CompleteSplatError, match="no image in this folder"):
+        find_images(str(folder / "c.png"))
     with pytest.raises(CompleteSplatError, match="at least one"):
-        find_pictures([])
+        find_images([])
 
 
 def test_pictures_of_one_name_get_folders_of_their_own():
@@ -138,7 +138,7 @@ def test_a_fault_at_one_picture_does_not_stop_the_others(predict, tmp_path, monk
     assert finished.status == 2
     first, summary = finished.err.splitlines()
     assert first == f"error: {tmp_path / 'a.png'}: a fault of the program"
-    assert "1 of 2 pictures failed (a.png)" in summary
+    assert "1 of 2 images failed (a.png)" in summary
     assert "Traceback" in finished.out
     assert (tmp_path / "out/b/sheet.png").is_file()
 
@@ -146,11 +146,11 @@ def test_a_fault_at_one_picture_does_not_stop_the_others(predict, tmp_path, monk
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("image=null", "image=None: give a picture, a folder, or a list of them"),
-        ("image=''", "image=: give a picture"),
-        ("image=[a.png,null]", "give a picture"),
-        ("image=[]", "name at least one picture"),
-        ("image={a:1}", "give a picture"),
+        ("image=null", "image=None: give an image, a folder, or a list of them"),
+        ("image=''", "image=: give an image"),
+        ("image=[a.png,null]", "give an image"),
+        ("image=[]", "name at least one image"),
+        ("image={a:1}", "give an image"),
         ("samples=1000000000", "samples=1000000000: must lie between 1 and 1000"),
         ("frames=1000000000", "frames=1000000000: must lie between 1 and 1000"),
         ("seed=-1", "seed=-1: must lie between 0 and"),
@@ -197,7 +197,7 @@ def trained(tiny_weights: Path, folder: Path, **facts: object) -> Path:
 def test_what_is_hidden_from_weights_that_were_not_trained_for_it_is_said_once(predict, tiny_weights, tmp_path):
     picture(tmp_path / "photos/a.png")
     picture(tmp_path / "photos/b.png")
-    said, box = "box: these weights were not trained with parts of the picture hidden", "box=[0,0,0.5,0.5]"
+    said, box = "box: these weights were not trained with parts of the image hidden", "box=[0,0,0.5,0.5]"
     without, masked = (
         trained(tiny_weights, tmp_path / "0", box_masks=0.0),
         trained(tiny_weights, tmp_path / "1", box_masks=0.5),
@@ -248,7 +248,7 @@ def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp
     broken, missing, summary = finished.err.splitlines()
     assert re.match("error: .*b.jpg", broken)
     assert "nowhere.png: no such file" in missing
-    assert summary == f"error: 2 of 4 pictures failed (b.jpg, nowhere.png); the others are in {tmp_path / 'out'}"
+    assert summary == f"error: 2 of 4 images failed (b.jpg, nowhere.png); the others are in {tmp_path / 'out'}"
     done = [line.partition(":")[0] for line in finished.out.splitlines() if "/4 " in line]
     assert done == ["1/4 a.png", "4/4 a.png"]
     found = [(path.parent.name, path.name) for path in (tmp_path / "out").glob("*/*")]
@@ -257,7 +257,7 @@ def test_a_picture_that_fails_is_named_and_does_not_stop_the_others(predict, tmp
 
 
 def test_if_all_fail_nothing_is_said_to_be_left(predict, tmp_path):
-    assert predict("[x.png,y.png]").err.splitlines()[-1] == "error: 2 of 2 pictures failed (x.png, y.png)"
+    assert predict("[x.png,y.png]").err.splitlines()[-1] == "error: 2 of 2 images failed (x.png, y.png)"
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 truncated")
     finished = predict(tmp_path / "broken.jpg")
     assert (finished.status, finished.err.count("\n")) == (2, 1)
@@ -295,7 +295,7 @@ def test_wishes_without_a_meaning_are_refused_before_the_model_is_loaded(tmp_pat
     for setting, said in (
         ("formats=[ply,obj]", "formats=obj: choose from ply, splat, glb, spz, sog, html"),
         ("video=zoom", "video=zoom: choose from orbit, swipe, wobble"),
-        ("mask=x.png", "mask=FILE belongs to one picture"),
+        ("mask=x.png", "mask=FILE belongs to one image"),
     ):
         config = compose_config("predict", "image=[a.png,b.png]", "weights=nowhere", setting)
         with pytest.raises(CompleteSplatError, match=re.escape(said)):
