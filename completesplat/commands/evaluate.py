@@ -174,9 +174,9 @@ def run_hidden_modes(
     scenes = [scene.to(device) for scene in scenes]
     measured = measure(methods, scenes, samples, evaluation["seed"], *shown, progress)
     results, calibration = measured.results(samples), measured.calibration()
-    contents = {"hidden_modes": results, "calibration": calibration, "shares": measured.shares()}
-    for name, content in contents.items():
-        write_json(out / f"{name}.json", content)
+    write_json(out / "hidden_modes.json", results)
+    write_json(out / "calibration.json", calibration)
+    write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
     write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
     draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")

@@ -1,4 +1,4 @@
-"""Options and settings in `conf/` with their comments, for help texts and for the completion of command lines in shells.
+"""Options and settings in `conf/` with their comments, for help texts and for completion in shells.
 
 A comment above a key or behind its value explains the key; the first comment of a file explains the file. Neither Hydra
 nor OmegaConf is imported, because shells call `completesplat --complete WORDS` at each press of the tab key.
