@@ -1,4 +1,4 @@
-"""`completesplat doctor`: a report of what this machine has and lacks, and whether `predict` can work on it."""
+"""`completesplat doctor`: a report of what this machine has and lacks, and whether `predict` works on it."""
 
 import os
 import platform
@@ -10,9 +10,8 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
-from urllib.parse import urlparse
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.filesize import decimal
@@ -22,8 +21,7 @@ from rich.text import Text
 from completesplat import __version__
 from completesplat.commands.protocol import write_json
 from completesplat.errors import WeightsError
-from completesplat.settings.options import conf_folder
-from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, weights_folder
+from completesplat.weights import BOX, SUMS_FILE, WEIGHTS_FILE, weights_folder
 
 ALWAYS_NAMED = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {
@@ -35,7 +33,6 @@ EXTRAS = {
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000
 """Bytes that the files of a few predictions take."""
-VAE = "CompVis/stable-diffusion-v1-4"
 
 
 @dataclass(frozen=True)
@@ -105,25 +102,19 @@ def check_imports() -> Iterator[Finding]:
 
 
 def check_device() -> Iterator[Finding]:
-    """Yield CPU, memory and GPUs. A missing GPU is no error: small models draw samples in seconds without one."""
+    """Yield CPU and GPUs. A missing GPU is no error: small models draw samples in seconds without one."""
     import torch
 
     from completesplat.results.machine import machine
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Finding("processor", "yes", f"{machine()['processor']}, {cores} cores to use")
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", ()):
-        yield Finding("memory", "yes", decimal(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
+    yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")
     for index in range(torch.cuda.device_count()):
         free, total = map(decimal, torch.cuda.mem_get_info(index))
         yield Finding(f"GPU {index}", "yes", f"{torch.cuda.get_device_name(index)}, {free} of {total} free")
     if not torch.cuda.is_available():
-        reason = f"torch for CUDA {torch.version.cuda} finds none; `nvidia-smi` says what the driver sees"
-        if torch.version.cuda is None:
-            reason = f"this torch ({torch.__version__}) is built without CUDA; all works on the CPU, slower"
-        elif shutil.which("nvidia-smi") is None:
-            reason = "no NVIDIA driver here (there is no nvidia-smi); all works on the CPU, slower"
-        yield Finding("GPU", "no", reason)
+        built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
+        reason = f"torch {torch.__version__}, built {built}, finds none (nvidia-smi shows the driver's)"
+        yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
 
 
 def check_rasterizers() -> Iterator[Finding]:
@@ -138,47 +129,13 @@ def check_rasterizers() -> Iterator[Finding]:
 
 
 def check_weights(folder: Path = BOX) -> Iterator[Finding]:
-    """Yield the package's weights, in subfolders of `folder`, and published ones, which are downloaded if missing."""
-    import torch
-    from huggingface_hub import try_to_load_from_cache
-
-    from completesplat.losses.lpips import URL as VGG
-    from completesplat.metrics.image_sets import URL as INCEPTION
-
-    for path in sorted(
-        {path.parent for name in (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE) for path in folder.glob(f"*/{name}")}
-    ):
+    """Yield the weights that come with the package, in subfolders of `folder`."""
+    for path in sorted(path for path in folder.iterdir() if (path / SUMS_FILE).is_file()):
         try:
             size = decimal((weights_folder(path) / WEIGHTS_FILE).stat().st_size)
             yield Finding(path.name, "yes", f"with the package, {size}: predict weights={path.name}")
         except WeightsError as error:
             yield Finding(path.name, "broken", f"{error}; install completesplat again")
-    cache = Path(torch.hub.get_dir()) / "checkpoints"
-    for name, url in (("LPIPS: VGG16", VGG), ("FID, KID: Inception", INCEPTION)):
-        path = cache / Path(urlparse(url).path).name
-        message = str(path) if path.is_file() else f"not here; will be downloaded from {url} when it is needed"
-        yield Finding(name, "yes" if path.is_file() else "no", message)
-    vae = try_to_load_from_cache(VAE, "diffusion_pytorch_model.safetensors")
-    missing = f"not here; will be downloaded from huggingface.co for autoreconstructor.pretrained={VAE}"
-    cached = isinstance(vae, str)
-    yield Finding("Stable Diffusion's VAE", "yes" if cached else "no", str(vae) if cached else missing)
-
-
-def check_data(conf: Path, place: Path) -> Iterator[Finding]:
-    """Yield the data sets in `conf`, with roots relative to `place`; they are needed to train, not to predict."""
-    for path in sorted(conf.glob("*.yaml")):
-        config = OmegaConf.to_container(OmegaConf.load(path))
-        # A config without a root inherits one, or cannot be chosen.
-        if not isinstance(config, dict) or "root" not in config:
-            continue
-        name, root = path.stem, str(config["root"])
-        if root == "???":
-            yield Finding(name, "no", f"give its place: data={name} data.root=FOLDER")
-        elif (place / root).is_dir():
-            yield Finding(name, "yes", f"{root}: {len(os.listdir(place / root))} entries")
-        else:
-            made, elsewhere = "made there when it is first used", f"data={name} data.root=FOLDER names another place"
-            yield Finding(name, "no", f"not in {root}; {made if 'data_seed' in config else elsewhere}")
 
 
 def check_tools(place: Path) -> Iterator[Finding]:
@@ -193,8 +150,7 @@ def check_tools(place: Path) -> Iterator[Finding]:
         message = f"{_one_line(error)}; for videos, `pip install --force-reinstall imageio-ffmpeg`"
         yield Finding("ffmpeg", "broken", message)
     missing = {"node": f"version 20 or newer runs {PROGRAM}: https://nodejs.org"}
-    how = "npx fetches it when they are asked for" if shutil.which("npx") else "first Node.js with npm"
-    missing[PROGRAM] = f"for formats spz, sog and html: `npm install -g {PACKAGE}`, or {how}"
+    missing[PROGRAM] = f"for formats spz, sog and html: `npm install -g {PACKAGE}`; npx also fetches it when needed"
     for program, message in missing.items():
         path = shutil.which(program)
         yield Finding(program, "yes" if path else "no", path or message)
@@ -216,7 +172,6 @@ def run(config: DictConfig, out: Path) -> None:
         "device": check_device,
         "rasterizers": check_rasterizers,
         "weights": check_weights,
-        "data": lambda: check_data(conf_folder() / "data", Path.cwd()),
         "tools": lambda: check_tools(Path.cwd()),
     }
     findings: dict[str, Sequence[Finding]] = {}

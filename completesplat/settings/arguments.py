@@ -82,7 +82,7 @@ def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
     settings = [argument for argument in arguments if argument not in words]
     keys = WORDS[verb]
     if twice := [key for key in keys if words and any(setting.startswith(f"{key}=") for setting in settings)]:
-        raise CompleteSplatError(f"give files by their names or as {twice[0]}=, not both: {_shown(words[0])}")
+        raise CompleteSplatError(f"give files by their names or as {twice[0]}=, not both: {_short(words[0])}")
     if verb == "predict" and len(words) > 1:
         return [f"image=[{','.join(map(quoted, words))}]", *settings]
     if len(words) > len(keys):
@@ -109,16 +109,16 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     if not equals and not argument.startswith("~"):
         chosen = [f"{group}={argument}" for group in groups() if argument in options(group)]
         nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else did_you_mean(argument, groups())
-        raise CompleteSplatError(f"{_shown(argument)}: no setting, which are given as key=value{nearest}")
+        raise CompleteSplatError(f"{_short(argument)}: no setting, which are given as key=value{nearest}")
     try:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
         example = f'"{key}={_readable(value)}"'
         message = "cannot be read; a text with such characters wants quotes"
-        raise CompleteSplatError(f"{_shown(argument)}: {message}: {_shown(example)}") from None
+        raise CompleteSplatError(f"{_short(argument)}: {message}: {_short(example)}") from None
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
-        raise CompleteSplatError(f"{_shown(argument)}: {_shown(message)}")
+        raise CompleteSplatError(f"{_short(argument)}: {_short(message)}")
     if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
 
@@ -131,6 +131,6 @@ def _readable(value: str) -> str:
     return f"[{','.join(quoted(entry.strip()) for entry in entries)}]"
 
 
-def _shown(text: str) -> str:
+def _short(text: str) -> str:
     preview = printable(text)
     return preview if len(preview) <= MOST_SHOWN else f"{preview[:MOST_SHOWN]}..."
