@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from completesplat.commands import exit_status, refusal
 from completesplat.data.audit import Findings
 from completesplat.data.captures import import_capture
 from completesplat.data.images.files import save_picture
-from completesplat.data.loading.latent_cache import ArrayWriter
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
@@ -130,21 +128,6 @@ def test_rows_that_do_not_fit_are_refused(tmp_path):
         with quota(most), pytest.raises(DiskError, match=rf"metrics\.csv: {SAID}"):
             file.save()
     assert file.path.stat().st_size == size
-
-
-def test_rows_of_latents_that_do_not_fit_are_refused_and_removed(tmp_path):
-    path, row = tmp_path / "mean.npy", np.zeros((1, 4, 8, 8), np.float32)
-
-    def write() -> None:
-        with ArrayWriter(path, (4, 8, 8), "float32") as writer:
-            for _ in range(40):
-                writer.append(row)
-
-    write()
-    for most in offsets(path.stat().st_size):
-        with quota(most), pytest.raises(DiskError, match=f"{path.name}: {SAID}" if most > 200 else path.name):
-            write()
-        assert list(tmp_path.iterdir()) == []
 
 
 def capture(out: Path) -> Path:
@@ -271,25 +254,6 @@ def test_prepared_data_and_latents_that_do_not_fit(command, pipeline, packed_toy
         assert command(*given, f"out={out}").status == 0
 
 
-def test_modules_first_imported_under_a_quota_can_be_imported_again(tmp_path, monkeypatch):
-    (tmp_path / "imported_first.py").write_text("\n".join(f"a_{i} = {i}" for i in range(100)))
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", False)
-    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
-    again = [sys.executable, "-c", "import imported_first"]
-    with quota(600):
-        sys.modules.pop(import_module("imported_first").__name__)
-        subprocess.run(again, cwd=tmp_path, check=True)
-    subprocess.run(again, cwd=tmp_path, check=True)
-
-
-def test_a_part_of_ones_own_that_does_not_fit(command):
-    with quota(600):
-        finished = command("new", "loss", "mine")
-    assert re.fullmatch(rf"error: mine\.py: {SAID}", line(finished))
-    assert finished.status == 1
-
-
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS])
 def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number):
     error = Exception("Error in call to target")
@@ -302,31 +266,6 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number
     # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
     assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
     assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None
-
-
-def test_shards_that_do_not_fit_leave_the_checkpoint_before(command, toy_root, tmp_path, monkeypatch):
-    step, run = ReconstructionModule.training_step, tmp_path / "run"
-    before: dict[Path, bytes] = {}
-
-    def files() -> dict[Path, bytes]:
-        return {path: path.read_bytes() for path in (run / "checkpoints").rglob("*") if path.is_file()}
-
-    def full(self, *inputs):
-        if self.global_step == 3:
-            before.update(files())
-            resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-        return step(self, *inputs)
-
-    given = [*FIT, f"data.root={toy_root}", f"out={run}", "trainer=fsdp", "trainer.devices=1"]
-    with monkeypatch.context() as patch, quota(2**30):
-        patch.setattr(ReconstructionModule, "training_step", full)
-        finished = command("fit", *given)
-    last = run / "checkpoints/last.ckpt"
-    assert re.fullmatch(rf"error: {last}: {SAID}", line(finished))
-    assert finished.status == 1
-    assert len(before) == 2
-    assert files() == before | {last.with_name("previous.ckpt"): before[last]}
-    assert command("fit", *given, "ckpt_path=last").status == 0
 
 
 def test_shards_go_where_the_checkpoint_that_names_them_does_not_fit(tmp_path, monkeypatch):

@@ -73,12 +73,9 @@ def _images_of(path: Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path]
     try:
-        candidates = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
-    images = [file for file in candidates if os.path.isfile(file)]
-    if left_out := [printable(file.name) for file in candidates if file not in images]:
-        log.warning("%s: left out, because they are no files: %s", printable(str(path)), ", ".join(left_out))
     if not images:
         raise CompleteSplatError(f"{path}: no image in this folder ({', '.join(SUFFIXES)})")
     return images

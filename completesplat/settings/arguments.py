@@ -87,7 +87,7 @@ def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
         return [f"image=[{','.join(map(quoted, words))}]", *settings]
     if len(words) > len(keys):
         wanted = " and ".join(f"one {key}" for key in keys)
-        raise CompleteSplatError(f"give {wanted}, not {' '.join(map(_shown, words))}")
+        raise CompleteSplatError(f"give {wanted}, not {' '.join(map(_short, words))}")
     return [f"{key}={quoted(word)}" for key, word in zip(keys, words, strict=False)] + settings
 
 

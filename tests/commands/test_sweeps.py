@@ -135,16 +135,6 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
 
 
 @pytest.mark.slow
-def test_submitit_runs_the_jobs_of_a_sweep_in_processes_of_their_own(toy_root, tmp_path):
-    sweep = tmp_path / "sweep"
-    launched = [f"out={sweep}", "hydra/launcher=submitit_local"]
-    in_a_process_of_its_own([*settings(toy_root), "seed=0,1", *launched], tmp_path)
-    for seed in (0, 1):
-        assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
-    assert list(sweep.glob(".submitit/**/*_log.out"))
-
-
-@pytest.mark.slow
 def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(command, monkeypatch, toy_root, tmp_path):
     """The ablation table is two sweeps: without LPIPS differs from the full model in the second part only."""
     generator = torch.Generator().manual_seed(0)

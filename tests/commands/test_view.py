@@ -18,7 +18,6 @@ from completesplat.commands.jobs import alone_in
 from completesplat.commands.view import LOADING, data_cameras, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import View
 from completesplat.settings.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
@@ -104,19 +103,6 @@ def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     samples, up = newest_scenes(tmp_path / "run")
     assert (len(samples), up) == (2, UP)
     assert "no scenes yet; waiting" in capsys.readouterr().out
-
-
-def test_the_background_is_removed_from_the_picture_that_is_given(command, pipeline, tmp_path, monkeypatch):
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    seen, read = [], SceneModel.read
-    monkeypatch.setattr(
-        SceneModel, "read", lambda self, file, fov, remove: seen.append(remove) or read(self, file, fov)
-    )
-    given = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=1", "steps=2", "export=drawn.html"]
-    for setting in ("background=remove", "background=0.25"):
-        finished = command("view", *given, setting, f"out={tmp_path / 'out'}")
-        assert finished.status == 0, finished.err
-    assert seen == [True, False]
 
 
 def test_settings_out_of_their_ranges_are_refused():
