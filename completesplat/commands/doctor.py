@@ -21,7 +21,7 @@ from rich.text import Text
 from completesplat import __version__
 from completesplat.commands.protocol import write_json
 from completesplat.errors import WeightsError
-from completesplat.weights import BOX, SUMS_FILE, WEIGHTS_FILE, weights_folder
+from completesplat.weights import SHIPPED, SUMS_FILE, WEIGHTS_FILE, check_folder
 
 ALWAYS_NAMED = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {
@@ -128,11 +128,12 @@ def check_rasterizers() -> Iterator[Finding]:
         yield Finding("reference", "yes", "draws everything here, which is very slow")
 
 
-def check_weights(folder: Path = BOX) -> Iterator[Finding]:
+def check_weights(folder: Path = SHIPPED) -> Iterator[Finding]:
     """Yield the weights that come with the package, in subfolders of `folder`."""
     for path in sorted(path for path in folder.iterdir() if (path / SUMS_FILE).is_file()):
         try:
-            size = decimal((weights_folder(path) / WEIGHTS_FILE).stat().st_size)
+            check_folder(path)
+            size = decimal((path / WEIGHTS_FILE).stat().st_size)
             yield Finding(path.name, "yes", f"with the package, {size}: predict weights={path.name}")
         except WeightsError as error:
             yield Finding(path.name, "broken", f"{error}; install completesplat again")

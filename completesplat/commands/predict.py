@@ -178,7 +178,7 @@ def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wante
         raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
     model = open_generator(config)
     views = read_photographs(images, Path(config.cameras), model.image_size)
-    views = replace(views, cameras=model.in_own_units(views.cameras))
+    views = replace(views, cameras=model.in_model_units(views.cameras))
     scene = model.reconstruct(views)
     recorded = {
         "seed": config.seed,

@@ -1,13 +1,14 @@
 """`completesplat report`: studies of a trained model's samples.
 
 Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
-and, if it draws samples, `diffusion_of`. Skip and guidance weights outside of [0, 1] are refused.
+and, if it draws samples, `diffusion_of`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
 import torch
 from rich.console import Console
@@ -16,19 +17,19 @@ from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.errors import CompleteSplatError
+from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.results.machine import machine
-from completesplat.results.tables import SSIM_NOTE, Column, table
+from completesplat.results.tables import SSIM_NOTE, records_table, show
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
 from completesplat.studies import stage1 as stage1_study
-from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
 from completesplat.training.stage import Stage
 
-Numbers = Annotated[Sequence[float], Entries(1)]
+Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
@@ -41,7 +42,7 @@ class Run(TypedDict):
 
 
 class SampledRun(Run):
-    """A run with a seed and the number of samples of each scene."""
+    """A run of stage 2, and the number of samples for each scene."""
 
     seed: int
     samples: Annotated[int, Range(2)]
@@ -50,8 +51,8 @@ class SampledRun(Run):
 def samplers(
     samplers: Mapping[str, Mapping[str, object]],
     steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     out: Path,
     **run: Unpack[SampledRun],
 ) -> None:
@@ -65,26 +66,30 @@ def samplers(
     for name in steps:
         if name not in samplers:
             raise CompleteSplatError(f"steps.{name}: no such sampler; there are {', '.join(samplers)}")
-    renderer, scenes, settings = _open_samples(run)
+    renderer, scenes, settings = _open_sampled(run)
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _status() as tick:
         rows = samplers_study.rows(renderer, samplers, steps, scenes, weights, tick)
     best = samplers_study.fewest(rows)
-    report = {"machine": machine(), "settings": settings | weights, "rows": rows, "fewest": dict(best)}
+    report = {
+        "machine": machine(),
+        "settings": settings | weights,
+        "rows": list(map(asdict, rows)),
+        "fewest": asdict(best),
+    }
     write_json(out / "samplers.json", report)
     title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
     samplers_study.plot_samplers(rows, out / "samplers.png", title)
-    _print(f"Samplers, from the same noise. {SSIM_NOTE}", SAMPLERS, rows)
-    name, count = rows[0]["sampler"], rows[0]["steps"]
+    show(records_table(f"Samplers, from the same noise. {SSIM_NOTE}", list(map(asdict, rows))))
     print(
-        f"fewest denoiser calls within {samplers_study.CLOSE} dB of {name} with {count} steps: {best['calls']} "
-        f"({best['sampler']}, {best['steps']} steps, {best['psnr'] - rows[0]['psnr']:+.2f} dB)"
+        f"fewest denoiser calls within {samplers_study.CLOSE} dB of {rows[0].sampler} with {rows[0].steps} steps: "
+        f"{best.calls} ({best.sampler}, {best.steps} steps, {best.psnr - rows[0].psnr:+.2f} dB)"
     )
 
 
 def controls(
-    skip_weights: Numbers,
-    guidance_weights: Numbers,
+    skip_weights: Weights,
+    guidance_weights: Weights,
     near_degrees: float,
     shown: int,
     out: Path,
@@ -95,22 +100,21 @@ def controls(
     All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
-    renderer, scenes, settings = _open_samples(run)
+    renderer, scenes, settings = _open_sampled(run)
     with _status() as tick:
         rows = controls_study.rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
-        strips = controls_study.strips(renderer, weights, scenes[0], shown)
+        grid = controls_study.strips(renderer, weights, scenes[0], shown)
     write_json(out / "controls.json", {"settings": settings | {"near_degrees": near_degrees}, "rows": rows})
     title = f"Controls: {len(scenes)} scenes, {run['samples']} samples each; (skip, guidance) of the paper in red"
     controls_study.plot_controls(rows, out / "controls.png", title)
-    far = f"far view of {min(shown, run['samples'])}"
-    title = f"{scenes[0].names[0]}: reference view of one sample, {far}; the paper's settings in red"
-    draw_strips(*strips, out / "controls_grid.png", title)
-    _print("Faithfulness (PSNR, dB) and diversity", CONTROLS, rows)
+    title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
+    _write_sheet(grid, out / "controls_grid.png", title)
+    show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
 def masked(
-    boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[SampledRun]
+    boxes: Sequence[Sequence[float]], views: int, guidance_weight: Share, out: Path, **run: Unpack[SampledRun]
 ) -> None:
     """Write `masked.png`: inputs with boxes over them, and several completions of each.
 
@@ -118,16 +122,16 @@ def masked(
     """
     for box in boxes:
         controls_study.check_box(box)
-    renderer, scenes, _ = _open_samples(run)
+    renderer, scenes, _ = _open_sampled(run)
     with _status() as tick:
         tick("completions")
-        strips = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
-    draw_strips(*strips, out / "masked.png", "Completions of partly hidden inputs, without skips")
+        rows = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
+    _write_sheet(rows, out / "masked.png", "Completions of partly hidden inputs, without skips")
 
 
 def depth(
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     shown_scenes: Positive,
     shown: Positive,
     far_degrees: Annotated[float, Range(0, 180)],
@@ -136,17 +140,16 @@ def depth(
 ) -> None:
     """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
     weights = controls_study.grid([skip_weight], [guidance_weight])
-    renderer, scenes, settings = _open_samples(run)
-    drawn = scenes[:shown_scenes]
+    renderer, scenes, settings = _open_sampled(run)
     with _status() as tick:
         rows = depth_study.rows(renderer, weights, scenes, far_degrees, tick)
         tick("the figure")
-        strips = depth_study.strips(renderer, drawn, skip_weight, guidance_weight, shown)
+        sheet = depth_study.strips(renderer, scenes[:shown_scenes], skip_weight, guidance_weight, shown)
     write_json(out / "depth.json", {"settings": settings | {"far_degrees": far_degrees}, "rows": rows})
-    title = f"Render, depth and normals in a far view, and standard deviation of {run['samples']} samples' depth"
+    title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
-    draw_strips(strips, [scene.names[0] for scene in drawn], out / "depth.png", title)
-    _print("Standard deviation of depth over samples, scene units", DEPTH, rows)
+    _write_sheet(sheet, out / "depth.png", title)
+    show(records_table("Deviation of depth over samples, scene units", rows))
 
 
 def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: Unpack[Run]) -> None:
@@ -156,7 +159,7 @@ def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: U
         rows = stage1_study.rows_of_views(module, counts, scenes, tick)
     write_json(out / "views.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
     stage1_study.plot_views(rows, out / "views.png", f"{run['scenes']} scenes, posterior's mean")
-    _print("PSNR (dB) of other views by the number of views", VIEWS, rows)
+    show(records_table("PSNR (dB) of other views by the number of views", rows))
 
 
 def layers(out: Path, **run: Unpack[Run]) -> None:
@@ -165,7 +168,7 @@ def layers(out: Path, **run: Unpack[Run]) -> None:
     with _status() as tick:
         rows = stage1_study.rows_of_layers(module, scenes, tick)
     write_json(out / "layers.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
-    _print("Layers on the object, behind what the image shows (scene units)", LAYERS, rows)
+    show(records_table("Layers on the object, behind the front (scene units)", rows))
 
 
 def _open(run: Run) -> tuple[Stage, list[SceneBatch]]:
@@ -176,34 +179,19 @@ def _open(run: Run) -> tuple[Stage, list[SceneBatch]]:
     return module, [scene.to(module.device) for scene in first_scenes(data, run["scenes"])]
 
 
-def _open_samples(run: SampledRun) -> tuple[SampleRenderer, list[SceneBatch], dict[str, int]]:
+def _open_sampled(run: SampledRun) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
     """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results."""
     stage, scenes = _open(run)
-    model, background = diffusion_of(stage), stage.background
-    settings = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
-    return SampleRenderer(model, stage.rasterizer, background, run["samples"], run["seed"]), scenes, settings
+    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
+    model = diffusion_of(stage)
+    return SampleRenderer(model, stage.rasterizer, stage.background, run["samples"], run["seed"]), scenes, settings
+
+
+def _write_sheet(rows: Sequence[Sequence[SheetCell | None]], path: Path, title: str) -> None:
+    write_png(path, image_sheet([""] * max(map(len, rows)), rows, title))
 
 
 @contextmanager
 def _status() -> Iterator[Callable[[str], None]]:
     with Console(stderr=True).status("drawing") as status:
         yield lambda text: status.update(f"drawing: {text}")
-
-
-def _print(title: str, columns: Sequence[Column], rows: Iterable[dict[str, Any]]) -> None:
-    Console(width=120).print(table(title, columns, rows))
-
-
-SAMPLERS = [("sampler", "sampler", ""), ("steps", "steps", "d"), ("calls", "calls", "d"), ("PSNR", "psnr", ".2f")]
-SAMPLERS += [("SSIM", "ssim", ".4f"), ("diversity", "diversity", ".4f"), ("agreement", "agreement", ".1f")]
-SAMPLERS += [("ms", "ms", ".1f")]
-WEIGHTS = [("skip", "skip_weight", "g"), ("guidance", "guidance_weight", "g")]
-CONTROLS = [*WEIGHTS, ("reference", "reference_psnr", ".2f"), ("near object", "near_object_psnr", ".2f")]
-CONTROLS += [("diversity", "diversity", ".4f")]
-VIEWS = [("views", "views", "d"), ("all pixels", "psnr", ".2f"), ("object", "object_psnr", ".2f")]
-LAYERS = [("", "layer", ""), ("opacity", "opacity", ".2f"), ("behind the front", "behind", ".3f")]
-LAYERS += [("of the thickness", "ratio", ".0%"), ("pixels on the back", "on_back", ".0%")]
-DEPTH = [*WEIGHTS]
-for _view in ("reference", "far"):
-    DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]
-    DEPTH += [("measured", f"{_view}_measured", ".0%")]
