@@ -4,7 +4,7 @@ import os
 import platform
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -24,12 +24,8 @@ from completesplat.errors import WeightsError
 from completesplat.weights import SHIPPED, SUMS_FILE, WEIGHTS_FILE, check_folder
 
 ALWAYS_NAMED = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
-EXTRAS = {
-    "cuda": "draws on an NVIDIA GPU",
-    "view": "shows scenes in a browser, live",
-    "colmap": "imports captures of your own",
-    "slurm": "spreads sweeps over a cluster",
-}
+EXTRAS = {"cuda": "to draw on an NVIDIA GPU", "view": "to show scenes in a browser, live"}
+EXTRAS |= {"colmap": "to import your own captures", "slurm": "to spread sweeps over a cluster"}
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000
 """Bytes that the files of a few predictions take."""
@@ -58,40 +54,28 @@ def check_packages() -> Iterator[Finding]:
         yield Finding("installation", "no", message)
 
 
-def required_packages(requirements: Sequence[Requirement]) -> Iterator[Finding]:
-    """Yield a finding for each well-known, missing or mismatched package and for those of extras; count the others."""
+def required_packages(requirements: Iterable[Requirement]) -> Iterator[Finding]:
+    """Yield well-known, missing and mismatched packages and those of extras; count the others."""
     others = 0
-    for requirement in (entry for entry in requirements if _applies(entry, "")):
-        installed = _version(requirement)
-        if installed is None:
-            message = f'missing; `pip install "{requirement.name}{requirement.specifier}"`'
-            yield Finding(requirement.name, "broken", message)
-        elif not requirement.specifier.contains(installed, prereleases=True):
-            message = f"{installed}, which is not {requirement.specifier}: it may or may not work"
-            yield Finding(requirement.name, "no", message)
-        elif requirement.name in ALWAYS_NAMED:
-            yield Finding(requirement.name, "yes", installed)
+    for requirement in requirements:
+        name, marker = requirement.name, requirement.marker
+        extra = next((key for key in ("", *EXTRAS) if marker is None or marker.evaluate({"extra": key})), None)
+        if extra is None:  # for another system, or for developers
+            continue
+        try:
+            installed = version(name)
+        except PackageNotFoundError:
+            package = f"completesplat[{extra}]" if extra else f"{name}{requirement.specifier}"
+            message = f'missing; `pip install "{package}"`{f" {EXTRAS[extra]}" if extra else ""}'
+            yield Finding(name, "no" if extra else "broken", message)
+            continue
+        if not requirement.specifier.contains(installed, prereleases=True):
+            yield Finding(name, "no", f"{installed}, which is not {requirement.specifier}: it may or may not work")
+        elif extra or name in ALWAYS_NAMED:
+            yield Finding(name, "yes", installed)
         else:
             others += 1
     yield Finding("others", "yes", f"{others} more, in versions that fit")
-    for extra, purpose in EXTRAS.items():
-        for requirement in requirements:
-            if _applies(requirement, extra) and not _applies(requirement, ""):
-                installed = _version(requirement)
-                message = f"{installed}: {purpose}" if installed else f'{purpose}: pip install "completesplat[{extra}]"'
-                yield Finding(requirement.name, "yes" if installed else "no", message)
-
-
-def _applies(requirement: Requirement, extra: str) -> bool:
-    """Return whether this machine needs a package for an extra, or without any (`""`)."""
-    return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
-
-
-def _version(requirement: Requirement) -> str | None:
-    try:
-        return version(requirement.name)
-    except PackageNotFoundError:
-        return None
 
 
 def check_imports() -> Iterator[Finding]:
@@ -175,15 +159,19 @@ def run(config: DictConfig, out: Path) -> None:
         "weights": check_weights,
         "tools": lambda: check_tools(Path.cwd()),
     }
-    findings: dict[str, Sequence[Finding]] = {}
-    with Console(stderr=True).status("looking") as status:
-        for part, check in checks.items():
-            status.update(f"looking at: {part}")
-            findings[part] = findings_of(check)
-    rows = [{"part": part, **vars(finding)} for part, part_findings in findings.items() for finding in part_findings]
+    table = Table(title="completesplat doctor", title_justify="left")
+    for heading in ("part", "what", "here", "which, or why not"):
+        table.add_column(heading, overflow="fold")
+    rows = []
+    for part, check in checks.items():
+        for index, finding in enumerate(findings_of(check)):
+            rows.append({"part": part, **vars(finding)})
+            state = Text(finding.state, style=STYLES[finding.state])
+            table.add_row("" if index else part, Text(finding.name), state, Text(finding.details))
+        table.add_section()
     broken = [f"{row['part']}, {row['name']}: {row['details']}" for row in rows if row["state"] == "broken"]
     write_json(out / "doctor.json", {"works": not broken, "findings": rows})
-    show(findings)
+    Console(width=None if Console().is_terminal else 160).print(table)
     if broken:
         print("broken: " + "; ".join(broken))
         print(out)
@@ -197,16 +185,3 @@ def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
         return list(check())
     except Exception as error:  # of any library: the other checks still run
         return [Finding("check", "broken", _one_line(error))]
-
-
-def show(findings: Mapping[str, Sequence[Finding]]) -> None:
-    """Print the table, with a rule between the parts."""
-    table = Table(title="completesplat doctor", title_justify="left")
-    for heading in ("part", "what", "here", "which, or why not"):
-        table.add_column(heading, overflow="fold")
-    for part, part_findings in findings.items():
-        for index, finding in enumerate(part_findings):
-            state = Text(finding.state, style=STYLES[finding.state])
-            table.add_row("" if index else part, Text(finding.name), state, Text(finding.details))
-        table.add_section()
-    Console(width=None if Console().is_terminal else 160).print(table)

@@ -136,8 +136,17 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
             except DiskError:  # the other images would fail, too
                 raise
             except Exception as error:
+                fault = not isinstance(error, CompleteSplatError | OSError)
+                message = " ".join(str(error).split()) or type(error).__name__
+                message = printable(message if image.name in message else f"{image}: {message}")
+                if len(images) == 1 and fault:
+                    raise
+                if len(images) == 1:
+                    raise CompleteSplatError(message) from error
+                if fault:
+                    log.error("a fault of the program, not of the image", exc_info=error)
+                print(f"error: {message}", file=sys.stderr, flush=True)
                 failed.append(name)
-                _report(error, image, single=len(images) == 1)
                 continue
             if not console.is_terminal:
                 seconds = f"{time.perf_counter() - start:.0f} s"
@@ -145,20 +154,6 @@ def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path]
     if failed:
         share = f"{len(failed)} of {len(images)} images failed ({', '.join(failed)})"
         raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
-
-
-def _report(error: Exception, image: Path, single: bool) -> None:
-    """Print one line about an image's error; if it is the only image, raise the error, expected ones with this line."""
-    message = " ".join(str(error).split()) or type(error).__name__
-    message = printable(message if image.name in message else f"{image}: {message}")
-    expected = isinstance(error, CompleteSplatError | OSError)
-    if single and not expected:
-        raise error
-    if single:
-        raise CompleteSplatError(message) from error
-    if not expected:
-        log.error("a fault of the program, not of the image", exc_info=error)
-    print(f"error: {message}", file=sys.stderr, flush=True)
 
 
 def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wanted, out: Path) -> None:

@@ -43,12 +43,12 @@ def test_failing_imports_and_packages_that_are_missing_or_of_another_version_are
     assert finding.state == "broken"
     assert "ModuleNotFoundError" in finding.details
     lines = ["no-such-package>=2.5", "numpy<1.0", "torch>=99; python_version < '3'", "no-viewer; extra == 'view'"]
-    missing, older, others, extra = required_packages(list(map(Requirement, lines)))
+    missing, older, extra, others = required_packages(map(Requirement, lines))
     assert (missing.name, missing.state, older.name, older.state) == ("no-such-package", "broken", "numpy", "no")
     assert 'pip install "no-such-package>=2.5"' in missing.details
     assert "<1.0: it may or may not work" in older.details
     assert others.details.startswith("0 ")
-    assert (extra.state, extra.details.partition(": ")[2]) == ("no", 'pip install "completesplat[view]"')
+    assert (extra.state, 'pip install "completesplat[view]"' in extra.details) == ("no", True)
 
 
 def test_weights_are_broken_if_changed_or_incomplete(tmp_path):

@@ -102,7 +102,7 @@ def test_names_that_are_no_utf_8_are_printed_by_a_process_that_prints_utf_8(tmp_
     assert (tmp_path / out / "_" / "sheet.png").is_file()
 
 
-def test_a_fault_at_one_picture_does_not_stop_the_others(predict, tmp_path, monkeypatch):
+def test_a_fault_at_one_image_does_not_stop_the_others(predict, tmp_path, monkeypatch):
     def faulty(model, photograph, visible, **settings):
         if photograph.image[0].mean() < 0.5:
             raise ValueError("a fault\nof the program")
