@@ -71,23 +71,22 @@ def stack(items: Sequence[T]) -> T:
 def concatenate(items: Sequence[T], axis: int = 0) -> T:
     """Concatenate the items' tensors along an existing axis; static values are those of the first item."""
 
-    def join(values: list[object]) -> object:
-        if tensors := [value for value in values if isinstance(value, Tensor)]:
-            return torch.cat(tensors, dim=axis)
-        parts = [value for value in values if isinstance(value, TensorDataclass)]
-        return concatenate(parts, axis) if parts else values[0]
+    def join(values: list[Any]) -> object:
+        if isinstance(values[0], Tensor):
+            return torch.cat(values, dim=axis)
+        return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
 
     joined = {field.name: join([getattr(item, field.name) for item in items]) for field in fields(items[0])}
     return replace(items[0], **joined)
 
 
-def _merge(values: list[object]) -> object:
+def _merge(values: list[Any]) -> object:
     first = values[0]
     if isinstance(first, Tensor):
         # Like `torch.stack`, but a loader's worker process writes directly into memory that it shares with training.
         return default_collate(values)
     if isinstance(first, TensorDataclass):
-        return stack([value for value in values if isinstance(value, TensorDataclass)])
+        return stack(values)
     if isinstance(first, str):
         return tuple(values)
     if any(value != first for value in values):

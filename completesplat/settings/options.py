@@ -142,7 +142,7 @@ def parse(text: str) -> ConfFile:
         number = node.start_mark.line
         above = takewhile(lambda line: line.lstrip().startswith("#"), lines[len(head) : number][::-1])
         behind = lines[number][node.start_mark.column :].partition(" #")[2]
-        return " ".join(filter(None, [*(line.strip(" #") for line in [*above][::-1]), behind.strip()]))
+        return " ".join(filter(None, [*(line.strip()[1:].strip() for line in [*above][::-1]), behind.strip()]))
 
     root = yaml.compose(text, Loader=LOADER) or yaml.compose("{}", Loader=LOADER)  # an empty file has no root
     entries = {key.value: value for key, value in root.value}
