@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from completesplat.baselines.splatter_image.model import PublishedSplatterImage
-from completesplat.data.images.photograph import Photograph, Picture, read_photograph
+from completesplat.data.images.photograph import ImageLike, Photograph, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
@@ -50,7 +50,7 @@ class PublishedGenerator(SceneModel):
         """Return the network."""
         return self.network
 
-    def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+    def read(self, picture: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size, on the background that the weights know (`read_photograph`).
 
         If the weights know only one camera, the image counts as that camera's, and a cut-out object is put into the

@@ -21,7 +21,7 @@ from support import SMALL, some_gaussians, tiny_generator, write_capture
 from completesplat.commands import exit_status, refusal
 from completesplat.data.audit import Findings
 from completesplat.data.captures import import_capture
-from completesplat.data.images.files import save_picture
+from completesplat.data.images.files import save_image
 from completesplat.data.loading.latent_cache import ArrayWriter
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.errors import DiskError
@@ -179,7 +179,7 @@ def test_a_data_set_that_does_not_fit_is_refused_and_nothing_of_it_stays(tmp_pat
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_a_picture_that_does_not_fit_is_not_cut_short(tmp_path, suffix):
     with quota(100), pytest.raises(OSError, match=rf"Errno {errno.EFBIG}"):
-        save_picture(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
+        save_image(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
 
 
 def test_weights_that_do_not_fit_are_refused_and_the_old_ones_stay(tmp_path):

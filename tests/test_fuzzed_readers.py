@@ -40,7 +40,7 @@ from completesplat.data.captures.capture import read_picture
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.images.crop import Square
 from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode, picture_size, read_depth
+from completesplat.data.images.files import decode, read_depth, stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.validation import read_points
@@ -103,7 +103,7 @@ def test_pictures(tmp_path):
         path.write_bytes(content)
         calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
         calls += [
-            partial(picture_size, path, "a"),
+            partial(stored_size, path, "a"),
             partial(read_depth, path, 1.0),
             partial(read_picture, path, (12, 16)),
         ]

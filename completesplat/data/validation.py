@@ -45,7 +45,7 @@ class BadCamera(DataError, kind="impossible camera"):
     """Pose or intrinsics that no camera can have."""
 
 
-class BadPicture(DataError, kind="unusable picture"):
+class BadImage(DataError, kind="unusable image"):
     """Image, mask or depth map that is damaged, too large, of another size or ambiguous."""
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import GAP, INK, LINE, MARGIN, PAPER, write_png
 from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
@@ -86,7 +86,7 @@ def _picture_cell(sequence: PosedSequence, index: int, cross: Cross) -> tuple[Im
     return cell, "" if inside else ": cross outside" if arms else ": cross behind"
 
 
-def _with_outline(picture: Picture) -> Image.Image:
+def _with_outline(picture: MaskedImage) -> Image.Image:
     """Resize an image to a cell, with a line where the mask crosses one half."""
     image = Image.fromarray(np.ascontiguousarray(picture.image.permute(1, 2, 0).numpy()))
     # This filter repeats pixels to enlarge an image, and averages them to reduce it.

@@ -9,7 +9,7 @@ import skimage
 import torch
 from PIL import Image
 
-from completesplat.data.images.photograph import picture_features, read_photograph
+from completesplat.data.images.photograph import image_features, read_photograph
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 
@@ -80,8 +80,8 @@ def test_features_are_colours_their_spread_and_how_fine_they_are():
     image = torch.zeros(3, 4, 4)
     image[0], image[1, :, 2:], image[2, 1::2] = 0.25, 1, 1
     expected = [0.25, 0.5, 0.5, 0, 0.5, 0.5, 1 / 9, 1 / 3]  # green has one step in three, blue three of three
-    torch.testing.assert_close(picture_features(image), torch.tensor(expected))
-    assert picture_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
+    torch.testing.assert_close(image_features(image), torch.tensor(expected))
+    assert image_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_data_say_what_weights_are_to_know_of_them(toys):
     store = toys.store("train")
     sequences = [toys.source("train").read(name) for name in store.names]
     pictures = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255
-    features = picture_features(pictures)
+    features = image_features(pictures)
     assert facts["picture_mean"] == pytest.approx(features.mean(0).tolist())
     assert facts["picture_std"] == pytest.approx(features.std(0, correction=0).clamp(min=1e-3).tolist())
 
@@ -121,6 +121,6 @@ def test_photographs_lie_far_from_toy_objects_and_other_toy_objects_near(tmp_pat
     ]
     photographs = torch.stack([read_photograph(folder / name, 64).image for name in names])
     near, far = (
-        ((picture_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
+        ((image_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
     )
     assert near.max() < 2 < far.min()

@@ -16,7 +16,7 @@ from completesplat.data.co3d.source import (
 )
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.toy.objects import SUBSET
-from completesplat.data.validation import BadPicture, BadPlacement, MissingFile, UnreadableFile
+from completesplat.data.validation import BadImage, BadPlacement, MissingFile, UnreadableFile
 
 CENTER = np.array([3.0, -2.0, 5.0])
 AXES = np.eye(3)
@@ -145,7 +145,7 @@ def test_eight_depth_maps_are_read_of_many_in_units_of_their_scale(tmp_path):
         from_depth_maps([gone, there] * 8, AXES)
     assert (caught.value.file, caught.value.frame) == (str(tmp_path / "a/gone.png"), 7)
     (tmp_path / "a/depth.png").write_text("depth")
-    with pytest.raises(BadPicture, match=r"frame 7: not an image"):
+    with pytest.raises(BadImage, match=r"frame 7: not an image"):
         from_depth_maps([there], AXES)
     Image.fromarray(np.zeros((24, 32), dtype=np.uint16)).save(tmp_path / "b/depth.png")
     with pytest.raises(BadPlacement, match="foreground"):

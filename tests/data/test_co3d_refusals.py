@@ -21,7 +21,7 @@ from completesplat.data.sequences import SPLITS
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    BadPicture,
+    BadImage,
     BadPlacement,
     MissingFile,
     OutsidePath,
@@ -224,13 +224,13 @@ def unknown_depth(category: Path) -> None:
 
 # name: (damage, kind, file, frame), of sequence a.
 DAMAGES: dict[str, tuple[Callable[[Path], object], type[DataError], str | None, int | None]] = {
-    "picture_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadPicture, IMAGE, 1),
+    "picture_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadImage, IMAGE, 1),
     "missing_mask": (lambda category: (category / MASK).unlink(), MissingFile, MASK, 1),
     "picture_is_a_pipe": (replaced(IMAGE, os.mkfifo), MissingFile, IMAGE, 1),
     "missing_cloud": (lambda category: (category / CLOUD).unlink(), MissingFile, CLOUD, None),
     "missing_depth_map": (without_cloud(lambda category: (category / DEPTH).unlink()), MissingFile, DEPTH, 1),
     "zero_scale_of_a_depth_map": (
-        without_cloud(lambda c: change(c / FRAMES, put(*SCALE, value=0, entry=1))), BadPicture, DEPTH, 1,
+        without_cloud(lambda c: change(c / FRAMES, put(*SCALE, value=0, entry=1))), BadImage, DEPTH, 1,
     ),
     "no_depth_is_known": (without_cloud(unknown_depth), BadPlacement, None, None),
 }  # fmt: skip

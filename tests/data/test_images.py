@@ -15,7 +15,7 @@ from PIL import Image, ImageCms, ImageFile
 from completesplat.data.images.crop import Square, read_square
 from completesplat.data.images.exif import ORIENTATION
 from completesplat.data.images.files import decode, read_depth
-from completesplat.data.validation import BadPicture, MissingFile
+from completesplat.data.validation import BadImage, MissingFile
 from completesplat.errors import DataError
 
 RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
@@ -196,7 +196,7 @@ BAD: dict[str, tuple[bytes, str, str]] = {
 }  # fmt: skip
 
 
-def refuse(read: Callable[[], object], name: str, part: str, kind: type[DataError] = BadPicture) -> None:
+def refuse(read: Callable[[], object], name: str, part: str, kind: type[DataError] = BadImage) -> None:
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         with pytest.raises(DataError) as caught:

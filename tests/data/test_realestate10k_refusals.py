@@ -33,7 +33,7 @@ from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    BadPicture,
+    BadImage,
     MissingFile,
     OutsidePath,
     TooFewFrames,
@@ -87,9 +87,9 @@ BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int 
     "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),
     "lens_distortion": (entry(2, 4, 0.1), BadCamera, 2),
     "one_frame": (first(1), TooFewFrames, None),
-    "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadPicture, 2),
-    "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadPicture, 0),
-    "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadPicture, 2),
+    "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadImage, 2),
+    "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadImage, 0),
+    "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadImage, 2),
 }  # fmt: skip
 
 
@@ -103,7 +103,7 @@ def broken(name: str) -> list[StoredClip]:
 @pytest.mark.parametrize("name", BAD_CLIPS)
 def test_a_broken_clip_is_refused_with_its_place(name, form, tmp_path):
     _, kind, frame = BAD_CLIPS[name]
-    of_text = f"{BAD}/{33_000 * ((frame or 0) + 1)}.jpg" if kind is BadPicture else TEXT
+    of_text = f"{BAD}/{33_000 * ((frame or 0) + 1)}.jpg" if kind is BadImage else TEXT
     assert_only_refusal(
         write(tmp_path / "train", form, broken(name)), kind, of_text if form == "text" else CHUNK, frame
     )

@@ -128,7 +128,7 @@ def read_picture(path: Path, image_size: tuple[int, int]) -> CapturedPicture:
 
     Raises:
         MissingFile: the file does not exist.
-        BadPicture: it is damaged, too large, of another size, or its EXIF orientation turns it. Programs that estimate
+        BadImage: it is damaged, too large, of another size, or its EXIF orientation turns it. Programs that estimate
             poses use the pixels as they are stored, so the pose would not fit the upright image.
     """
     require_file(path)

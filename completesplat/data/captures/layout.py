@@ -17,7 +17,7 @@ from torch import Tensor
 
 from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, PointCloud, read_picture
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
-from completesplat.data.images.files import decode, save_picture
+from completesplat.data.images.files import decode, save_image
 from completesplat.data.validation import BadCamera, at
 from completesplat.geometry.cameras import pixel_centers
 
@@ -179,9 +179,9 @@ class CaptureWriter:
             self._copied += 1
         else:
             options: dict[str, Any] = {"quality": self.quality, "subsampling": 0} if picture.lossy else {}
-            save_picture(image, self.folder / path, **options)
+            save_image(image, self.folder / path, **options)
         mask_path = f"{self.sequence}/masks/{stem}.png"
-        save_picture(mask, self.folder / mask_path)
+        save_image(mask, self.folder / mask_path)
         return {
             "sequence_name": self.sequence,
             "frame_number": number,

@@ -22,7 +22,7 @@ from completesplat.data.captures.capture import (
     make_cloud,
     read_picture,
 )
-from completesplat.data.images.files import picture_size
+from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
@@ -176,7 +176,7 @@ def _read_lens(values: dict[str, Any], image: Path) -> Lens:
     if not isinstance(model, str) or model not in USED or others:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
     number = partial(_number, values)
-    stored = None if {"w", "h"} <= values.keys() else picture_size(image, str(image))
+    stored = None if {"w", "h"} <= values.keys() else stored_size(image, str(image))
     height, width = stored or (_whole(values, "h"), _whole(values, "w"))
     if "fl_x" in values:
         fx = number("fl_x")

@@ -16,7 +16,7 @@ from completesplat.data.co3d.annotations import CO3DFrame
 from completesplat.data.co3d.splits import SplitMembers
 from completesplat.data.images.crop import Square, principal_square, read_square
 from completesplat.data.images.files import decode, read_depth
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import BadCamera, BadPlacement, at, read_points
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import crop_resize, invert_rigid, pixel_centers, transform_points, unproject
@@ -224,12 +224,12 @@ def _square(frame: CO3DFrame) -> Square:
     return principal_square((x, y), frame.camera.image_size)
 
 
-def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> Picture:
+def _read(name: str, frames: list[CO3DFrame], size: int, index: int) -> MaskedImage:
     frame = frames[index]
     square, image_size = _square(frame), frame.camera.image_size
     with at(sequence=name, frame=frame.number):
         image = read_square(frame.image, image_size, square, size, "RGB")
-        return Picture(image, read_square(frame.mask, image_size, square, size, "L"))
+        return MaskedImage(image, read_square(frame.mask, image_size, square, size, "L"))
 
 
 def _read_depth(name: str, frames: list[CO3DFrame], size: int, factor: float, index: int) -> Float[Tensor, "1 _ _"]:

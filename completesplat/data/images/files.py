@@ -14,7 +14,7 @@ from PIL import Image, ImageFile, UnidentifiedImageError
 from torch import Tensor
 
 from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
-from completesplat.data.validation import BadPicture, require_file
+from completesplat.data.validation import BadImage, require_file
 from completesplat.errors import ImageError
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
@@ -47,7 +47,7 @@ def decode(
 
     Raises:
         MissingFile: the file does not exist.
-        BadPicture: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
+        BadImage: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
             has pixels whose meaning in this mode is unclear.
     """
     with _loaded(source, file, FORMATS) as (picture, exif):
@@ -58,7 +58,7 @@ def decode(
         return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
 
 
-def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
     """Return (height, width) of an image file or its content, from its header; errors as in `decode`."""
     with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
         return image.height, image.width
@@ -71,11 +71,11 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
 
     Raises:
         MissingFile: the file does not exist.
-        BadPicture: it is no readable 16-bit PNG, the factor is not positive and finite, depths are negative, none is
+        BadImage: it is no readable 16-bit PNG, the factor is not positive and finite, depths are negative, none is
             finite, or all are subnormal, as integer depths below 1024 would be.
     """
     if not 0 < scale_adjustment < LARGEST_SCALE:
-        raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
+        raise BadImage(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
     with _loaded(path, str(path), ("PNG",)) as (picture, _):
         if picture.mode not in SIXTEEN_BIT_MODES:
             raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
@@ -93,11 +93,11 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
 
 @contextmanager
 def refused_as_bad(file: str) -> Iterator[None]:
-    """Convert an ImageError raised within the context to a BadPicture that names the file."""
+    """Convert an ImageError raised within the context to a BadImage that names the file."""
     try:
         yield
     except ImageError as error:
-        raise BadPicture(str(error), file) from error.__cause__
+        raise BadImage(str(error), file) from error.__cause__
 
 
 @contextmanager
@@ -175,7 +175,7 @@ def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
     return values.astype(np.float32)
 
 
-def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+def save_image(image: Image.Image, path: Path, **options: Any) -> None:
     """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
     content = io.BytesIO()
     image.save(content, Image.registered_extensions()[path.suffix], **options)
@@ -184,7 +184,7 @@ def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
 
 @contextmanager
 def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
-    """Decode an image completely and yield it with its EXIF record; convert its errors to BadPicture."""
+    """Decode an image completely and yield it with its EXIF record; convert its errors to BadImage."""
     with refused_as_bad(file):
         if ImageFile.LOAD_TRUNCATED_IMAGES:
             raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")

@@ -48,11 +48,11 @@ class Photograph(TensorDataclass):
     fov_source: Literal["given", "exif", "default"]
 
 
-Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
+ImageLike: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
 
 
 def read_photograph(
-    picture: Picture,
+    picture: ImageLike,
     size: int,
     fov_degrees: float | None = None,
     default_fov_degrees: float = 50.0,
@@ -96,7 +96,7 @@ def read_photograph(
 
 
 def _square(
-    picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
+    picture: ImageLike, size: int, remove_background: bool, background: float, object_share: float | None
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     if isinstance(picture, (np.ndarray, Tensor)):
@@ -253,7 +253,7 @@ def _session() -> Any:
     return rembg.new_session(CUTTER)
 
 
-def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
+def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
     """Return mean and standard deviation of red, green and blue, and two measures of detail; all lie in [0, 1].
 
     The measures of detail are the mean absolute differences between neighbours in a row, and in a column.

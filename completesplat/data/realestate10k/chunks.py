@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode, picture_size
+from completesplat.data.images.files import decode, stored_size
 from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError, TensorFileError
@@ -117,7 +117,7 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
     if not len(images) == len(rows) == len(times):
         raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
     with at(frame=0):
-        size = picture_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
+        size = stored_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
     timestamps = tuple(times.tolist())
     return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), partial(_read, images, size, str(path)))
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, read_square
-from completesplat.data.images.files import picture_size
+from completesplat.data.images.files import stored_size
 from completesplat.data.validation import (
     ROTATION_TOLERANCE,
     BadAnnotation,
@@ -109,7 +109,7 @@ class TextClips:
                     raise MissingFile("no such picture", str(self.folder / key / f"{time}.jpg"), key, frame)
             paths = [pictures[time] for time in timestamps]
             with at(frame=0):
-                size = picture_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
+                size = stored_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
             numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
             return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
 

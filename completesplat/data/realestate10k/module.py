@@ -16,7 +16,7 @@ from completesplat.data.loading.view_selection import GrowingGap, evaluation_vie
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource, split_by_hash
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
@@ -90,9 +90,9 @@ def _square(clip: Clip, crop: str, frame: int) -> Square:
         return principal_square((x, y), (height, width))
 
 
-def _read(clip: Clip, squares: list[Square], size: int, index: int) -> Picture:
+def _read(clip: Clip, squares: list[Square], size: int, index: int) -> MaskedImage:
     with at(clip.source, clip.key, index):
-        return Picture(clip.read(index, squares[index], size), None)
+        return MaskedImage(clip.read(index, squares[index], size), None)
 
 
 class RE10KDataModule(SceneDataModule):

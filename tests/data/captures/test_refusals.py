@@ -6,7 +6,7 @@ from completesplat.data.captures.capture import make_cloud
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    BadPicture,
+    BadImage,
     MissingFile,
     OutsidePath,
     TooFewFrames,
@@ -47,7 +47,7 @@ TRANSFORMS = {
     "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
     "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
     "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
-    "another size": (lambda c: c.update(h=151), BadPicture, r"r_0\.png, in, frame 0: has 150 x 210 .* says 151 x 210"),
+    "another size": (lambda c: c.update(h=151), BadImage, r"r_0\.png, in, frame 0: has 150 x 210 .* says 151 x 210"),
     "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
     "no name of a lens": (lambda c: c.update(camera_model=["OPENCV"]), BadCamera, "camera model .* is not supported"),
     "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
@@ -97,7 +97,7 @@ PICTURES = {
 def test_a_bad_picture_is_refused(captures, tmp_path, damage, message):
     path = captures.write_transforms(tmp_path / "in", captures.Shot())
     damage(tmp_path / "in/images/r_5.png")
-    with pytest.raises(BadPicture, match=rf"images/r_5\.png, in, frame 5: .*{message}"):
+    with pytest.raises(BadImage, match=rf"images/r_5\.png, in, frame 5: .*{message}"):
         import_capture(tmp_path / "out", "desk", path, progress=False)
     assert not list(tmp_path.glob("out/*"))
 

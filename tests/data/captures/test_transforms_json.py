@@ -9,7 +9,7 @@ from plyfile import PlyData
 
 from completesplat.data.captures import import_capture
 from completesplat.data.captures.transforms_json import read_photographs
-from completesplat.data.validation import BadPicture, MissingFile
+from completesplat.data.validation import BadImage, MissingFile
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import project
 
@@ -190,7 +190,7 @@ def test_photographs_without_a_plain_camera_are_refused(captures, tmp_path):
     with pytest.raises(CompleteSplatError, match=r"r_0.png: its lens distorts; import the capture"):
         read_photographs([first], path, 32)
     captures.edit(path, lambda content: content.update(k1=0, w=200))
-    with pytest.raises(BadPicture, match="200"):
+    with pytest.raises(BadImage, match="200"):
         read_photographs([first], path, 32)
     captures.edit(path, lambda content: content["frames"].pop(0))
     with pytest.raises(CompleteSplatError, match=r"r_0.png: .*transforms.json has no frame with this picture"):
