@@ -118,7 +118,9 @@ class SceneModel(nn.Module):
             CompleteSplatError: the axes are parallel, or meet behind the first camera.
         """
         center = nearest_to_axes(cameras)
-        depth = 0.0 if center is None else transform_points(cameras[0].world_to_camera, center[None])[0, 2].item()
+        depth = (
+            0.0 if center is None else transform_points(cameras[0].world_to_camera, center.float()[None])[0, 2].item()
+        )
         if depth <= 0:
             raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
         near, far = self.depth_range.tolist()

@@ -41,7 +41,7 @@ DELTAS = ["experiment", "ablation", "posterior", "objective"]
 def needed(group: str, option: str) -> list[str]:
     """What else has to be said for an option, so that nothing is missing in the configuration."""
     given = ["data.category=y"] if option == "co3d_category" else []
-    given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
+    given += ["data.root=x"] if option.startswith(("capture", "co3d_", "re10k_", "realestate10k")) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
     given += ["model.model.weights=x"] if option == "splatter_image_published" else []

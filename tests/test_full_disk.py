@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import SMALL, some_gaussians, tiny_generator, write_capture
+from support import SMALL, some_gaussians, tiny_generator
 
 from completesplat.commands import exit_status, refusal
 from completesplat.data.audit import Findings
-from completesplat.data.captures import import_capture
 from completesplat.data.images.files import save_image
 from completesplat.data.loading.latent_cache import ArrayWriter
 from completesplat.data.toy import write_objects, write_rooms
@@ -148,18 +147,10 @@ def test_rows_of_latents_that_do_not_fit_are_refused_and_removed(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
-def capture(out: Path) -> Path:
-    source = out.parent / "capture"
-    if not source.exists():
-        write_capture(source, 6)
-    return import_capture(out, "desk", source / "transforms.json", progress=False)
-
-
 TINY = {"scenes": 2, "frames": 2, "size": 16, "seed": 0, "workers": 1, "progress": False}
 FOLDERS: dict[str, Callable[[Path], Path]] = {
     "toy_objects": lambda out: write_objects(out, **TINY),
     "toy_rooms": lambda out: write_rooms(out, **TINY),
-    "desk": capture,
 }
 
 
@@ -272,15 +263,11 @@ def test_prepared_data_and_latents_that_do_not_fit(command, pipeline, packed_toy
         assert command(*given, f"out={out}").status == 0
 
 
-def test_toys_captures_and_statistics_that_do_not_fit(command, toy_root, tmp_path, monkeypatch):
-    write_capture(tmp_path / "capture", 6)
-    for path in (tmp_path / "capture").glob("*.png"):
-        picture(path)
+def test_toys_and_statistics_that_do_not_fit(command, toy_root, tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "statistics", lambda sources: {"of many splits": "1" * 6000})
     toy = ["toy", "kind=objects", "scenes=2", "frames=2", "size=64", "workers=1"]
-    captured = ["import", f"transforms={tmp_path}/capture/transforms.json", "category=desk"]
     stats = ["stats", "data=toy_objects", f"data.root={toy_root}"]
-    for given, name in ((toy, "toy_objects"), (captured, "desk"), (stats, "stats.json")):
+    for given, name in ((toy, "toy_objects"), (stats, "stats.json")):
         out = tmp_path / given[0]
         with quota(6000):
             finished = command("data", *given, f"out={out}")

@@ -27,7 +27,7 @@ ALWAYS_SHOWN = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb
 EXTRAS = {
     "cuda": "draws on an NVIDIA GPU",
     "view": "shows scenes in a browser, live",
-    "colmap": "imports captures of your own",
+    "colmap": "reads captures whose lens distorts",
     "slurm": "spreads sweeps over a cluster",
 }
 OWN_PARTS = "completesplat.commands.doctor_checks"

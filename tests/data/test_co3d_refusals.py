@@ -27,7 +27,7 @@ from completesplat.data.validation import (
     OutsidePath,
     UnreadableFile,
 )
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import DataError
 
 POLICIES = pytest.mark.parametrize("policy", ["raise", "skip"])
 NAN = float("nan")
@@ -88,23 +88,17 @@ R, FOCAL, CENTER = ((CAMERA, key) for key in ("R", "focal_length", "principal_po
     [
         ((CAMERA,), ..., BadAnnotation, "no viewpoint"),
         (R, ..., BadAnnotation, "R must be 3 x 3 numbers"),
-        (R, [[1, 0, 0], [0, 1], [0, 0, 1]], BadAnnotation, "R must be 3 x 3 numbers"),
-        (R, [[10**400] * 3] * 3, BadAnnotation, "R must be 3 x 3 numbers"),
         (R, turned(0.3, 1.001), BadCamera, "R is not orthonormal"),
         (R, turned(0.3, -1.0), BadCamera, "R is a reflection"),
         (R, turned(0.3, NAN), BadAnnotation, "R is not finite"),
         (FOCAL, [0, 2], BadCamera, "focal_length must be positive"),
-        (FOCAL, 2.0, BadAnnotation, "focal_length must be 2 numbers"),
         (CENTER, [0, 1.2], BadCamera, "lies outside of the 32 x 24 image"),
         ((CAMERA, "intrinsics_format"), "screen", BadAnnotation, "unknown intrinsics format 'screen'"),
-        ((CAMERA, "intrinsics_format"), [], BadAnnotation, "unknown intrinsics format"),
         (("image", "size"), [0, 32], BadAnnotation, "two positive integers"),
-        (("image", "size"), [32, 32, 3], BadAnnotation, "two positive integers"),
         (("mask",), None, BadAnnotation, "mask must be of type dict"),
         (SCALE, NAN, BadAnnotation, "scale_adjustment is not finite"),
         (("image", "path"), 7, BadAnnotation, "path must be of type str"),
         (("image", "path"), "things/../../x.jpg", OutsidePath, "outside"),
-        (("depth", "path"), "../x.png", OutsidePath, "outside"),
         (("image", "path"), "things/\ud800.jpg", OutsidePath, "no file name has"),
     ],
 )
@@ -161,7 +155,6 @@ def test_a_bad_entry_takes_away_no_more_than_what_it_is_of(name, category):
     [
         (FRAMES, lambda entries: {"frames": entries}, "must hold a list"),
         (SET_LIST, lambda splits: [splits], "no train"),
-        (SET_LIST, lambda splits: {"train": [], "val": []}, "no test"),
     ],
 )
 def test_a_file_that_says_nothing_is_raised_under_either_policy(policy, category, file, edit, part):
@@ -316,22 +309,3 @@ def test_what_is_annotated_badly_is_raised_or_left_out_before_training(policy, c
         assert loader.refused == []
         refused = data.source("train").refused
     assert [place(error) for error in refused] == [(BadAnnotation, str(category / FRAMES), "a", 2)]
-
-
-def test_a_bad_depth_map_is_not_looked_at_where_there_is_a_point_cloud(category, pictures):
-    (category / DEPTH).write_text("depth")
-    assert len(epoch(module(category.parent, "raise").train_dataloader(), pictures)) == 8
-
-
-def test_a_mask_threshold_without_meaning_is_refused(category):
-    for threshold in (0, 1.5, NAN):
-        with pytest.raises(CompleteSplatError, match=r"data\.mask_threshold"):
-            module(category.parent, "skip", mask_threshold=threshold)
-
-
-def test_a_background_that_is_no_grey_value_or_is_not_that_of_encoded_pictures_is_refused(category):
-    for background in (-0.1, 1.5):
-        with pytest.raises(CompleteSplatError, match=r"data\.background"):
-            module(category.parent, "skip", background=background)
-    with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is of pictures as they are"):
-        module(category.parent, "skip", background=0.0, latent_cache="x")

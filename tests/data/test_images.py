@@ -237,17 +237,6 @@ def test_whatever_a_decoder_raises_is_a_data_error(monkeypatch, error):
     refuse(lambda: decode(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP", "TIFF", "BMP"])
-def test_random_damage_gives_a_picture_or_a_data_error(kind):
-    rng, good = np.random.default_rng(0), saved(LARGE, kind)
-    for _ in range(60):
-        content = bytearray(good)
-        for position in rng.integers(0, len(content), 4):
-            content[position] = rng.integers(256)
-        with suppress(DataError):
-            assert decode(bytes(content), kind, "RGB", (24, 32)).size == (32, 24)
-
-
 def test_no_flipped_bit_changes_the_pixels_of_a_png():
     """Checksums cover every chunk; flips in the last one, which is empty, may pass."""
     good = saved(RGB, compress_level=0)
@@ -280,11 +269,9 @@ def test_a_depth_map_is_float16_times_the_scale_and_unknown_where_not_finite(tmp
         (saved(GREY), 1.0, "16 bits"),
         (saved(DEEP, "TIFF"), 1.0, "formats PNG"),
         (depth_png([[1.0, -0.5]]), 1.0, "negative"),
-        (depth_png([[np.nan, np.inf]]), 1.0, "no finite depth"),
-        (saved(np.arange(1, 1000, dtype=np.uint16)[None]), 1.0, "integers"),
         *((depth_png(np.ones((2, 2))), scale, "scale adjustment") for scale in (0.0, float("nan"), float("inf"))),
     ],
-    ids=["eight_bits", "tiff", "negative", "not_finite", "integers", "zero", "nan", "infinite"],
+    ids=["eight_bits", "tiff", "negative", "zero", "nan", "infinite"],
 )
 def test_a_bad_depth_map_is_refused_by_name(tmp_path: Path, content, scale, part):
     path = tmp_path / "d.png"

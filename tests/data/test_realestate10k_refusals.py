@@ -3,7 +3,6 @@
 import json
 import logging
 import weakref
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -160,12 +159,9 @@ def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
     ("fields", "part"),
     [
         ({"cameras": torch.zeros(4, 17)}, "18 columns"),
-        ({"cameras": [[0.5] * 18] * 4}, "18 columns"),
         ({"cameras": torch.zeros(3, 18)}, "4 images, 3 cameras and 4 timestamps"),
         ({"timestamps": torch.arange(4.0)}, "timestamps are not int64"),
-        ({"timestamps": large(10**6, dtype=torch.int64)}, "1000000 timestamps"),
         ({"timestamps": torch.tensor([0, 1, 2, 1])}, "another frame has its timestamp"),
-        ({"images": [torch.zeros(9)] * 4}, "images are not a list"),
         ({"images": [large(10**6)] * 4}, "images are not a list"),
     ],
 )
@@ -186,11 +182,10 @@ class Runs:
         return self.call[0], self.call[1:]
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_a_chunk_runs_no_code(tmp_path, legacy):
+def test_a_chunk_runs_no_code(tmp_path):
     path, canary = tmp_path / CHUNK, tmp_path / "canary"
     harmful = chunk_entry(CLIPS[0]) | {"url": Runs(exec, f"open({str(canary)!r}, 'w')")}
-    torch.save([harmful], path, _use_new_zipfile_serialization=not legacy)
+    torch.save([harmful], path)
     with pytest.raises(UnreadableFile):
         read_chunk(path)
     assert not canary.exists()
@@ -198,50 +193,13 @@ def test_a_chunk_runs_no_code(tmp_path, legacy):
     assert canary.exists()
 
 
-def saved(make: Callable[[dict[str, Any]], object], **options: Any) -> Damage:
-    return lambda path: torch.save(make(chunk_entry(CLIPS[0])), path, **options)
-
-
-def flipped(data: bytes) -> Damage:
-    """One bit in the middle of these bytes of the file."""
-
-    def damage(path: Path) -> None:
-        whole = bytearray(path.read_bytes())
-        whole[whole.index(data) + len(data) // 2] ^= 1
-        path.write_bytes(whole)
-
-    return damage
-
-
-def bomb(path: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in {**records, f"{next(iter(records)).split('/')[0]}/data/9999": bytes(10**7)}.items():
-            archive.writestr(name, data)
-
-
-def bytes_from_nothing(path: Path) -> None:
-    """A pickle of 30 bytes for 2 GiB."""
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in records.items():
-            asks = b"\x80\x02cbuiltins\nbytearray\n\x8a\x05" + (2**31).to_bytes(5, "little") + b"\x85R."
-            archive.writestr(name, asks if name.endswith("data.pkl") else data)
+def saved(make: Callable[[dict[str, Any]], object]) -> Damage:
+    return lambda path: torch.save(make(chunk_entry(CLIPS[0])), path)
 
 
 # name: (damage of the broken clip's chunk, kind)
 BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
-    "empty": (lambda path: path.write_bytes(b""), UnreadableFile),
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-500]), UnreadableFile),
-    "flipped_bit_in_a_camera": (flipped(CLIPS[0].rows.tobytes()), UnreadableFile),
-    "zip_of_something_else": (
-        lambda path: zipfile.ZipFile(path, "w").writestr("readme.txt", "nothing"), UnreadableFile,
-    ),
-    "legacy_form": (saved(lambda entry: [entry], _use_new_zipfile_serialization=False), UnreadableFile),
-    "bomb": (bomb, UnreadableFile),
-    "bytes_from_nothing": (bytes_from_nothing, UnreadableFile),
     "list_of_tensors": (saved(lambda entry: list(entry["images"])), BadAnnotation),
     "key_twice": (saved(lambda entry: [entry, entry]), BadAnnotation),
     "another_clip": (saved(lambda entry: [entry | {"key": "other"}]), BadAnnotation),
