@@ -163,6 +163,6 @@ def test_what_is_not_there_or_makes_no_sense_is_refused(tmp_path):
             module(tmp_path, **setting)
 
 
-@pytest.mark.parametrize("experiment", ["co3d_diffusion", "re10k_diffusion", "toy_diffusion"])
+@pytest.mark.parametrize("experiment", ["paper_diffusion", "toy_diffusion"])
 def test_latent_diffusion_reads_no_targets(experiment):
     assert compose_config("fit", f"experiment={experiment}").data.targets == 0
