@@ -1,4 +1,4 @@
-"""Objects cut out of their background, by a stand-in for rembg; what tells pictures of one kind from others."""
+"""Objects cut out of their background, by a stand-in for rembg; what tells images of one kind from others."""
 
 import sys
 from pathlib import Path
@@ -35,7 +35,7 @@ def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
     assert read_photograph(tmp_path / "a.png", 32).image[1, 0, 0] == 0
 
 
-def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_square(rembg, tmp_path):
+def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_square(rembg, tmp_path):
     image = Image.new("RGB", (64, 32), "red")
     image.paste("blue", (2, 4, 14, 10))  # left of the central square
     image.save(tmp_path / "a.png")
@@ -47,7 +47,7 @@ def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_s
     assert torch.equal(found, expected)
 
 
-def test_an_object_as_long_as_a_picture_may_be_is_reduced_before_its_square_is_made(tmp_path):
+def test_an_object_as_long_as_a_image_may_be_is_reduced_before_its_square_is_made(tmp_path):
     Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
     found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
     assert found[0, 0].min() > 0.9  # white above the line
@@ -70,7 +70,7 @@ def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, mon
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
 
 
-def test_a_picture_without_an_object_is_refused(rembg, tmp_path):
+def test_a_image_without_an_object_is_refused(rembg, tmp_path):
     Image.new("RGB", (32, 32), "red").save(tmp_path / "a.png")
     with pytest.raises(ImageError, match=r"a\.png: background=remove leaves nothing"):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)

@@ -36,7 +36,7 @@ def annotate(
     splits: Mapping[str, Sequence[str]] | None = None,
     qualities: Mapping[str, tuple[float | None, float | None]] | None = None,
 ) -> None:
-    """Annotations without any picture."""
+    """Annotations without any image."""
     viewpoints = [look(eye, np.zeros(3)) for eye in orbit(max(counts.values(), default=0))]
     frames = [frame_entry(name, i, viewpoints[i]) for name, count in counts.items() for i in range(count)]
     write_annotations(root, frames, [sequence_entry(n, *(qualities or {}).get(n, (1.0, 1.0))) for n in counts], splits)

@@ -123,7 +123,7 @@ def plane(folder: Path, map_size: tuple[int, int], scale: float = 1.0) -> CO3DFr
 
 @pytest.mark.parametrize(("map_size", "step"), [((24, 32), 1), ((12, 16), 2), ((6, 8), 4)])
 def test_a_plane_is_placed_where_it_is_also_by_smaller_depth_maps(tmp_path, map_size, step):
-    """Pixel (u, v) of the picture is at ((16 - u) / 36, (12 - v) / 36) 2, with PyTorch3D's axes: 36 = 3 * 24 / 2."""
+    """Pixel (u, v) of the image is at ((16 - u) / 36, (12 - v) / 36) 2, with PyTorch3D's axes: 36 = 3 * 24 / 2."""
     center, half_size = from_depth_maps([plane(tmp_path / "a", map_size)], AXES)
     columns, rows = np.arange(4, 28, step) + step / 2, np.arange(8, 20, step) + step / 2
     expected = [2 * (16 - columns.mean()) / 36, 2 * (12 - rows.mean()) / 36, 2]
@@ -167,7 +167,7 @@ def test_all_ways_agree_roughly_on_toy_objects(toy_root):
 
     They are not exact: depth maps show the surface that the cameras see, the cloud all of it, and the largest of its
     points counts but only the 99 % quantile of theirs; and cameras are taken to be filled by the object, which leaves
-    a margin in every picture.
+    a margin in every image.
     """
     category = read_category(toy_root, "toy_objects", SUBSET, SeededSplit(0.1, 0.1, 0), Filters())
     for members in category.splits.values():

@@ -175,7 +175,7 @@ def test_a_truncated_or_missing_file_is_refused_as_a_whole(category, file):
         read(category)
 
 
-def test_pictures_behind_links_that_leave_the_root_are_refused(category, tmp_path):
+def test_images_behind_links_that_leave_the_root_are_refused(category, tmp_path):
     folder = category / "a" / "images"
     folder.rename(tmp_path / "elsewhere")
     folder.symlink_to(tmp_path / "elsewhere")
@@ -217,9 +217,9 @@ def unknown_depth(category: Path) -> None:
 
 # name: (damage, kind, file, frame), of sequence a.
 DAMAGES: dict[str, tuple[Callable[[Path], object], type[DataError], str | None, int | None]] = {
-    "picture_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadImage, IMAGE, 1),
+    "image_is_text": (lambda category: (category / IMAGE).write_text("picture"), BadImage, IMAGE, 1),
     "missing_mask": (lambda category: (category / MASK).unlink(), MissingFile, MASK, 1),
-    "picture_is_a_pipe": (replaced(IMAGE, os.mkfifo), MissingFile, IMAGE, 1),
+    "image_is_a_pipe": (replaced(IMAGE, os.mkfifo), MissingFile, IMAGE, 1),
     "missing_cloud": (lambda category: (category / CLOUD).unlink(), MissingFile, CLOUD, None),
     "missing_depth_map": (without_cloud(lambda category: (category / DEPTH).unlink()), MissingFile, DEPTH, 1),
     "zero_scale_of_a_depth_map": (
@@ -240,14 +240,14 @@ def test_what_is_broken_is_refused_by_the_source_with_its_place(name, category):
 
 
 def module(root: Path, policy: str, **settings: Any) -> CO3DDataModule:
-    """Small pictures, one scene in a batch that shows all frames, and no limit on what is skipped."""
+    """Small images, one scene in a batch that shows all frames, and no limit on what is skipped."""
     defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "references_per_sequence": ITEMS, "subset": SUBSET}
     return CO3DDataModule(str(root), CATEGORY, **{**defaults, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
 
 
 @pytest.fixture(scope="module")
-def pictures(intact: Path) -> dict[bytes, Seen]:
-    """All pictures of the tree that nothing is wrong with; no two are alike."""
+def intact_images(intact: Path) -> dict[bytes, Seen]:
+    """All images of the tree that nothing is wrong with; no two are alike."""
     data, found = module(intact.parent, "raise"), {}
     for split in SPLITS:
         for name in data.source(split).names:
@@ -257,7 +257,7 @@ def pictures(intact: Path) -> dict[bytes, Seen]:
     return found
 
 
-def epoch(loader: Any, pictures: dict[bytes, Seen], number: int = 0) -> set[Seen]:
+def epoch(loader: Any, intact_images: dict[bytes, Seen], number: int = 0) -> set[Seen]:
     """The frames that an epoch of training shows, exactly as they are. It has all of its scenes, whatever is broken."""
     loader.sampler.set_epoch(number)
     batches, seen = list(loader), set()
@@ -265,15 +265,15 @@ def epoch(loader: Any, pictures: dict[bytes, Seen], number: int = 0) -> set[Seen
     for batch in batches:
         views = batch.all_views()
         assert all(t.isfinite().all() for t in (views.masks, views.cameras.world_to_camera, batch.depth_range))
-        found = {pictures[(255 * image).round().to(torch.uint8).numpy().tobytes()] for image in views.images[0]}
+        found = {intact_images[(255 * image).round().to(torch.uint8).numpy().tobytes()] for image in views.images[0]}
         assert {(sequence,) for sequence, _ in found} == {batch.names}
         seen |= found
     return seen
 
 
 @POLICIES
-@pytest.mark.parametrize("name", ["picture_is_text", "missing_cloud"])
-def test_what_is_broken_never_gets_into_a_batch(name, policy, category, pictures, monkeypatch):
+@pytest.mark.parametrize("name", ["image_is_text", "missing_cloud"])
+def test_what_is_broken_never_gets_into_a_batch(name, policy, category, images, monkeypatch):
     damage, kind, file, frame = DAMAGES[name]
     damage(category)
     data = module(category.parent, policy)
@@ -288,24 +288,7 @@ def test_what_is_broken_never_gets_into_a_batch(name, policy, category, pictures
         return
     for number in (0, 1):
         readings.clear()
-        assert {name for name, _ in epoch(loader, pictures, number)} == {"b"}
+        assert {name for name, _ in epoch(loader, intact_images, number)} == {"b"}
         # Its own items come every epoch; what is drawn in their place may be others of them.
         assert len(loader.refused) == readings["a"] >= ITEMS
         assert {place(error) for error in loader.refused} == {(kind, str(category / file), "a", frame)}
-
-
-@POLICIES
-def test_what_is_annotated_badly_is_raised_or_left_out_before_training(policy, category, pictures):
-    change(category / FRAMES, put(CAMERA, value=None))
-    data = module(category.parent, policy, targets=2)
-    if policy == "raise":
-        with pytest.raises(BadAnnotation) as caught:
-            data.setup("fit")
-        refused = [caught.value]
-    else:
-        data.setup("fit")
-        loader = data.train_dataloader()
-        assert epoch(loader, pictures) == {(name, number) for name in "ab" for number in range(4)} - {("a", 2)}
-        assert loader.refused == []
-        refused = data.source("train").refused
-    assert [place(error) for error in refused] == [(BadAnnotation, str(category / FRAMES), "a", 2)]

@@ -21,7 +21,7 @@ def test_exif_orientation(tmp_path, orientation, name, options):
     upright[0] = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
     upright[1] = [[255, 255, 255], [0, 0, 0], [255, 255, 0]]
     upright = Image.fromarray(upright.repeat(32, 0).repeat(32, 1))
-    # The inverse of what the orientation asks for gives the stored picture (5 to 8 are wider than high when upright).
+    # The inverse of what the orientation asks for gives the stored image (5 to 8 are wider than high when upright).
     exif = Image.Exif()
     exif[0x0112] = {6: 8, 8: 6}.get(orientation, orientation)
     upright.info["exif"] = exif.tobytes()

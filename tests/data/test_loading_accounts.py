@@ -15,7 +15,7 @@ def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
     """Clips of which some have broken pictures, others broken cameras."""
     clips = {key: make_clip(key, frames=3) for key in KEYS}
     for key in pictures:
-        clips[key].pictures[1:] = [b"<html>", b"<html>"]
+        clips[key].images[1:] = [b"<html>", b"<html>"]
     for key in cameras:
         clips[key].rows[1, 0] = 0
     clips = list(clips.values())

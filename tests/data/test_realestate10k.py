@@ -63,7 +63,7 @@ def test_a_point_reprojects_onto_its_pixel(tmp_path, form, crop):
         x, y, z = row[6:].reshape(3, 4) @ [*world, 1]
         u, v = width * (row[0] * x / z + row[2]), height * (row[1] * y / z + row[3])
         disc = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 18)
-        clip.pictures[frame] = encode(disc[..., None].repeat(3, axis=2).astype(np.uint8))
+        clip.images[frame] = encode(disc[..., None].repeat(3, axis=2).astype(np.uint8))
     root = write_tree(tmp_path, form, [clip, make_clip("b")], TEST)
     store = module(root, image_size=64, crop=crop, scale=2.0, val_fraction=0.0).store("train")
     scene = store.scene(store.source.read("a"), 1, [0, 2, 3])
@@ -106,7 +106,7 @@ def test_evaluation_goes_from_the_first_frame_to_those_that_follow(root):
     assert sorted(batch.names) == sorted(clip.key for clip in TEST)
 
 
-def test_a_model_sees_pictures_made_as_its_training_pictures_were_whatever_size_is_scored(root):
+def test_a_model_sees_images_made_as_its_training_images_were_whatever_size_is_scored(root):
     small, large = module(root, image_size=8), module(root, image_size=HEIGHT)
     expected = list(module(root, image_size=HEIGHT).test_dataloader())
     large.at_model_size = small

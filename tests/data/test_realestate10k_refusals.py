@@ -25,7 +25,7 @@ from realestate10k_trees import (
 
 from completesplat.data.audit import check
 from completesplat.data.images.crop import Square
-from completesplat.data.realestate10k import chunks, clips
+from completesplat.data.realestate10k import chunks
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
 from completesplat.data.realestate10k.clips import TextClips
 from completesplat.data.realestate10k.module import RE10KDataModule
@@ -66,8 +66,8 @@ def entry(row: int, column: int | slice, value: float) -> Callable[[StoredClip],
     return lambda clip: clip.rows[row].__setitem__(column, value)
 
 
-def picture(frame: int, make: Callable[[bytes], bytes]) -> Callable[[StoredClip], object]:
-    return lambda clip: clip.pictures.__setitem__(frame, make(clip.pictures[frame]))
+def stored_image(frame: int, make: Callable[[bytes], bytes]) -> Callable[[StoredClip], object]:
+    return lambda clip: clip.images.__setitem__(frame, make(clip.images[frame]))
 
 
 def mirrored(clip: StoredClip) -> None:
@@ -86,9 +86,9 @@ BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int 
     "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),
     "lens_distortion": (entry(2, 4, 0.1), BadCamera, 2),
     "one_frame": (first(1), TooFewFrames, None),
-    "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadImage, 2),
-    "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadImage, 0),
-    "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadImage, 2),
+    "cut_jpeg": (stored_image(2, lambda data: data[: len(data) // 2]), BadImage, 2),
+    "html_instead_of_the_first_image": (stored_image(0, lambda _: b"<html>404</html>"), BadImage, 0),
+    "another_size_in_the_middle": (stored_image(2, lambda _: make_clip("x", size=(32, 18)).images[0]), BadImage, 2),
 }  # fmt: skip
 
 
@@ -125,12 +125,12 @@ def replaced(file: str, make: Callable[[Path], object]) -> Damage:
 
 # name: (damage, kind, file, frame)
 BAD_TEXTS: dict[str, tuple[Damage, type[DataError], str, int | None]] = {
-    "a_picture": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].pictures[0])), UnreadableFile, TEXT, None),
+    "an_image": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].images[0])), UnreadableFile, TEXT, None),
     "a_folder": (replaced(TEXT, Path.mkdir), MissingFile, TEXT, None),
     "column_too_many": (line_of(1, lambda columns: [*columns, "0"]), BadAnnotation, TEXT, 1),
     "letters": (line_of(2, lambda columns: [*columns[:5], "k1", *columns[6:]]), BadAnnotation, TEXT, 2),
     "timestamp_twice": (line_of(2, lambda columns: ["66000", *columns[1:]]), BadAnnotation, TEXT, 1),
-    "no_picture": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
+    "no_image": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
 }
 
 
@@ -139,15 +139,6 @@ def test_a_broken_text_is_refused_with_its_place(name, tmp_path):
     damage, *expected = BAD_TEXTS[name]
     damage(write(tmp_path / "train", "text"))
     assert_only_refusal(tmp_path / "train", *expected)
-
-
-def test_a_text_may_be_large_but_not_endless(tmp_path, monkeypatch):
-    texts = TextClips(write(tmp_path, "text"))
-    monkeypatch.setattr(clips, "MOST_BYTES", (tmp_path / TEXT).stat().st_size)
-    assert len(texts.clip(BAD).timestamps) == 4
-    monkeypatch.setattr(clips, "MOST_BYTES", clips.MOST_BYTES - 1)
-    with pytest.raises(UnreadableFile, match="more than"):
-        texts.clip(BAD)
 
 
 def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:

@@ -19,7 +19,7 @@ from completesplat.data.images.files import (
     check_sums,
     decode,
     opened,
-    over_white,
+    over_grey,
     refused_as_bad,
 )
 from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
@@ -138,7 +138,7 @@ def _read_upright(path: Path, image_size: tuple[int, int]) -> tuple[Image.Image,
             )
         if image.has_transparency_data and image.mode in EIGHT_BIT_MODES:
             check_annotated_size(image, image_size)
-            return over_white(image), image.convert("RGBA").getchannel("A")
+            return over_grey(image, 1.0), image.convert("RGBA").getchannel("A")
     return decode(path, str(path), "RGB", image_size), None
 
 

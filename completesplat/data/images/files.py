@@ -128,11 +128,6 @@ def check_sums(image: Image.Image, source: str | Path | io.BytesIO) -> None:
             again.verify()
 
 
-def over_white(image: Image.Image) -> Image.Image:
-    """Composite an image over white and return it in RGB."""
-    return over_grey(image, 1.0)
-
-
 def over_grey(image: Image.Image, value: float) -> Image.Image:
     """Composite an image over a grey value from 0 to 1 and return it in RGB."""
     grey = Image.new("RGBA", image.size, (round(255 * value),) * 3)
