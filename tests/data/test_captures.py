@@ -177,7 +177,7 @@ def test_the_object_fills_its_half_size_and_stray_points_are_left_out(tmp_path):
         content.update(ply_file_path="sparse.ply")
 
     write_transforms(tmp_path, change=add_points)
-    sequence = CaptureDataModule(str(tmp_path)).source("train").read(tmp_path.name)
+    sequence = CaptureDataModule(str(tmp_path / "transforms.json")).source("train").read("transforms.json")
     factor = sequence.cameras.centers[0].norm().item() / np.linalg.norm(opengl_poses()[1, :3, 3])
     extent = np.abs(POINTS - POINTS.mean(axis=0)).max()
     assert factor == pytest.approx(0.57 / extent, rel=0.3)  # Its axes are turned.

@@ -273,7 +273,7 @@ def epoch(loader: Any, intact_images: dict[bytes, Seen], number: int = 0) -> set
 
 @POLICIES
 @pytest.mark.parametrize("name", ["image_is_text", "missing_cloud"])
-def test_what_is_broken_never_gets_into_a_batch(name, policy, category, images, monkeypatch):
+def test_what_is_broken_never_gets_into_a_batch(name, policy, category, intact_images, monkeypatch):
     damage, kind, file, frame = DAMAGES[name]
     damage(category)
     data = module(category.parent, policy)

@@ -47,11 +47,14 @@ def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
 def read_capture(folder: Path, most_missing: float) -> Capture | None:
     """Read the capture in a folder: `transforms.json`, or `sparse/0` or `sparse` with `images` and perhaps `masks`.
 
+    `folder` may also be a JSON file, such as `transforms_train.json` of NeRF.
+
     Returns:
         The capture, or None if the folder has none.
     """
-    if (folder / "transforms.json").is_file():
-        return read_transforms(folder / "transforms.json", most_missing)
+    transforms = folder if folder.suffix == ".json" else folder / "transforms.json"
+    if transforms.is_file():
+        return read_transforms(transforms, most_missing)
     for model in (folder / "sparse/0", folder / "sparse"):
         if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             masks = folder / "masks"
@@ -124,7 +127,7 @@ class CaptureDataModule(SceneDataModule):
     scaled to a common object size. The object is placed by the capture's points, else by its cameras.
 
     Args:
-        root: folder of a capture (`read_capture`), a folder of such folders, or prepared captures.
+        root: folder or file of a capture (`read_capture`), a folder of such folders, or prepared captures.
         hold_out: one of every `hold_out` frames is for validation and test.
         most_missing: largest share of the frames of a `transforms.json` that may lack an image and are left out.
         evaluation_targets: at most this many evenly spaced targets of the reference, the first held-out frame; None:
