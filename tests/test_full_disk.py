@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support import SMALL, some_gaussians, tiny_generator, write_capture
+from support import SMALL, some_gaussians, tiny_generator
 
 from completesplat.commands import exit_status, refusal
 from completesplat.data.audit import Findings
-from completesplat.data.captures import import_capture
-from completesplat.data.images.files import save_picture
+from completesplat.data.images.files import save_image
 from completesplat.data.toy import write_objects, write_rooms
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
@@ -130,18 +129,10 @@ def test_rows_that_do_not_fit_are_refused(tmp_path):
     assert file.path.stat().st_size == size
 
 
-def capture(out: Path) -> Path:
-    source = out.parent / "capture"
-    if not source.exists():
-        write_capture(source, 6)
-    return import_capture(out, "desk", source / "transforms.json", progress=False)
-
-
 TINY = {"scenes": 2, "frames": 2, "size": 16, "seed": 0, "workers": 1, "progress": False}
 FOLDERS: dict[str, Callable[[Path], Path]] = {
     "toy_objects": lambda out: write_objects(out, **TINY),
     "toy_rooms": lambda out: write_rooms(out, **TINY),
-    "desk": capture,
 }
 
 
@@ -161,7 +152,7 @@ def test_a_data_set_that_does_not_fit_is_refused_and_nothing_of_it_stays(tmp_pat
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_a_picture_that_does_not_fit_is_not_cut_short(tmp_path, suffix):
     with quota(100), pytest.raises(OSError, match=rf"Errno {errno.EFBIG}"):
-        save_picture(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
+        save_image(Image.effect_noise((64, 64), 50), tmp_path / f"a{suffix}")
 
 
 def test_weights_that_do_not_fit_are_refused_and_the_old_ones_stay(tmp_path):

@@ -3,13 +3,16 @@
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_text
 from completesplat.settings.schema import Entries, Positive, Range
+
+if TYPE_CHECKING:
+    from completesplat.data.sequences import PosedSequence, SequenceSource
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +122,7 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
+def _sources(data: Any, splits: Sequence[str]) -> "dict[str, SequenceSource]":
     """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()
@@ -136,7 +139,7 @@ def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
     return sources
 
 
-def _readable(source: Any, names: Any) -> Iterator[Any]:
+def _readable(source: "SequenceSource", names: Iterable[str]) -> "Iterator[PosedSequence]":
     for name in names:
         try:
             yield source.read(name)

@@ -25,7 +25,7 @@ from completesplat.weights import SHIPPED, SUMS_FILE, WEIGHTS_FILE, check_folder
 
 ALWAYS_NAMED = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
 EXTRAS = {"cuda": "to draw on an NVIDIA GPU", "view": "to show scenes in a browser, live"}
-EXTRAS |= {"colmap": "to import your own captures", "slurm": "to spread sweeps over a cluster"}
+EXTRAS |= {"colmap": "to read captures whose lens distorts", "slurm": "to spread sweeps over a cluster"}
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000
 """Bytes that the files of a few predictions take."""

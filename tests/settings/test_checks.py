@@ -36,7 +36,7 @@ ODD = [
     ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
     ("fit", "data.workers=4000", "data.workers=4000: must not be above 4 for each of "),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
-    ("data", "data_task=import hold_out=1", "hold_out=1: must be at least 2"),
+    ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
     ("fit", "loss.terms=null", "loss.terms=None: must be a mapping"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
@@ -62,9 +62,7 @@ def test_an_odd_value_is_named_with_the_values_allowed(verb, setting, message):
     assert message in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 
 
-@pytest.mark.parametrize(
-    "chosen", [*VERBS, "data_task=check", "data_task=import", "bench_task=paper", "report_task=html"]
-)
+@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=html"])
 def test_the_defaults_of_each_verb_fit(chosen):
     verb = chosen.partition("_")[0]
     check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))
@@ -96,7 +94,7 @@ def test_a_value_is_named_where_it_was_set():
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit data=toy_object", r"no data 'toy_object': there are .*; did you mean toy_objects"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are stage1, stage2; did you mean stage1"),
-        ("fit data=null", r"data=null: choose one of co3d_category, "),
+        ("fit data=null", r"data=null: choose one of capture, co3d_category, "),
         ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),
         ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),
         ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
