@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import draws
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
@@ -56,7 +56,7 @@ class SceneStore:
         self.names = list(names)
         self.mask_threshold = mask_threshold
         self.background = background
-        self._cache: dict[tuple[str, int], Picture] | None = {} if cache else None
+        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
         """Return the scene of the frames with these indices in the reference camera's frame, if all can be read."""
@@ -72,7 +72,7 @@ class SceneStore:
         """Return one image, if it can be read."""
         return self._read(sequence, view).image
 
-    def _read(self, sequence: PosedSequence, view: int) -> Picture:
+    def _read(self, sequence: PosedSequence, view: int) -> MaskedImage:
         key = sequence.name, view
         if self._cache is None:
             return self._on_background(sequence.read(view))
@@ -80,12 +80,12 @@ class SceneStore:
             self._cache[key] = self._on_background(sequence.read(view))
         return self._cache[key]
 
-    def _masks(self, pairs: Sequence[Picture]) -> Float[Tensor, "view 1 size size"]:
+    def _masks(self, pairs: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
         everywhere = torch.full_like(pairs[0].image[:1], 255)
         masks = _shares([everywhere if pair.mask is None else pair.mask for pair in pairs])
         return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
 
-    def _on_background(self, pair: Picture) -> Picture:
+    def _on_background(self, pair: MaskedImage) -> MaskedImage:
         if self.background is None or pair.mask is None:
             return pair
         mask = self._masks([pair])[0].numpy()

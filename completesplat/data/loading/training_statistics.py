@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from completesplat.data.images.photograph import picture_features
+from completesplat.data.images.photograph import image_features
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
@@ -67,8 +67,8 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
-    """Return mean and standard deviation of `picture_features` over about 1,024 images; empty if none can be read."""
-    rows = [picture_features(image.double() / 255) for image in _images(store, FEATURE_IMAGES)]
+    """Return mean and standard deviation of `image_features` over about 1,024 images; empty if none can be read."""
+    rows = [image_features(image.double() / 255) for image in _images(store, FEATURE_IMAGES)]
     if not rows:
         return {}
     features = torch.stack(rows)

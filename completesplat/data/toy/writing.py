@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
-from completesplat.data.images.files import save_picture
+from completesplat.data.images.files import save_image
 from completesplat.data.toy.object_scene import ToyScene, draw_mini, draw_scene, render_frame
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
 from completesplat.data.toy.shapes import Array
@@ -91,7 +91,7 @@ def to_bytes(values: Array) -> UInt8[np.ndarray, "..."]:
 
 def write_image(path: Path, image: Array) -> None:
     """Write colours in [0, 1], [height width 3], as a JPEG."""
-    save_picture(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
+    save_image(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
 
 
 def _write_frame(
@@ -107,10 +107,10 @@ def _write_frame(
     image, coverage, depth = render_frame(scene, frame, size)
     mask = to_bytes(coverage)
     write_image(folder / files["image"], image)
-    save_picture(Image.fromarray(mask), folder / files["mask"])
+    save_image(Image.fromarray(mask), folder / files["mask"])
     # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
-    save_picture(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
-    save_picture(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
+    save_image(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
+    save_image(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
     paths = {key: f"{category}/{path}" for key, path in files.items()}
     # The world has the scene's unit and origin.
     world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
