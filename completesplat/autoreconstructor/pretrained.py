@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -65,7 +64,7 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     vae.load_state_dict(given, strict=False)
 
 
-def _needed_settings(config: Mapping[str, Any]) -> str:
+def _needed_settings(config: Mapping[str, object]) -> str:
     overrides = [
         f"autoreconstructor.encoder.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
         for theirs, ours in SETTINGS.items()
@@ -106,7 +105,7 @@ def _fetch_hint(hub_id: str) -> str:
     )
 
 
-def _read_config(path: Path) -> dict[str, Any]:
+def _read_config(path: Path) -> dict[str, object]:
     try:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:
