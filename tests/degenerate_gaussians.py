@@ -1,4 +1,4 @@
-"""Gaussians that no rasterizer should meet, but that training produces, and a healthy scene for them to spoil."""
+"""Degenerate Gaussians, as training produces them, and a healthy scene around them."""
 
 import math
 from functools import partial
@@ -15,23 +15,18 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 NAN, INF = math.nan, math.inf
 SIZE = (14, 18)
 
-# What is changed in a healthy Gaussian, at the centre of the view and 2 units away.
+# Changes to a healthy Gaussian at the centre of the view, 2 units away.
 NEVER_DRAWN = {
     "behind the camera": {"means": (0.0, 0.0, -2.0)},
     "in the camera": {"means": (0.0, 0.0, 0.0)},
     "on the near plane": {"means": (0.0, 0.0, 0.01)},
     "far to the side": {"means": (1e30, 0.0, 2.0)},
-    "at the end of float32": {"means": (3e38, 3e38, 3e38)},
     "beyond the end of float32 for the camera": {"means": (-3e38, 3e38, 3.4e38)},
     "mean nan": {"means": (0.0, NAN, 2.0)},
-    "mean inf": {"means": (0.0, 0.0, INF)},
-    "quaternion nan": {"quaternions": (NAN, 0.0, 0.0, 1.0)},
     "quaternion inf": {"quaternions": (INF, 0.0, 0.0, 1.0)},
     "scale nan": {"scales": (0.1, NAN, 0.1)},
     "scale inf": {"scales": (0.1, 0.1, INF)},
-    "scale minus inf": {"scales": (-INF, 0.1, 0.1)},
     "colour nan": {"colors": (NAN, 0.1, 0.1)},
-    "colour inf": {"colors": (0.1, 0.1, INF)},
     "scale enormous": {"scales": (1e14, 1e13, 1e14)},
     "scale at the end of float32": {"scales": (3e38, 1e-38, 3e38)},
     "opacity nan": {"opacities": NAN},
@@ -43,12 +38,10 @@ NEVER_DRAWN = {
 DRAWN = {
     "zero quaternion": {"quaternions": (0.0, 0.0, 0.0, 0.0)},
     "vanishing quaternion": {"quaternions": (1e-20, 1e-20, 0.0, 0.0)},
-    "short quaternion": {"quaternions": (1e-10, -1e-10, 2e-10, 0.0)},
     "long quaternion": {"quaternions": (1e25, -1e25, 2e25, 0.0)},
     "scale zero": {"scales": (0.0, 0.0, 0.0)},
     "one scale zero": {"scales": (0.2, 0.0, 0.1)},
     "scale negative": {"scales": (-0.2, 0.3, 0.1)},
-    "scale tiny": {"scales": (1e-30, 1e-38, 1e-20)},
     "needle": {"scales": (1e3, 1e-3, 1e-3)},
     "scale huge": {"scales": (1e6, 1e6, 1e6)},
     "opacity one": {"opacities": 1.0},
@@ -70,14 +63,15 @@ def healthy(count: int) -> Gaussians:
 
 
 def changed(values: dict) -> Gaussians:
-    one = Gaussians(
+    gaussian = Gaussians(
         means=torch.tensor([[[0.03, -0.02, 2.0]]]),
         quaternions=torch.tensor([[[0.9, 0.3, -0.2, 0.1]]]),
         scales=torch.tensor([[[0.2, 0.3, 0.1]]]),
         opacities=torch.tensor([[0.7]]),
         colors=torch.tensor([[[0.2, 0.5, 0.8]]]),
     )
-    fields = vars(one) | {name: torch.tensor(value).expand_as(getattr(one, name)) for name, value in values.items()}
+    changes = {name: torch.tensor(value).expand_as(getattr(gaussian, name)) for name, value in values.items()}
+    fields = vars(gaussian) | changes
     return Gaussians(**{name: tensor.clone() for name, tensor in fields.items()})
 
 
@@ -88,24 +82,24 @@ def camera() -> Cameras:
 def draw(
     rasterizer: Rasterizer, gaussians: Gaussians, cameras: Cameras | None = None, intrinsics: bool = True
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """All images in one tensor; gradients of the Gaussians and the cameras under random cotangents."""
+    """Return all images in one tensor, and gradients of the Gaussians and cameras under random cotangents."""
     cameras = (camera() if cameras is None else cameras).to(gaussians.means)
     cotangents = [cotangent.to(gaussians.means) for cotangent in cotangents_for(cameras, 1)]
     rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents, intrinsics)
     return torch.cat(list(vars(rendering).values()), dim=2), gradients
 
 
-def assert_as_good_as_absent(
-    rasterizer: Rasterizer, one: Gaussians, gradients_agree: float = 0.0, intrinsics: bool = True
+def assert_changes_nothing(
+    rasterizer: Rasterizer, gaussian: Gaussians, gradients_agree: float = 0.0, intrinsics: bool = True
 ) -> None:
-    rest = healthy(12).to(one.means)
+    rest = healthy(12).to(gaussian.means)
     expected, expected_gradients = draw(rasterizer, rest, intrinsics=intrinsics)
-    images, gradients = draw(rasterizer, concatenate([one, rest]), intrinsics=intrinsics)
+    images, gradients = draw(rasterizer, concatenate([gaussian, rest]), intrinsics=intrinsics)
     assert expected.any()
     assert torch.equal(images, expected)
     for name, without in expected_gradients.items():
         gradient = gradients[name]
-        if name in vars(one):
+        if name in vars(gaussian):
             assert not gradient[:, 0].any(), name
             gradient = gradient[:, 1:]
         assert (gradient - without).norm() <= gradients_agree * without.norm(), name
@@ -124,5 +118,5 @@ def assert_drawn_as_by_the_reference(rasterizer: Rasterizer, kind: str, intrinsi
             parts = list(zip(*(x.split([12, 1], dim=1) for x in (gradients[name], exact)), strict=True))
         if (kind, name) == ("scale huge", "quaternions"):  # the rotation of a ball changes nothing
             assert parts.pop()[0].norm() <= 1e-4
-        for found, wanted in parts:
-            assert (found - wanted).norm() <= 2e-4 * wanted.norm(), name
+        for actual, expected_part in parts:
+            assert (actual - expected_part).norm() <= 2e-4 * expected_part.norm(), name

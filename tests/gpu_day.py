@@ -18,9 +18,9 @@ from completesplat.results.machine import machine
 NETWORKS = ["autoreconstructor=tiny", "autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser=tiny"]
 NETWORKS += ["denoiser.channels=[16,32]", "denoiser.attention_levels=[1]", "conditioning.channels=[8,8,16,16]"]
 SCENES = ["data.scenes=4", "data.frames=4", "data.image_size=32", "data.batch_size=2", "repeats=1", "samples=2"]
-RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1", "growth=false", "training_step=false"]
+RASTERIZERS = ["sizes=[16]", "views=[1]", "repeats=1", "training_step=false"]
 PAPER = ["device=cpu", "compile=false", "conditioning=learned", "sampler.steps=2", *NETWORKS, *SCENES]
-DIFFUSION = ["compile_limit=0", "steps=1", *NETWORKS, *SCENES]
+DIFFUSION = ["steps=1", *NETWORKS, *SCENES]
 LARGE = [f"{part}=stable_diffusion" for part in ("autoreconstructor", "conditioning", "denoiser")]
 STAGE1 = ["trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.limit_val_batches=1", "data.batch_size=2"]
 STAGE1 += ["autoreconstructor.encoder.channels=[8,8,16]"]
@@ -48,8 +48,8 @@ def steps(out: Path, small: bool) -> Iterator[Step]:
     yield Step("tests", ["-m", "pytest", "-q", "-rs", "-m", "gpu", "tests/rasterizers"])
     yield verb("rasterizers", "bench", "rasterizers", *if_small(RASTERIZERS), out=out)
     yield verb("paper", "bench", "paper", *if_small(PAPER), out=out)
-    yield verb("diffusion", "bench", "diffusion", "compile_limit=120", *if_small(DIFFUSION), out=out)
-    large = if_small(DIFFUSION, ["compile_limit=120", "data.image_size=128", *LARGE])
+    yield verb("diffusion", "bench", "diffusion", *if_small(DIFFUSION), out=out)
+    large = if_small(DIFFUSION, ["data.image_size=128", *LARGE])
     yield verb("diffusion_large", "bench", "diffusion", *large, out=out)
     yield verb("data", "data", "toy", "kind=objects", "size=128", f"scenes={20 if small else 1000}", out=out)
     for size in (32, 48) if small else (64, 128):

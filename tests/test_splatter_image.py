@@ -85,27 +85,25 @@ def test_zero_rotation_is_the_identity_with_a_finite_gradient():
 
 # Standard deviations of the raw values of szymanowiczs/splatter-image's own network at the start: commit 98b4657,
 # `SingleImageSongUNetPredictor` with the settings of its configs/default_config.yaml and these 15 channels, not
-# training: the mean over 20 seeds, two pictures of uniform noise of 128 x 128 each.
+# training: the mean over 20 seeds, two images of uniform noise of 128 x 128 each.
 UPSTREAM = {"depth": 0.206, "offset": 0.0209, "opacity": 0.200, "scale": 0.000596, "rotation": 0.196, "color": 0.968}
 
 
-def autoreconstructor(channels: tuple[int, ...], groups: int, layers: int = 2) -> nn.Module:
+def autoreconstructor(channels: tuple[int, ...], groups: int) -> nn.Module:
     encoder = Encoder(channels, 1, 4, groups)
-    return VariationalAutoReconstructor(encoder, Reconstructor(Parameterization(layers), channels, 1, 4, groups))
+    return VariationalAutoReconstructor(encoder, Reconstructor(Parameterization(2), channels, 1, 4, groups))
 
 
 NETWORKS = {
     "tiny": lambda: autoreconstructor((16, 16, 64, 128), 8),
-    "small, 3 layers": lambda: autoreconstructor((24, 48, 96), 8, layers=3),
     "Stable Diffusion's blocks": lambda: autoreconstructor((128, 256, 512, 512), 32),
-    "Splatter Image, tiny": lambda: SplatterImageUNet(Parameterization(1), (32, 48, 64, 112), (2,), 1, norm_groups=8),
     "Splatter Image": lambda: SplatterImageUNet(Parameterization(1), layers_per_block=1),
 }
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_raw_values_start_as_far_apart_as_splatter_images(network):
-    seeds = 2 if network in ("Stable Diffusion's blocks", "Splatter Image") else 12
+    seeds = 12 if network == "tiny" else 2
     deviations = dict.fromkeys(GROUPS, 0.0)
     outside = 0.0
     for seed in range(seeds):
@@ -123,7 +121,7 @@ def test_raw_values_start_as_far_apart_as_splatter_images(network):
     assert outside < 0.15  # 0.08 there, 0.7 with its gains on one convolution
 
 
-def test_gaussians_start_as_large_as_the_parameterization_says():
+def test_gaussians_start_with_the_scale_of_the_parameterization():
     reconstructor = Reconstructor(Parameterization(2, first_scale=0.06), (16, 32), 1, 4, 8)
     scales = reconstructor(torch.randn(2, 4, 4, 4), [torch.zeros(2, 16, 8, 8)]).split()["scale"].exp()
     torch.testing.assert_close(scales, torch.full_like(scales, 0.06), rtol=0.02, atol=0)

@@ -3,9 +3,9 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Literal, TypedDict
 
-from completesplat.benchmarks.printing import device_of, print_results
+from completesplat.benchmarks.measuring import Row, device_name, print_results
 from completesplat.commands.protocol import write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, table
@@ -29,41 +29,26 @@ def run(
     Raises:
         CompleteSplatError: `measured` is not a result of `bench paper`, or has no training steps.
     """
-    results = _read(Path(measured))
-    rows = bill(results["rows"], trainings, gpus)
+    try:
+        results = json.loads(Path(measured).read_text())
+        machine, work, steps = results["machine"], results["workload"], results["rows"]
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise CompleteSplatError(f"measured={measured}: no result of bench paper ({error!r})") from error
+    rows: list[Row] = [
+        {"training": name, "steps": training["steps"], "way": step["way"], "ms": step["ms"]}
+        | {key: step[key] for key in ("memory_mb",) if key in step}
+        | {f"days_{count}": training["steps"] * step["ms"] / count / DAY_MS for count in gpus}
+        for name, training in trainings.items()
+        for step in steps
+        if step["name"] == training["step"] and "ms" in step
+    ]
     if not rows:
         raise CompleteSplatError(f"{measured} has no training steps: bench paper measures them with training=true")
-    write_json(out / "cost.json", {"machine": results["machine"], "workload": results["workload"], "rows": rows})
+    write_json(out / "cost.json", {"machine": machine, "workload": work, "rows": rows})
     columns: list[Column] = [("training", "training", ""), ("steps", "steps", ",d"), ("", "way", "")]
     columns += [("ms a step", "ms", ",.0f"), ("memory\nMB", "memory_mb", ",.0f")]
     columns += [(f"days on {count}", f"days_{count}", ",.1f") for count in gpus]
-    work = results["workload"]
     title = f"{work['image_size']} x {work['image_size']} pixels, {work['batch']} scenes a step, on {work['device']}"
-    print_results(results, device_of(results), [table(title, columns, rows)], width=140)
-    print("Several divide the scenes of a step without loss: no less time than this. Reading data, validation and")
+    print_results(machine, device_name(machine, work["device"]), [table(title, columns, rows)])
+    print("At least this long: GPUs divide the scenes of a step without loss; reading data, validation and")
     print("checkpoints are not counted.")
-
-
-def bill(
-    rows: Sequence[Mapping[str, Any]], trainings: Mapping[str, WholeTraining], gpus: Sequence[int]
-) -> list[dict[str, Any]]:
-    """Return a row for each training and each way in which its step was measured."""
-    return [
-        {"training": name, "steps": training["steps"], "way": row["way"], "ms": row["ms"]}
-        | {key: row[key] for key in ("memory_mb",) if key in row}
-        | {f"days_{count}": training["steps"] * row["ms"] / count / DAY_MS for count in gpus}
-        for name, training in trainings.items()
-        for row in rows
-        if row["name"] == training["step"] and "ms" in row
-    ]
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        results: dict[str, Any] = json.loads(path.read_text())
-        missing = {"machine", "workload", "rows"} - results.keys()
-    except (OSError, ValueError, AttributeError) as error:
-        raise CompleteSplatError(f"measured={path}: no result of bench paper ({type(error).__name__})") from error
-    if missing:
-        raise CompleteSplatError(f"measured={path}: no result of bench paper (no {', '.join(sorted(missing))})")
-    return results

@@ -8,7 +8,7 @@ for the pairs of Gaussians and pixels, and nerfacc for the weights along rays.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
 
 import torch
 from jaxtyping import Float, Int, Integer
@@ -39,7 +39,7 @@ class GsplatTorchRasterizer:
             from gsplat.cuda import _torch_impl
         except ImportError as error:
             raise CompleteSplatError("gsplat is not installed: pip install gsplat==1.5.3") from error
-        self.gsplat: Any = _torch_impl
+        self.gsplat: ModuleType = _torch_impl
         self.constants = constants or RenderingConstants()
         if self.constants.frustum_margin != FRUSTUM_MARGIN:
             raise CompleteSplatError(f"gsplat's torch implementation has a frustum_margin of {FRUSTUM_MARGIN} only")

@@ -1,23 +1,21 @@
-"""`completesplat bench startup`: time to the first scene from a cold start, and the imports that it waits for."""
+"""`completesplat bench startup`: time to the first scene from a cold start."""
 
 import json
 import os
-import re
 import statistics
 import subprocess
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from PIL import Image
 from rich.console import Console
 
-from completesplat.benchmarks.printing import print_results
+from completesplat.benchmarks.measuring import Row, print_results
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.results.machine import machine
@@ -43,11 +41,8 @@ print(json.dumps([time.process_time() - start[0], time.perf_counter() - start[1]
 """
 # The working folder may hold another version of the package.
 SETTINGS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONSAFEPATH": "1"}
-IMPORTED = re.compile(r"import time: +(\d+) \| +\d+ \| ( *)(\S+)")
-PROCESSES: list[Column] = [("", "what", ""), ("processor\ns", "cpu_seconds", ".2f"), ("wall\ns", "wall_seconds", ".2f")]
+PROCESSES: list[Column] = [("", "what", ""), ("CPU time\ns", "cpu_seconds", ".2f"), ("wall\ns", "wall_seconds", ".2f")]
 PROCESSES += [("times\nimport torch", "times_torch", ".1f")]
-IMPORTS: list[Column] = [("package", "package", ""), ("its own\nms", "own_ms", ",.0f")]
-IMPORTS += [("with what it\nimports, ms", "ms", ",.0f")]
 
 
 class Seconds(NamedTuple):
@@ -57,21 +52,12 @@ class Seconds(NamedTuple):
     wall: float
 
 
-class ImportedModule(NamedTuple):
-    """Module that a process imported: its own seconds, and the packages within which it was imported."""
-
-    name: str
-    seconds: float
-    within: frozenset[str]
-
-
-def run(weights: str, repeats: Positive, packages: Positive, against: str | None, out: Path) -> None:
-    """Time whole processes in turn, list their imports, write `startup.json`, and print both tables.
+def run(weights: str, repeats: Positive, against: str | None, out: Path) -> None:
+    """Time whole processes in turn, write `startup.json`, and print a table.
 
     Args:
         weights: draw one sample, without a video.
         repeats: number of timed processes of each kind, after an untimed one; the median counts.
-        packages: number of packages that are listed, the most costly first.
         against: a folder with another version of the package, which is measured in turn.
 
     Raises:
@@ -80,27 +66,23 @@ def run(weights: str, repeats: Positive, packages: Positive, against: str | None
     if against is not None and not (Path(against) / PACKAGE / "cli.py").is_file():
         raise CompleteSplatError(f"against={against}: no {PACKAGE}/ here, of another version")
     with TemporaryDirectory(prefix="bench_startup_") as folder:
-        picture = Path(folder) / "picture.png"
-        Image.new("RGB", (64, 64), "grey").save(picture)  # its content does not change the work
+        image = Path(folder) / "image.png"
+        Image.new("RGB", (64, 64), "grey").save(image)  # its content does not change the work
         shared = [f"weights={weights}", f"out={folder}/out"]
-        programs = {PREDICT: ["predict", str(picture), "samples=1", "video=[]", *shared], VIEW: ["view", *shared]}
+        programs = {PREDICT: ["predict", str(image), "samples=1", "video=[]", *shared], VIEW: ["view", *shared]}
         if find_spec("viser") is None:
             del programs[VIEW]
         times = timed(programs, repeats, None if against is None else Path(against).resolve())
-        modules = imported_by(["-m", PACKAGE, *programs[PREDICT]])
-        torch_modules = imported_by(["-c", "import torch"])
-    rows: list[dict[str, Any]] = [
+    rows: list[Row] = [
         {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / times[TORCH].cpu}
         for name, x in times.items()
     ]
-    beyond = costs(modules, {module.name for module in torch_modules})[:packages]
-    results: dict[str, Any] = {"machine": machine(), "commit": git_commit(), "rows": rows, "imports": beyond}
-    write_json(out / "startup.json", results)
-    tables = [table("One sample, without a video, from a cold start", PROCESSES, rows)]
-    tables += [table("Imports beyond those of torch, in one process", IMPORTS, beyond)]
-    print_results(results, results["machine"]["processor"], tables)
+    described = machine()
+    write_json(out / "startup.json", {"machine": described, "commit": git_commit(), "rows": rows})
+    title = "One sample, without a video, from a cold start"
+    print_results(described, described["processor"], [table(title, PROCESSES, rows)])
     starting = (times[PREDICT].cpu - times[AGAIN].cpu) / times[TORCH].cpu
-    print(f"predict without what it takes once more: {starting:.1f} times import torch, by the processor's time")
+    print(f"predict without what it takes once more: {starting:.1f} times import torch, in CPU time")
 
 
 def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | None) -> dict[str, Seconds]:
@@ -122,7 +104,7 @@ def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | N
             for name, (arguments, package) in kinds.items():
                 status.update(f"{name}: {number} of {repeats}")
                 before, start = os.times(), time.perf_counter()
-                printed = _run(arguments, package, first_line=name.startswith(VIEW)).stdout
+                printed = _run(arguments, package, first_line=name.startswith(VIEW))
                 after, wall = os.times(), time.perf_counter() - start
                 cpu = after.children_user - before.children_user + after.children_system - before.children_system
                 seconds = Seconds(cpu, wall) if name != AGAIN else Seconds(*json.loads(printed.splitlines()[-1]))
@@ -130,52 +112,22 @@ def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | N
     return {name: Seconds(*map(statistics.median, zip(*taken[name], strict=True))) for name in kinds}
 
 
-def imported_by(arguments: Sequence[str]) -> list[ImportedModule]:
-    """Return a Python process's imports (`-X importtime` lists a module after those that it imports)."""
-    modules: list[ImportedModule] = []
-    above: list[str] = []
-    for line in reversed(_run(["-X", "importtime", *arguments], None).stderr.splitlines()):
-        if (match := IMPORTED.match(line)) is None:
-            continue
-        depth, name = len(match[2]) // 2, match[3]
-        above[depth:] = [name.partition(".")[0]]
-        modules.append(ImportedModule(name, int(match[1]) / 1e6, frozenset(above)))
-    return modules
-
-
-def costs(modules: Sequence[ImportedModule], known: set[str]) -> list[dict[str, Any]]:
-    """Return, for each package, the time of its own modules and of all that it imports, without known modules.
-
-    This project's package has only its own modules, because everything is imported within it.
-    """
-    own: dict[str, float] = defaultdict(float)
-    total: dict[str, float] = defaultdict(float)
-    for module in modules:
-        if module.name not in known:
-            package = module.name.partition(".")[0]
-            own[package] += 1000 * module.seconds
-            for outer in module.within - ({PACKAGE} - {package}):
-                total[outer] += 1000 * module.seconds
-    most_first = sorted(total, key=lambda name: -total[name])
-    return [{"package": name, "own_ms": own[name], "ms": total[name]} for name in most_first]
-
-
-def _run(arguments: Sequence[str], package: Path | None, first_line: bool = False) -> subprocess.CompletedProcess[str]:
-    """Run Python with this process's package or that of a folder, until its end or its first line of output.
+def _run(arguments: Sequence[str], package: Path | None, first_line: bool = False) -> str:
+    """Return the output of Python with this process's package or that of a folder, until its end or its first line.
 
     Raises:
         CompleteSplatError: the process fails.
     """
     folder = Path(__file__).parents[2] if package is None else package
-    environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(folder)}
-    pipe = subprocess.PIPE
-    program = [sys.executable, *arguments]
-    with subprocess.Popen(program, env=environment, stdout=pipe, stderr=pipe, text=True) as process:
-        begun = process.stdout.readline() if first_line and process.stdout is not None else ""
-        if begun:
+    environment, pipe = {**os.environ, **SETTINGS, "PYTHONPATH": str(folder)}, subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, *arguments], env=environment, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        line = process.stdout.readline() if first_line and process.stdout is not None else ""
+        if line:
             process.kill()
-        printed, complaint = process.communicate()
-    if process.returncode and not begun:
-        last = (complaint.strip().splitlines() or ["it says nothing"])[-1]
+        printed, errors = process.communicate()
+    if process.returncode and not line:
+        last = (errors.strip().splitlines() or ["no message"])[-1]
         raise CompleteSplatError(f"a process that was timed has failed: {last}")
-    return subprocess.CompletedProcess(program, 0, begun + printed, complaint)
+    return line + printed

@@ -1,23 +1,54 @@
-"""Share of the rasterizer in a training step of the reconstruction model."""
+"""Optimizer steps of both stages, and the rasterizer's share of a step of the reconstruction model."""
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from lightning import Callback, LightningModule, Trainer
+from hydra.utils import instantiate
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
 
+from completesplat.benchmarks.measuring import Row
 from completesplat.benchmarks.workloads import DISTANCE, Backend, orbit
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer, Rendering
-from completesplat.scene import SceneBatch, Views
+from completesplat.scene import CachedScene, SceneBatch, Views
+from completesplat.training.stage import Stage
 
 UNTIMED_STEPS, TIMED_STEPS = 3, 15
 SLOW = {"gsplat_torch": (1, 3)}  # untimed and timed steps; the other slow backends would take minutes
+MAXIMAL_NORM = 1.0  # of gradients, as in conf/trainer
+
+
+class Training:
+    """Optimizer steps of either stage as in a run, without its logging; `module` is on its device.
+
+    `precision` is in Lightning's notation: "bf16-mixed" computes the networks in bfloat16.
+    """
+
+    def __init__(self, module: Stage, precision: str) -> None:
+        self.module = module.train()
+        self.precision = precision
+        for logs in ("log_loss", "log_step"):  # there is no trainer to log with
+            setattr(module, logs, lambda *_, **__: None)
+        self.optimizer = module.optimizer([p for p in module.parameters() if p.requires_grad])
+
+    def step(self, batch: SceneBatch | CachedScene) -> None:
+        """Do one optimizer step on a batch of scenes or of their latents."""
+        module = self.module
+        with autocast(module.device, self.precision):
+            loss: Tensor = module.training_step(batch.to(module.device), 0)  # type: ignore[assignment]
+        self.optimizer.zero_grad()
+        torch.autograd.backward([loss])
+        torch.nn.utils.clip_grad_norm_(module.parameters(), MAXIMAL_NORM)
+        self.optimizer.step()
+
+
+def autocast(device: torch.device, precision: str) -> torch.autocast:
+    """Return the context in which Lightning computes with this precision."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
 
 
 class StopWatch:
@@ -42,19 +73,6 @@ class StopWatch:
         self.seconds += time.perf_counter()
 
 
-class Repeated(Dataset[Any]):
-    """Data set of the same item, `count` times."""
-
-    def __init__(self, item: Any, count: int) -> None:
-        self.item, self.count = item, count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> Any:
-        return self.item
-
-
 class _OnBackward(torch.autograd.Function):
     """Identity that calls a function when the tensors' gradients pass in the backward pass."""
 
@@ -65,63 +83,37 @@ class _OnBackward(torch.autograd.Function):
         return tuple(tensor.view_as(tensor) for tensor in tensors)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         ctx.function()
         return None, *gradients
 
 
-class _StepTimes(Callback):
-    def __init__(self, watch: StopWatch) -> None:
-        self.watch = watch
-        self.steps: list[tuple[float, float]] = []  # seconds in total and in the rasterizer
-
-    def on_train_batch_start(self, trainer: Trainer, module: LightningModule, batch: Any, index: int) -> None:
-        self.started, self.watch.seconds = time.perf_counter(), 0.0
-
-    def on_train_batch_end(
-        self, trainer: Trainer, module: LightningModule, outputs: Any, batch: Any, index: int
-    ) -> None:
-        self.steps.append((time.perf_counter() - self.started, self.watch.seconds))
-
-
-def share(
-    backend: Backend, make_module: Callable[[Rasterizer], LightningModule], size: int, batch: int, targets: int,
-    precision: str,
-) -> dict[str, Any]:  # fmt: skip
+def share(backend: Backend, model: Mapping[str, object], size: int, batch: int, targets: int, precision: str) -> Row:
     """Return medians over optimizer steps on one synthetic batch, on the CPU.
 
     Args:
-        make_module: makes the LightningModule with a rasterizer.
+        model: config of the module, without its rasterizer.
         size: side of the images in pixels.
         batch, targets: number of scenes in a batch, and of target views of each.
         precision: precision in Lightning's notation.
     """
-    watch = StopWatch(backend.rasterizer)
-    times = _StepTimes(watch)
+    watch, scenes = StopWatch(backend.rasterizer), synthetic_batch(size, batch, targets)
+    training = Training(instantiate(model, rasterizer=watch, _convert_="all"), precision)
     untimed, timed = SLOW.get(backend.name, (UNTIMED_STEPS, TIMED_STEPS))
-    trainer = Trainer(
-        max_steps=untimed + timed,
-        precision=precision,  # type: ignore[arg-type]
-        gradient_clip_val=1.0,
-        accelerator="cpu",
-        devices=1,
-        callbacks=[times],
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
-    batches = Repeated(synthetic_batch(size, batch, targets), untimed + timed)
-    trainer.fit(make_module(watch), DataLoader(batches, batch_size=None))
-    steps = times.steps[untimed:]
+    steps, inside = [], []
+    for _ in range(untimed + timed):
+        watch.seconds, start = 0.0, time.perf_counter()
+        training.step(scenes)
+        steps.append(time.perf_counter() - start)
+        inside.append(watch.seconds)
     return {
         "backend": backend.name,
         "size": size,
         "batch": batch,
         "views": 1 + targets,
-        "step_ms": statistics.median(step for step, _ in steps) * 1e3,
-        "rasterizer_ms": statistics.median(inside for _, inside in steps) * 1e3,
-        "share": statistics.median(inside / step for step, inside in steps),
+        "step_ms": statistics.median(steps[untimed:]) * 1e3,
+        "rasterizer_ms": statistics.median(inside[untimed:]) * 1e3,
+        "share": statistics.median(a / b for a, b in zip(inside[untimed:], steps[untimed:], strict=True)),
     }
 
 
@@ -133,6 +125,5 @@ def synthetic_batch(size: int, batch: int, targets: int) -> SceneBatch:
     images = torch.rand(batch, 1 + targets, 3, size, size, generator=generator)
     views = Views(images, cameras, torch.ones_like(images[:, :, :1]))
     depth_range = torch.tensor([0.5 * DISTANCE, 2 * DISTANCE]).expand(batch, 2)
-    names = tuple("synthetic" for _ in range(batch))
     frames = torch.zeros(batch, dtype=torch.int64)
-    return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], frames, names)
+    return SceneBatch(views[:, 0], views[:, 1:], depth_range, views.masks[:, 0], frames, ("synthetic",) * batch)

@@ -115,15 +115,15 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
     if model is not None and config.image is not None:
         photograph = model.read(Path(config.image), config.fov, remove)
     cameras = None if config.get("data") is None else data_cameras(config.data)
-    stage = SplatView(server, up, cameras)
-    stage.show(samples)
+    splats = SplatView(server, up, cameras)
+    splats.show(samples)
     rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
-    saver = Saver(out, stage, rasterizer, config.frames, background)
+    saver = Saver(out, splats, rasterizer, config.frames, background)
     if model is None:
-        page = Page(server, stage, saver, max(sample.layers for sample in samples))
+        page = Page(server, splats, saver, max(sample.layers for sample in samples))
         page.show(samples, step_of(samples) if config.watch is not None else "")
         return page
-    page = Page(server, stage, saver, model.parameterization.layers)
+    page = Page(server, splats, saver, model.parameterization.layers)
     steps = model.default_steps if config.steps is None else config.steps
     start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
     completion = Completion(page, model, start)
@@ -161,7 +161,7 @@ def show_newest(page: Any, run: Path) -> None:
     """Show the scenes that the run has written since the page was last drawn, if any."""
     from completesplat.viewer.sample import read_newest
 
-    steps = {sample.settings["step"] for sample in page.stage.samples}
+    steps = {sample.settings["step"] for sample in page.view.samples}
     try:
         step, samples, _ = read_newest(run / NEWEST)
     except CompleteSplatError:
@@ -201,6 +201,6 @@ def export(page: Any, path: Path) -> None:
     from completesplat.viewer.page import write_page
 
     page.worker.wait()
-    if not page.stage.samples:
+    if not page.view.samples:
         raise CompleteSplatError("there is nothing to export: give a scene, or a picture and weights")
     print(write_page(page.server, path))

@@ -1,5 +1,6 @@
 """Fast CPU backend: compiled kernels with a hand-written backward pass, float32."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,8 @@ class TiledRasterizer:
             return self(gaussians.to("cpu"), cameras.to("cpu")).to(gaussians.means.device)
         _check(gaussians, cameras)
         tensors = (*vars(gaussians).values(), cameras.world_to_camera, cameras.intrinsics)
-        return Rendering(*_Rasterize.apply(*tensors, cameras.image_size, self.constants))  # type: ignore[no-untyped-call]
+        images = _Rasterize.apply(cameras.image_size, self.constants, *tensors)  # type: ignore[no-untyped-call]
+        return Rendering(*images)
 
 
 def _check(gaussians: Gaussians, cameras: Cameras) -> None:
@@ -85,18 +87,18 @@ def unpack_camera_gradients(packed: np.ndarray) -> tuple[Tensor, Tensor]:
 
 
 class _Rasterize(torch.autograd.Function):
-    """Map (means, quaternions, scales, opacities, colors, world_to_camera, intrinsics, size, constants) to images."""
+    """Map (size, constants, means, quaternions, scales, opacities, colors, world_to_camera, intrinsics) to images."""
 
     @staticmethod
-    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
-        tensors = [tensor.detach().contiguous() for tensor in arguments[:5]]
-        image_size, constants = arguments[7:]
-        cameras = pack_cameras(Cameras(arguments[5], arguments[6], image_size), constants.frustum_margin)
-        keep = any(ctx.needs_input_grad)
-        drawing = Drawing(_arrays(Parameters, tensors), cameras, image_size, constants, keep)
+    def forward(
+        ctx: Any, image_size: tuple[int, int], constants: RenderingConstants, *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        parameters = Parameters(*_arrays([tensor.detach().contiguous() for tensor in tensors[:5]]))
+        cameras = pack_cameras(Cameras(tensors[5], tensors[6], image_size), constants.frustum_margin)
+        drawing = Drawing(parameters, cameras, image_size, constants, keep=any(ctx.needs_input_grad))
         images = tuple(torch.from_numpy(image) for image in drawing.draw())
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*arguments[:7], *images)
+        ctx.save_for_backward(*tensors, *images)
         ctx.drawing = drawing
         return images
 
@@ -109,11 +111,11 @@ class _Rasterize(torch.autograd.Function):
             torch.from_numpy(np.zeros(image.shape, np.float32)) if gradient is None else gradient.contiguous()
             for image, gradient in zip(images, image_gradients, strict=True)
         ]
-        to_cameras = any(ctx.needs_input_grad[5:7])
-        gradients, of_cameras = ctx.drawing.backward(_arrays(Images, images), _arrays(Images, filled), to_cameras)
+        arrays, to_cameras = (Images(*_arrays(tensors)) for tensors in (images, filled)), any(ctx.needs_input_grad[7:])
+        gradients, of_cameras = ctx.drawing.backward(*arrays, to_cameras)
         matrices = (None, None) if of_cameras is None else unpack_camera_gradients(of_cameras)
-        return *(torch.from_numpy(gradient) for gradient in gradients), *matrices, None, None
+        return None, None, *(torch.from_numpy(gradient) for gradient in gradients), *matrices
 
 
-def _arrays(kind: Any, tensors: Any) -> Any:
-    return kind(*(tensor.detach().numpy() for tensor in tensors))
+def _arrays(tensors: Sequence[Tensor]) -> list[np.ndarray]:
+    return [tensor.detach().numpy() for tensor in tensors]

@@ -40,13 +40,13 @@ class Completion:
         self.photograph = name, photograph
         label = f"{name}, field of view {photograph.fov_degrees:.0f}° ({photograph.fov_source})"
         self.controls.preview.content = preview_of(to_bytes(photograph.image), label)
-        self.page.stage.forget_view()
+        self.page.view.forget_view()
         self.request(client)
 
     def request(self, client: viser.ClientHandle | None = None) -> None:
         """Queue a drawing with the present settings."""
         if self.photograph is None:
-            return self.page.tell(CompleteSplatError("load a picture first"), client)
+            return self.page.tell(CompleteSplatError("load an image first"), client)
         settings = {name: getattr(self.controls, name).value for name in SLIDERS}
         job = partial(self._draw, *self.photograph, settings, client)
         self.page.worker.submit("draw", job)
@@ -74,7 +74,7 @@ class Completion:
         """Draw samples in the worker's thread, and show them while they form."""
         began = time.monotonic()
         progress, forming = self.controls.progress, self.controls.forming.value
-        earlier = [sample for sample in self.page.stage.samples if sample.finished] if self.controls.keep.value else []
+        earlier = [sample for sample in self.page.view.samples if sample.finished] if self.controls.keep.value else []
         layers = self.model.parameterization.layers
         reference, last_shown = self.model.camera(photograph), 0.0
 

@@ -19,7 +19,7 @@ from completesplat.files import write_text
 from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import Rasterizer
 from completesplat.viewer.access import GuardedServer, stop_server, with_head
-from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Picture, add_looking, add_saving, thumbnail_row
+from completesplat.viewer.panel import SIDE_BY_SIDE, VIDEO, Pixels, add_looking, add_saving, thumbnail_row
 from completesplat.viewer.sample import Sample
 from completesplat.viewer.splat_view import SplatView
 
@@ -79,7 +79,7 @@ class Worker:
                 try:
                     self._failed(error)
                 except Exception:
-                    log.exception("the viewer could not say what failed")
+                    log.exception("the viewer could not show an error")
 
 
 class Saver:
@@ -89,9 +89,9 @@ class Saver:
     """
 
     def __init__(
-        self, folder: Path, stage: SplatView, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
+        self, folder: Path, view: SplatView, make_rasterizer: Callable[[], Rasterizer], frames: int, background: float
     ) -> None:
-        self.folder, self.stage, self.frames, self.background = folder, stage, frames, background
+        self.folder, self.view, self.frames, self.background = folder, view, frames, background
         self.rasterizer = cache(make_rasterizer)
         self._converter = cache(find_splat_transform)
 
@@ -105,10 +105,10 @@ class Saver:
             raise CompleteSplatError("there is nothing to save yet: draw samples first")
         self.folder.mkdir(parents=True, exist_ok=True)
         if kind == "html":
-            return [write_page(self.stage.server, self._next("page", ".html"))]
+            return [write_page(self.view.server, self._next("page", ".html"))]
         return [self._video(sample) if kind == VIDEO else self._scene(kind, sample) for sample in samples]
 
-    def picture(self, sample: Sample, size: int) -> Picture:
+    def thumbnail(self, sample: Sample, size: int) -> Pixels:
         """Render a sample from its reference camera, with `size` px on the longer side."""
         camera, scene = sample.reference, sample.for_viewers()
         factor = size / max(camera.image_size)
@@ -123,15 +123,15 @@ class Saver:
         path = self._next("sample", f".{kind}")
         comments = [f"{name} {value}" for name, value in sample.settings.items()]
         converter = self._converter() if kind in CONVERTED else None
-        view = PageView(sample.reference, sample.pivot(), torch.tensor(self.stage.up), self.background)
-        write_formats(self.folder, path.stem, sample.for_viewers(), [kind], view, converter, comments)
+        front = PageView(sample.reference, sample.pivot(), torch.tensor(self.view.up), self.background)
+        write_formats(self.folder, path.stem, sample.for_viewers(), [kind], front, converter, comments)
         return path
 
     def _video(self, sample: Sample) -> Path:
         """Write a video of a full turn about a sample."""
         path = self._next("orbit", ".mp4")
         camera = sample.reference
-        up = camera.intrinsics.new_tensor(self.stage.up.tolist())
+        up = camera.intrinsics.new_tensor(self.view.up.tolist())
         scene, pivot = sample.gaussians, sample.pivot()
         frames, _ = orbit_views(self.rasterizer(), scene, camera, pivot, self.frames, self.background, up)
         write_video(path, frames)
@@ -145,20 +145,20 @@ class Saver:
 class Page:
     """Controls and scene of one server, with switches for `layers`. Slow work is done by the worker."""
 
-    def __init__(self, server: GuardedServer, stage: SplatView, saver: Saver, layers: int) -> None:
-        self.server, self.stage, self.saver = server, stage, saver
+    def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, layers: int) -> None:
+        self.server, self.view, self.saver = server, view, saver
         self.worker = Worker(self.tell)
         self.status = server.gui.add_markdown("", order=0)
-        self.looking = add_looking(server.gui, layers, stage.data_cameras is not None)
+        self.looking = add_looking(server.gui, layers, view.data_cameras is not None)
         self._connect_looking()
         self.saving = add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)
-        self._pictures: list[Picture] = []
-        self.show(stage.samples)
+        self._thumbnails: list[Pixels] = []
+        self.show(view.samples)
 
     def show(self, samples: Sequence[Sample], status: str = "") -> None:
         """Show samples in all browsers, and their thumbnails when all of them are finished."""
-        self.stage.show(samples)
+        self.view.show(samples)
         options = (*(f"sample {i + 1}" for i in range(max(1, len(samples)))), SIDE_BY_SIDE)
         if self.looking.chosen.options != options:
             self.looking.chosen.options = options
@@ -169,11 +169,11 @@ class Page:
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
         """Render thumbnails in the worker's thread; a single sample needs none."""
         few = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
-        self._pictures = [self.saver.picture(sample, THUMBNAIL) for sample in few]
+        self._thumbnails = [self.saver.thumbnail(sample, THUMBNAIL) for sample in few]
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:
-        row = thumbnail_row(self._pictures, self.stage.chosen) if self._pictures else ""
+        row = thumbnail_row(self._thumbnails, self.view.chosen) if self._thumbnails else ""
         if self.looking.thumbnails.content != row:
             self.looking.thumbnails.content = row
 
@@ -192,15 +192,15 @@ class Page:
         stop_server(self.server)
 
     def _connect_looking(self) -> None:
-        looking, stage = self.looking, self.stage
+        looking, view = self.looking, self.view
 
         def changed(_: viser.GuiEvent[Any]) -> None:
             index, last = looking.chosen.options.index(looking.chosen.value), len(looking.chosen.options) - 1
-            stage.chosen = None if index == last else index
-            stage.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
-            stage.depth = looking.depth.value
-            stage.cameras = {name for name, box in looking.cameras.items() if box.value}
-            stage.refresh()
+            view.chosen = None if index == last else index
+            view.hidden_layers = {i for i, layer in enumerate(looking.layers) if not layer.value}
+            view.depth = looking.depth.value
+            view.cameras = {name for name, box in looking.cameras.items() if box.value}
+            view.refresh()
             self._mark_thumbnail()
 
         def pressed(index: int, _: viser.CommandEvent) -> None:
@@ -212,7 +212,7 @@ class Page:
         looking.chosen.on_update(changed)
         for box in (*looking.layers, looking.depth, *looking.cameras.values()):
             box.on_update(changed)
-        looking.front.on_click(lambda event: stage.look_from_the_front(event.client))
+        looking.front.on_click(lambda event: view.look_from_the_front(event.client))
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         client, kind = event.client, self.saving.kind.value
@@ -221,7 +221,7 @@ class Page:
 
         def save() -> None:
             try:
-                files = self.saver.save(kind, self.stage.shown)
+                files = self.saver.save(kind, self.view.shown)
             except CompleteSplatError as error:
                 return self.tell(error, client)
             for file in files:

@@ -21,14 +21,14 @@ from completesplat.scene_model import SceneModel
 MOST_SAMPLES, MOST_STEPS, MOST_SEED = 8, 100, 99
 SLIDERS = ("samples", "skip_weight", "guidance_weight", "steps", "seed")  # settings of `CompleteSplat`
 SIDE_BY_SIDE = "all, side by side"
-CUT_OUT = "of the next pictures: only the object, before what the weights know (needs completesplat[background])"
+CUT_OUT = "of the next images: only the object, before what the weights know (needs completesplat[background])"
 KEYS = 9  # keys 1 to 9 choose a sample; 0 shows all
-ONE_ANSWER = "One answer for each picture: these weights draw no samples."
+ONE_ANSWER = "One answer for each image: these weights draw no samples."
 VIDEO = "video"
 # Simulates a press of the number's key, which the page hears everywhere, because viser's HTML has no callbacks.
 CHOOSE = "this.dispatchEvent(new KeyboardEvent('keydown',{{key:'{0}',code:'Digit{0}',bubbles:true}}))"
 
-Picture = UInt8[np.ndarray, "_ _ 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]
 
 
 def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> SimpleNamespace:
@@ -40,7 +40,7 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
     if isinstance(model, CompleteSplat):
         most_steps, first_steps = possible_steps(model.sampler)[-1], nearest_steps(model.sampler, start["steps"])
     with gui.add_folder("Photograph", order=1):
-        upload = gui.add_upload_button("Load a picture", mime_type="image/*", hint="completes the scene that it shows")
+        upload = gui.add_upload_button("Load an image", mime_type="image/*", hint="completes the scene that it shows")
         preview = gui.add_html("")
         remove = gui.add_checkbox("Cut the object out", start["remove_background"], hint=CUT_OUT)
     with gui.add_folder("Completion", order=2):
@@ -93,30 +93,30 @@ def add_saving(gui: viser.GuiApi, formats: Sequence[str]) -> SimpleNamespace:
         return SimpleNamespace(kind=kind, save=gui.add_button("Save what is shown"))
 
 
-def thumbnail_row(pictures: Sequence[Picture], chosen: int | None) -> str:
+def thumbnail_row(images: Sequence[Pixels], chosen: int | None) -> str:
     """Return HTML with numbered images of samples; a click on one of the first nine chooses it."""
     cells = []
-    for i, picture in enumerate(pictures):
+    for i, image in enumerate(images):
         line = "#228be6" if i == chosen else "transparent"
         press = f' onclick="{CHOOSE.format(i + 1)}"' if i < KEYS else ""
         style = f"width:100%;display:block;border:2px solid {line};cursor:pointer"
-        cells.append(f'<div><img src="{_source(picture)}" alt="sample {i + 1}" style="{style}"{press}>{i + 1}</div>')
+        cells.append(f'<div><img src="{_source(image)}" alt="sample {i + 1}" style="{style}"{press}>{i + 1}</div>')
     style = (
         "display:grid;grid-template-columns:repeat(4,1fr);gap:4px;padding:0 12px 8px;font-size:12px;text-align:center"
     )
     return f'<div style="{style}">{"".join(cells)}</div>'
 
 
-def preview_of(picture: Picture, label: str) -> str:
+def preview_of(image: Pixels, label: str) -> str:
     """Return HTML with a line of any text above the image that is completed."""
     style = "padding:0 8px 8px;font-size:14px"
-    return f'<div style="{style}">{escape(label)}<img src="{_source(picture)}" alt="" style="display:block"></div>'
+    return f'<div style="{style}">{escape(label)}<img src="{_source(image)}" alt="" style="display:block"></div>'
 
 
-def _source(picture: Picture) -> str:
+def _source(image: Pixels) -> str:
     """Return an image as a data URL, because viser's own images disappear when the panel is moved."""
     content = io.BytesIO()
-    Image.fromarray(picture).save(content, format="PNG")
+    Image.fromarray(image).save(content, format="PNG")
     return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 

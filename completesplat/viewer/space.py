@@ -33,16 +33,16 @@ FRAME = '<iframe sandbox="allow-scripts" style="flex: 1 1 320px; height: 360px; 
 
 
 def completed(
-    model: SceneModel, rasterizer: Rasterizer, picture: Path, folder: Path, settings: dict[str, Any]
+    model: SceneModel, rasterizer: Rasterizer, image: Path, folder: Path, settings: dict[str, Any]
 ) -> tuple[str, str, list[str]]:
     """Complete an image; return HTML frames of turning scenes, the path of the contact sheet, and those of other files.
 
     Raises:
         CompleteSplatError: the image cannot be read, or the model refuses the settings.
     """
-    photograph = model.read(picture)
+    photograph = model.read(image)
     scenes, camera = model(photograph, **settings), model.camera(photograph)
-    recorded = {**settings, "image": printable(picture.name), "screen_space_dilation": True}
+    recorded = {**settings, "image": printable(image.name), "screen_space_dilation": True}
     write_prediction(folder, photograph.image, scenes, camera, rasterizer, model.up, Wanted(videos=()), recorded)
     frames = []
     for i, scene in enumerate(scenes):
@@ -82,22 +82,22 @@ def make_space(weights: str) -> Any:
     model = CompleteSplat.from_pretrained(weights).to("cuda" if torch.cuda.is_available() else "cpu")
     rasterizer, draws = auto(), model.draws_samples
 
-    def complete(picture: str | None, *values: float) -> Iterator[tuple[str, str, list[str]]]:
-        if picture is None:
-            raise gr.Error("Load a picture first.")
+    def complete(file: str | None, *values: float) -> Iterator[tuple[str, str, list[str]]]:
+        if file is None:
+            raise gr.Error("Load an image first.")
         settings = dict(zip(SETTINGS, values, strict=True)) if draws else {"samples": 1, "seed": 0}
         with TemporaryDirectory() as folder:
             try:
                 # gradio copies the files before it resumes this generator.
-                yield completed(model, rasterizer, Path(picture), Path(folder), settings)
+                yield completed(model, rasterizer, Path(file), Path(folder), settings)
             except CompleteSplatError as error:
-                raise gr.Error(printable(str(error).replace(picture, Path(picture).name))) from error
+                raise gr.Error(printable(str(error).replace(file, Path(file).name))) from error
 
     with gr.Blocks(title="completesplat", analytics_enabled=False, delete_cache=(HOUR, HOUR)) as page:
-        gr.Markdown(f"# completesplat\nOne picture, complete scenes of Gaussian splats; weights: `{weights}`.")
+        gr.Markdown(f"# completesplat\nOne image, complete scenes of Gaussian splats; weights: `{weights}`.")
         with gr.Row():
             # The unchanged file, because its EXIF may contain the field of view.
-            picture = gr.Image(type="filepath", image_mode=None, sources=["upload", "clipboard"], label="Picture")
+            image = gr.Image(type="filepath", image_mode=None, sources=["upload", "clipboard"], label="Image")
             with gr.Column():
                 samples = gr.Slider(1, MOST_SAMPLES, 2, step=1, label="Samples", visible=draws)
                 skips = gr.Slider(0, 1, 1, label="Skip weight (1: most faithful)", visible=draws)
@@ -106,7 +106,7 @@ def make_space(weights: str) -> Any:
                 draw = gr.Button("Complete", variant="primary")
         scenes, sheet = gr.HTML(), gr.Image(label="Around each sample")
         outputs = [scenes, sheet, gr.Files(label="For other programs")]
-        draw.click(complete, [picture, samples, skips, guidance, seed], outputs, api_name="complete")
+        draw.click(complete, [image, samples, skips, guidance, seed], outputs, api_name="complete")
     return page
 
 

@@ -139,7 +139,7 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
     given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
     given += [f"data.root={toy_root}", "data.background=0", "callbacks.pictures=null", "test=false"]
     refused = command("fit", *given, "data.image_size=64", "out=OTHER")
-    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth wants 32\n")
+    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth needs 32\n")
     trained = command("fit", *given, "optimizer.lr=1e-3", "out=RUN")
     assert trained.status == 0, trained.err
     assert {path.name for path in (tmp_path / "RUN/weights").iterdir()} == {

@@ -81,9 +81,9 @@ def test_a_run_is_watched_while_a_process_is_at_work_in_it(tmp_path):
 
 def test_what_a_run_writes_is_shown_when_it_is_new(tmp_path, capsys):
     run, shown = run_in_training(tmp_path / "run"), []
-    stage = SimpleNamespace(samples=newest_scenes(run)[0])
+    view = SimpleNamespace(samples=newest_scenes(run)[0])
     page = SimpleNamespace(
-        stage=stage, show=lambda samples, said: (shown.append(said), setattr(stage, "samples", samples))
+        view=view, show=lambda samples, said: (shown.append(said), setattr(view, "samples", samples))
     )
     show_newest(page, run)
     assert shown == []

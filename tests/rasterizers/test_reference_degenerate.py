@@ -1,10 +1,10 @@
-"""Bad Gaussians: the image and all gradients stay finite, and the healthy rest does not notice them."""
+"""Degenerate Gaussians: the image and all gradients stay finite, and the healthy ones do not change."""
 
 from functools import partial
 
 import pytest
 import torch
-from degenerate_gaussians import DRAWN, NEVER_DRAWN, assert_as_good_as_absent, changed, draw, healthy
+from degenerate_gaussians import DRAWN, NEVER_DRAWN, assert_changes_nothing, changed, draw, healthy
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
@@ -31,7 +31,7 @@ EXTREME = DRAWN | {
 }
 
 
-def one(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
+def degenerate(changes: dict[str, object], dtype: torch.dtype) -> Gaussians:
     return changed(changes).to(dtype)
 
 
@@ -45,24 +45,24 @@ def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_what_cannot_be_drawn_leaves_no_trace(kind: str, dtype: torch.dtype) -> None:
-    assert_as_good_as_absent(ReferenceRasterizer(), one(LEFT_OUT[kind], dtype))
+def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, dtype: torch.dtype) -> None:
+    assert_changes_nothing(ReferenceRasterizer(), degenerate(LEFT_OUT[kind], dtype))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("kind", EXTREME)
 def test_extreme_gaussians_are_drawn_with_finite_values_and_gradients(kind: str, dtype: torch.dtype) -> None:
-    assert_finite(*render_and_differentiate(concatenate([healthy(20).to(dtype), one(EXTREME[kind], dtype)])))
-    assert_finite(*render_and_differentiate(one(EXTREME[kind], dtype)))
+    assert_finite(*render_and_differentiate(concatenate([healthy(20).to(dtype), degenerate(EXTREME[kind], dtype)])))
+    assert_finite(*render_and_differentiate(degenerate(EXTREME[kind], dtype)))
 
 
 def test_the_sign_of_a_scale_and_a_zero_quaternion_have_a_meaning() -> None:
     """Only the squares of scales enter; a zero quaternion is the identity."""
     identity = {"quaternions": (1.0, 0.0, 0.0, 0.0)}
-    image, _ = render_and_differentiate(one(identity, torch.float64))
+    image, _ = render_and_differentiate(degenerate(identity, torch.float64))
     assert image.any()
-    negative, _ = render_and_differentiate(one(identity | {"scales": (-0.2, 0.3, -0.1)}, torch.float64))
-    zero, gradients = render_and_differentiate(one({"quaternions": (0.0, 0.0, 0.0, 0.0)}, torch.float64))
+    negative, _ = render_and_differentiate(degenerate(identity | {"scales": (-0.2, 0.3, -0.1)}, torch.float64))
+    zero, gradients = render_and_differentiate(degenerate({"quaternions": (0.0, 0.0, 0.0, 0.0)}, torch.float64))
     assert torch.equal(negative, image)
     assert torch.equal(zero, image)
     assert not gradients["quaternions"].any()
@@ -90,8 +90,8 @@ def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count:
 def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
     """Equal depths keep their order, and a transmittance that underflows does no harm."""
     colors = [[0.1, 0.2, 0.3], [0.9, 0.8, 0.7]]
-    front, back = (one({"colors": color, "opacities": 0.5}, dtype) for color in colors)
+    front, back = (degenerate({"colors": color, "opacities": 0.5}, dtype) for color in colors)
     image, _ = render_and_differentiate(concatenate([front, back]))
     swapped, _ = render_and_differentiate(concatenate([back, front]))
     assert image[0, 0, 0].max() < swapped[0, 0, 0].max()
-    assert_finite(*render_and_differentiate(concatenate([one({"opacities": 1.0}, dtype)] * 400)))
+    assert_finite(*render_and_differentiate(concatenate([degenerate({"opacities": 1.0}, dtype)] * 400)))

@@ -2,7 +2,6 @@
 
 import logging
 import math
-import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -32,7 +31,7 @@ def _no_gpu_and_no_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class Works(ReferenceRasterizer):
-    """A backend as it should be."""
+    """A working backend."""
 
 
 @pytest.fixture
@@ -45,7 +44,7 @@ def warnings_in(caplog: pytest.LogCaptureFixture) -> str:
 
 
 def test_the_tiled_backend_is_taken_where_there_is_no_gpu(caplog: pytest.LogCaptureFixture) -> None:
-    """That there is none is said, but is nothing to warn of."""
+    """The missing GPU is logged, but not as a warning."""
     constants = RenderingConstants(max_alpha=0.99)
     with caplog.at_level(logging.INFO):
         chosen = selection.auto(constants)
@@ -66,7 +65,7 @@ def test_the_cuda_backend_is_taken_where_it_works(gpu: None, monkeypatch, caplog
     assert warnings_in(caplog) == ""
 
 
-def test_a_gpu_without_gsplat_or_with_constants_that_it_refuses_is_worth_a_warning(gpu: None, monkeypatch, caplog):
+def test_a_gpu_without_gsplat_or_with_refused_constants_gives_a_warning(gpu: None, monkeypatch, caplog):
     pytest.importorskip("gsplat")
     constants = RenderingConstants(max_alpha=0.9)
     chosen = selection.auto(constants)
@@ -79,7 +78,7 @@ def test_a_gpu_without_gsplat_or_with_constants_that_it_refuses_is_worth_a_warni
 
 
 def test_gsplat_is_tried_and_not_only_imported(gpu: None, monkeypatch, caplog) -> None:
-    """It imports where its kernels are not compiled; then its first call fails like this."""
+    """Without compiled kernels gsplat can be imported, and its first call fails like this."""
     gsplat = pytest.importorskip("gsplat")
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
 
@@ -123,7 +122,7 @@ def test_a_gpu_with_gsplat_is_used(gpu: None) -> None:
     assert isinstance(selection.auto(), cuda.CudaRasterizer)
 
 
-def test_where_cuda_is_asked_for_and_does_not_work_the_line_says_what_to_choose():
+def test_a_cuda_rasterizer_that_does_not_work_names_the_alternative():
     with pytest.raises(InstantiationException) as caught:
         instantiate(compose_config("fit", "rasterizer=cuda").rasterizer, _convert_="all")
     line = refusal(caught.value) or ""
@@ -131,10 +130,9 @@ def test_where_cuda_is_asked_for_and_does_not_work_the_line_says_what_to_choose(
     assert line.endswith("; rasterizer=auto takes the fastest one that works here")
 
 
-def test_a_run_that_asked_for_cuda_is_tested_with_what_works(pipeline, tmp_path):
-    run = shutil.copytree(pipeline.var, tmp_path / "run")
-    config = OmegaConf.load(run / "config.yaml")
-    config.model.rasterizer._target_ = compose_config("fit", "rasterizer=cuda").rasterizer._target_
-    OmegaConf.save(config, run / "config.yaml")
-    found = config_of_run(run / "checkpoints/last.ckpt", []).model.rasterizer
-    assert isinstance(instantiate(found, _convert_="all"), TiledRasterizer)
+def test_a_run_that_asked_for_cuda_is_tested_with_a_rasterizer_that_works(tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/last.ckpt").touch()
+    OmegaConf.save(compose_config("fit", "rasterizer=cuda"), tmp_path / "config.yaml", resolve=True)
+    rasterizer = config_of_run(tmp_path / "checkpoints/last.ckpt", []).model.rasterizer
+    assert isinstance(instantiate(rasterizer, _convert_="all"), TiledRasterizer)

@@ -13,7 +13,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.tiled import TiledRasterizer
 
-SEEDS = [*range(50), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(50, 500))]
+SEEDS = [*range(28), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(28, 500))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -56,14 +56,14 @@ def test_cameras_alone_can_be_differentiated() -> None:
     cotangents = cotangents_for(cameras, 4)
     _, expected = render_with_gradients(TiledRasterizer(OTHER_CONSTANTS), gaussians, cameras, cotangents)
     for name in ("world_to_camera", "intrinsics"):
-        one = replace(cameras, **{name: getattr(cameras, name).clone().requires_grad_()})
-        rendering = TiledRasterizer(OTHER_CONSTANTS)(gaussians, one)
-        (gradient,) = torch.autograd.grad(list(vars(rendering).values()), getattr(one, name), cotangents)
+        inputs = replace(cameras, **{name: getattr(cameras, name).clone().requires_grad_()})
+        rendering = TiledRasterizer(OTHER_CONSTANTS)(gaussians, inputs)
+        (gradient,) = torch.autograd.grad(list(vars(rendering).values()), getattr(inputs, name), cotangents)
         assert torch.equal(gradient, expected[name])
         assert gradient.any()
 
 
-def test_neighbours_in_depth_that_are_one_in_float32_keep_their_order() -> None:
+def test_neighbours_with_equal_depth_in_float32_keep_their_order() -> None:
     """As in any large scene. The one behind comes first, so that equal keys would leave it in front."""
     gaussians, _ = scenes(6, 1, 1, (9, 9), CONSTANTS, count=2)
     gaussians.means[0] = torch.tensor([[1.5e-8, 0.0, 2.5], [0.0, 0.0, 2.5]])
@@ -113,7 +113,7 @@ def test_more_views_than_are_held_at_once_without_gradients() -> None:
         assert torch.equal(together[b, v], alone.color[0, 0])
 
 
-def test_an_input_that_changes_before_the_backward_pass_is_noticed() -> None:
+def test_an_input_that_changes_before_the_backward_pass_is_an_error() -> None:
     gaussians, cameras = scenes(12, 1, 1, (8, 9), CONSTANTS)
     inputs = differentiable(gaussians)
     color = TiledRasterizer()(inputs, cameras).color
@@ -126,12 +126,12 @@ def test_an_input_that_changes_before_the_backward_pass_is_noticed() -> None:
 def test_refusals() -> None:
     gaussians, cameras = scenes(13, 1, 1, (8, 9), CONSTANTS)
     twice = cameras.map(lambda tensor: tensor.repeat(2, 1, 1, 1))
-    for inputs, said in [
+    for inputs, message in [
         ((gaussians.to(torch.float64), cameras), "means is float64"),
         ((gaussians, cameras.to("meta")), "on meta"),
         ((gaussians, twice), r"means should have the shape \[2, 60, 3\], not \[1, 60, 3\]"),
     ]:
-        with pytest.raises(CompleteSplatError, match=said):
+        with pytest.raises(CompleteSplatError, match=message):
             TiledRasterizer()(*inputs)
     for name in ("blur", "near_plane"):
         with pytest.raises(CompleteSplatError, match=name):
@@ -145,7 +145,7 @@ def test_cuda_tensors_are_drawn_on_the_cpu() -> None:
     cotangents = cotangents_for(cameras, 2)
     expected, expected_gradients = render_with_gradients(TiledRasterizer(), gaussians, cameras, cotangents)
     moved = [tensor.cuda() for tensor in cotangents]
-    found, gradients = render_with_gradients(TiledRasterizer(), gaussians.to("cuda"), cameras.to("cuda"), moved)
-    assert found.color.is_cuda
-    assert torch.equal(found.color.cpu(), expected.color)
+    rendering, gradients = render_with_gradients(TiledRasterizer(), gaussians.to("cuda"), cameras.to("cuda"), moved)
+    assert rendering.color.is_cuda
+    assert torch.equal(rendering.color.cpu(), expected.color)
     assert all(torch.equal(gradients[name].cpu(), expected) for name, expected in expected_gradients.items())

@@ -1,4 +1,4 @@
-"""Gaussians that no rasterizer should meet, but that training produces: nothing they do may spread."""
+"""Degenerate Gaussians, as training produces them: they must not affect the others."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from degenerate_gaussians import (
     DRAWN,
     NEVER_DRAWN,
     SIZE,
-    assert_as_good_as_absent,
+    assert_changes_nothing,
     assert_drawn_as_by_the_reference,
     camera,
     changed,
@@ -22,8 +22,8 @@ from completesplat.rasterizers.tiled import TiledRasterizer
 
 
 @pytest.mark.parametrize("kind", NEVER_DRAWN)
-def test_a_gaussian_that_cannot_be_drawn_is_as_good_as_absent(kind: str) -> None:
-    assert_as_good_as_absent(TiledRasterizer(), changed(NEVER_DRAWN[kind]))
+def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str) -> None:
+    assert_changes_nothing(TiledRasterizer(), changed(NEVER_DRAWN[kind]))
 
 
 @pytest.mark.parametrize("kind", DRAWN)
@@ -48,14 +48,14 @@ def test_all_at_one_depth_keep_their_order() -> None:
     assert not torch.allclose(there, back)
 
 
-def test_a_hundred_thousand_on_one_pixel() -> None:
-    """All of them faint, so that a pixel is not full before hundreds have been drawn."""
+def test_thousands_of_gaussians_on_one_pixel() -> None:
+    """All are faint, so that a pixel is opaque only after hundreds."""
     one = changed({"opacities": 0.01, "scales": (0.001, 0.001, 0.001), "means": (0.0, 0.0, 2.0)})
-    many = one.map(lambda tensor: tensor.expand(1, 100_000, *tensor.shape[2:]).clone())
+    many = one.map(lambda tensor: tensor.expand(1, 10_000, *tensor.shape[2:]).clone())
     many.colors[:] = torch.rand(many.colors.shape, generator=torch.Generator().manual_seed(0))
     cameras = Cameras(torch.eye(4)[None, None], torch.tensor([[[[2.0, 0, 1.5], [0, 2.0, 1.5], [0, 0, 1]]]]), (3, 3))
     assert_agrees(TiledRasterizer(), CONSTANTS, many, cameras, 1)
     images, gradients = draw(TiledRasterizer(), many, cameras)
     assert images[0, 0, 4, 1, 1] > 0.99
     assert gradients["opacities"].count_nonzero() > 500
-    assert not gradients["opacities"][0, 50_000:].any()
+    assert not gradients["opacities"][0, 5_000:].any()

@@ -6,7 +6,6 @@ from scenes_for_training import scene_batch
 from support import NETWORKS, compose_config
 from torch.utils.data import DataLoader
 
-from completesplat.benchmarks.training_step import Repeated
 from completesplat.training.stage import copy_reference, repeat_image
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
@@ -51,7 +50,7 @@ def test_gradients_are_clipped_for_fused_optimizers(precision):
         max_steps=1, precision=precision, gradient_clip_val=1e-3, accelerator="cpu", logger=False,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
     )  # fmt: skip
-    trainer.fit(trained, DataLoader(Repeated(scene_batch(), 1), batch_size=None))
+    trainer.fit(trained, DataLoader([scene_batch()], batch_size=None))
     moved = torch.cat([(p - b).flatten() for p, b in zip(trained.parameters(), before, strict=True)])
     assert trainer.optimizers[0].defaults["fused"]
     assert moved.norm().item() == pytest.approx(1e-3, rel=1e-2)  # as far as gradients of this norm go

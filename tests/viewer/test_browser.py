@@ -49,10 +49,10 @@ def chromium():
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
     server = start_server(0)
-    stage = SplatView(server, (0.0, -1.0, 0.0))
-    stage.show([balls_sample()])
-    saver = Saver(tmp_path_factory.mktemp("saved"), stage, ReferenceRasterizer, 2, 0.5)
-    made = Page(server, stage, saver, layers=4)
+    view = SplatView(server, (0.0, -1.0, 0.0))
+    view.show([balls_sample()])
+    saver = Saver(tmp_path_factory.mktemp("saved"), view, ReferenceRasterizer, 2, 0.5)
+    made = Page(server, view, saver, layers=4)
     made.completion = Completion(made, tiny_generator(), START)
     yield made
     made.close()
@@ -90,12 +90,12 @@ def settled(tab) -> np.ndarray:
         shots.append(pixels(tab))
         return shots[-1].mean() < 200 and abs(shots[-1] - shots[-2]).max() < 2
 
-    assert waited_for(still), "the picture does not come to rest"
+    assert waited_for(still), "the image does not come to rest"
     return shots[-1]
 
 
 def changed(tab, before: np.ndarray) -> np.ndarray:
-    assert waited_for(lambda: abs(pixels(tab) - before).max() > 20), "the picture stays the same"
+    assert waited_for(lambda: abs(pixels(tab) - before).max() > 20), "the image stays the same"
     return settled(tab)
 
 
@@ -158,7 +158,7 @@ def test_the_page_has_our_title_and_icon_and_no_errors(tab):
 
 def test_a_phone_shows_the_whole_scene_and_the_panel_when_it_is_wanted(chromium, page):
     phone = open_tab(chromium, page.server.address, {"width": 390, "height": 700})
-    button = phone.get_by_role("button", name="Load a picture")
+    button = phone.get_by_role("button", name="Load an image")
     assert not button.is_visible()
     seen = settled(phone)
     assert seen.shape[:2] == (700, 390)
@@ -178,7 +178,7 @@ def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
     page.show([first, second])
     tab.get_by_alt_text("sample 2", exact=True).click(timeout=1000 * LIMIT)
     one = changed(tab, before)
-    assert page.stage.chosen == 1
+    assert page.view.chosen == 1
     assert not (abs(one - 255 * np.array(BALLS["red"][1])).max(-1) < 40).any()
     tab.locator("canvas").first.press("0")
     both = changed(tab, one)
@@ -193,7 +193,7 @@ def test_too_large_a_file_is_refused_and_the_page_says_so(tab, page, tmp_path):
     file = tmp_path / "large.png"
     file.write_bytes(bytes(33 * 2**20))
     with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load a picture").click()
+        tab.get_by_role("button", name="Load an image").click()
     chooser.value.set_files(file)
     told = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
     told.wait_for(state="attached", timeout=1000 * LIMIT)
@@ -209,17 +209,17 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     client = page.server.get_clients()[min(page.server.get_clients())]  # the tab, which came first
     assert abs(client.camera.position).max() > 0.3
     with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load a picture").click()
+        tab.get_by_role("button", name="Load an image").click()
     chooser.value.set_files(file)
     tab.get_by_text("1 drawn in").wait_for(timeout=1000 * LIMIT)
     first = changed(tab, turned)
-    assert page.stage.samples[0].settings["image"] == "photo.png"
+    assert page.view.samples[0].settings["image"] == "photo.png"
     assert client.camera.position == pytest.approx(np.zeros(3), abs=0.02)  # it comes back to the front
     assert client.camera.look_at[:2] == pytest.approx(np.zeros(2), abs=0.02)
     seed = tab.locator(".mantine-NumberInput-input").nth(4)  # behind the fifth slider
     seed.fill("9")
     seed.press("Enter")
-    assert waited_for(lambda: page.stage.samples[0].settings.get("seed") == 9), "no new sample"
+    assert waited_for(lambda: page.view.samples[0].settings.get("seed") == 9), "no new sample"
     changed(tab, first)
 
 
@@ -230,7 +230,7 @@ def test_a_browser_needs_the_whole_address_once(chromium, page):
             tab = context.new_page()
             assert tab.goto(address).status == status
         # What the page shows comes through its websocket.
-        tab.get_by_role("button", name="Load a picture").wait_for(timeout=1000 * LIMIT)
+        tab.get_by_role("button", name="Load an image").wait_for(timeout=1000 * LIMIT)
 
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):

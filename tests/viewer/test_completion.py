@@ -25,7 +25,7 @@ def png(width: int, height: int, mode: str = "RGB") -> bytes:
     return buffer.getvalue()
 
 
-def test_a_picture_is_read_at_the_models_size(model):
+def test_an_image_is_read_at_the_models_size(model):
     photograph = read_upload(model, "a.png", png(50, 40))
     assert photograph.image.shape == (3, 32, 32)
     assert photograph.image[:, 5, 5].numpy() == pytest.approx(np.array([200, 100, 50]) / 255, abs=1e-6)
@@ -39,7 +39,7 @@ def test_a_picture_is_read_at_the_models_size(model):
         ("bomb.png", png(8000, 8000, "1"), "64,000,000|8000 x 8000"),  # some kilobytes
     ],
 )
-def test_what_is_no_picture_or_has_too_many_pixels_is_refused_by_its_name(model, name, content, said):
+def test_other_files_and_too_many_pixels_are_refused_by_file_name(model, name, content, said):
     with pytest.raises(ImageError, match=said):
         read_upload(model, name, content)
 

@@ -64,9 +64,9 @@ def page(server, tmp_path, monkeypatch):
     monkeypatch.setattr(page_module, "THUMBNAIL", 8)  # of 96 pixels they take most of the time
     server.scene.reset()
     server.gui.reset()
-    stage = SplatView(server, (0.0, -1.0, 0.0))
-    stage.show([balls_sample()])
-    made = Page(server, stage, Saver(tmp_path / "out", stage, ReferenceRasterizer, 2, 0.5), layers=4)
+    view = SplatView(server, (0.0, -1.0, 0.0))
+    view.show([balls_sample()])
+    made = Page(server, view, Saver(tmp_path / "out", view, ReferenceRasterizer, 2, 0.5), layers=4)
     yield made
     made.worker.close()
 
@@ -82,9 +82,9 @@ def press(button, browser: Browser) -> None:
 
 
 def finish(completion: Completion) -> list:
-    """What is shown when nothing is left to do."""
+    """Return the samples on the page when no job is left."""
     assert completion.page.worker.wait(LIMIT)
-    return completion.page.stage.samples
+    return completion.page.view.samples
 
 
 def upload(completion: Completion, name: str = "photo.png", content: bytes | None = None, browser=None) -> list:
@@ -98,10 +98,10 @@ def upload(completion: Completion, name: str = "photo.png", content: bytes | Non
 
 
 def nodes(page: Page) -> dict[str, object]:
-    return page.stage._splats
+    return page.view._splats
 
 
-def test_layers_of_samples_are_switched_and_samples_picked_and_put_where_they_were_drawn(page):
+def test_layers_are_switched_and_samples_chosen_and_placed(page):
     page.show([balls_sample(layers=4), balls_sample(layers=2)])
     first, second = ({f"/sample_{i}/layer_{j}": 600 // of for j in range(of)} for i, of in enumerate((4, 2)))
     assert {name: len(node.centers) for name, node in nodes(page).items()} == dict.fromkeys(list(first), 150)
@@ -118,7 +118,7 @@ def test_layers_of_samples_are_switched_and_samples_picked_and_put_where_they_we
     assert {tuple(node.position) for node in nodes(page).values()} == {(0.0, 0.0, 0.0)}
 
 
-def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
+def test_keys_and_thumbnails_choose_a_sample(page):
     page.show([balls_sample()] * 3)
     assert page.worker.wait(LIMIT)
     thumbnails = page.looking.thumbnails
@@ -128,7 +128,7 @@ def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
     for digit, chosen, value in (("2", 1, "sample 2"), ("9", 1, "sample 2"), ("0", None, SIDE_BY_SIDE)):
         for callback in page.looking.keys[digit]._impl.trigger_cb:
             callback(viser.CommandEvent(client=Browser(), client_id=0, target=page.looking.keys[digit]))
-        assert (page.stage.chosen, page.looking.chosen.value) == (chosen, value)
+        assert (page.view.chosen, page.looking.chosen.value) == (chosen, value)
     assert len({tuple(node.position) for node in nodes(page).values()}) == 3
     assert thumbnails.content != first  # none is marked
     page.show([balls_sample()])
@@ -136,32 +136,32 @@ def test_one_sample_is_large_and_keys_and_thumbnails_choose_others(page):
     assert thumbnails.content == ""
 
 
-def test_a_thumbnail_is_what_the_reference_camera_sees(page):
+def test_a_thumbnail_is_the_view_of_the_reference_camera(page):
     sample = balls_sample()
     wide = replace(sample.reference, image_size=(64, 96))
-    picture = page.saver.picture(replace(sample, reference=wide), 48)
-    assert picture.shape == (32, 48, 3)
+    image = page.saver.thumbnail(replace(sample, reference=wide), 48)
+    assert image.shape == (32, 48, 3)
     rendering = ReferenceRasterizer()(sample.gaussians[None], sample.reference[None][None]).over(0.5)
     ours = to_bytes(rendering[0, 0]).reshape(32, 2, 32, 2, 3).mean((1, 3))
-    assert abs(picture[:, :32] - ours).mean() < 6
+    assert abs(image[:, :32] - ours).mean() < 6
 
 
-def test_depth_takes_the_place_of_the_colours_and_frusta_stand_where_the_cameras_are(page):
+def test_depth_replaces_colours_and_frusta_stand_at_the_cameras(page):
     red = nodes(page)["/sample_0/layer_0"].rgbs.copy()
     for depth in (True, False):
         page.looking.depth.value = depth
         assert (nodes(page)["/sample_0/layer_0"].rgbs == red).all() == (not depth)
     page.looking.cameras["orbit"].value = True
-    frusta = page.stage._frusta
+    frusta = page.view._frusta
     assert frusta[0].position == pytest.approx(np.zeros(3), abs=1e-5)  # the orbit starts at the reference camera
     middle = np.stack([f.position for f in frusta]).mean(axis=0)
-    assert middle == pytest.approx(page.stage.samples[0].pivot().numpy(), abs=1e-4)
+    assert middle == pytest.approx(page.view.samples[0].pivot().numpy(), abs=1e-4)
     assert frusta[0].fov == pytest.approx(np.radians(50), abs=1e-5)
     page.looking.cameras["orbit"].value = False
-    assert page.stage._frusta == []
+    assert page.view._frusta == []
 
 
-def test_a_picture_that_is_loaded_is_completed_in_sight_as_the_model_does(completion, model, monkeypatch):
+def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(completion, model, monkeypatch):
     monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
     seen, show = [], completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
@@ -175,7 +175,7 @@ def test_a_picture_that_is_loaded_is_completed_in_sight_as_the_model_does(comple
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
 
-def test_a_slider_draws_anew_with_its_value_unless_that_is_switched_off(completion):
+def test_a_slider_draws_anew_unless_that_is_switched_off(completion):
     before, controls = upload(completion)[0].gaussians.means, completion.controls
     controls.skip_weight.value = 0.25
     sample = finish(completion)[0]
@@ -190,7 +190,7 @@ def test_a_slider_draws_anew_with_its_value_unless_that_is_switched_off(completi
     assert finish(completion)[0].settings["seed"] == 7
 
 
-def test_earlier_samples_stay_if_that_is_wanted(completion):
+def test_earlier_samples_can_stay(completion):
     completion.controls.live.value = False
     upload(completion)
     completion.controls.keep.value = True
@@ -204,15 +204,15 @@ def test_earlier_samples_stay_if_that_is_wanted(completion):
     assert [sample.settings["seed"] for sample in finish(completion)] == [1, 1, 2, 2, 2, 2, 2, 2]
 
 
-def test_a_refusal_is_told_to_who_caused_it_and_changes_nothing(completion, monkeypatch):
-    before, browser, other = completion.page.stage.samples, Browser(), Browser()
+def test_a_refusal_goes_to_its_browser_and_changes_nothing(completion, monkeypatch):
+    before, browser, other = completion.page.view.samples, Browser(), Browser()
     monkeypatch.setattr(completion.page.server, "get_clients", lambda: {0: browser, 1: other})
     press(completion.controls.draw, browser)
-    assert upload(completion, "notes.txt", b"no picture", browser) is before
+    assert upload(completion, "notes.txt", b"no image", browser) is before
     completion.page.show([])
     press(completion.page.saving.save, browser)
     finish(completion)
-    for message, start in zip(browser.messages, ("load a", "notes.txt: not an", "there is nothing"), strict=True):
+    for message, start in zip(browser.messages, ("load an", "notes.txt: not an", "there is nothing"), strict=True):
         assert message.startswith(start)
     assert other.messages == []
 
@@ -232,7 +232,7 @@ def test_the_page_answers_while_the_model_works(completion, model, monkeypatch):
     assert not completion.controls.progress.visible
 
 
-def test_a_fault_is_told_and_the_page_goes_on(completion, model, monkeypatch, caplog):
+def test_a_fault_is_shown_and_the_page_goes_on(completion, model, monkeypatch, caplog):
     browser = Browser()
     with monkeypatch.context() as broken, caplog.at_level(logging.CRITICAL):
         broken.setattr(completion.page.server, "get_clients", lambda: {0: browser})
@@ -242,13 +242,13 @@ def test_a_fault_is_told_and_the_page_goes_on(completion, model, monkeypatch, ca
     assert len(upload(completion)) == 2
 
 
-KINDS = [(kind, 2, f"sample_0{{}}.{kind}") for kind in ("ply", "splat", "glb", "spz", "sog")]
+KINDS = [(kind, 2, f"sample_0{{}}.{kind}") for kind in ("ply", "sog")]
 
 
 @pytest.mark.parametrize(
     ("kind", "count", "name"), [*KINDS, ("video", 2, "orbit_0{}.mp4"), ("html", 1, "page_0{}.html")]
 )
-def test_files_are_written_and_sent_to_who_asked(page, kind, count, name, tmp_path, monkeypatch):
+def test_files_are_written_and_sent_to_their_browser(page, kind, count, name, tmp_path, monkeypatch):
     browser = Browser()
     monkeypatch.setenv(
         "PATH", str(fake_converter.install(tmp_path / "bin", "splat-transform").parent), prepend=os.pathsep
@@ -263,7 +263,7 @@ def test_files_are_written_and_sent_to_who_asked(page, kind, count, name, tmp_pa
         assert (page.saver.folder / file).read_bytes() == content
 
 
-def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(page):
+def test_saving_again_overwrites_nothing_and_takes_the_chosen_sample(page):
     page.show([balls_sample(), balls_sample()])
     page.looking.chosen.value = "sample 2"
     for _ in range(2):
@@ -273,8 +273,8 @@ def test_saving_again_overwrites_nothing_and_takes_the_sample_that_is_picked(pag
 
 
 @pytest.mark.parametrize("exact", [True, False])
-def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page, monkeypatch, exact):
-    """Our rasterizer adds its own; what was read from a file holds it already."""
+def test_files_have_the_screen_space_dilation_once_and_videos_none(page, monkeypatch, exact):
+    """Our rasterizer adds it itself; Gaussians from a file have it already."""
     sample, drawn = replace(balls_sample(), exact=exact), []
     drawing = lambda rasterizer, gaussians, *_: drawn.append(gaussians) or (torch.rand(1, 3, 8, 8), None)  # noqa: E731
     monkeypatch.setattr(page_module, "orbit_views", drawing)
@@ -285,25 +285,25 @@ def test_files_hold_the_rasterizers_blur_once_and_videos_are_drawn_without(page,
     assert torch.equal(drawn[0].scales, sample.gaussians.scales)
 
 
-def test_a_port_that_is_taken_leads_to_the_next_one(server):
+def test_a_taken_port_leads_to_the_next_one(server):
     second = start_server(server.get_port())
     assert second.get_port() > server.get_port()
     assert second.get_host() == "127.0.0.1"
     second.stop()
 
 
-def test_names_of_pictures_are_text_in_the_panels_html():
+def test_names_of_images_are_text_in_the_panels_html():
     html = preview_of(np.zeros((2, 2, 3), np.uint8), "<img src=x onerror=alert(1)>")
     assert html.count("<img") == 1
     assert "&lt;img src=x" in html
 
 
-def test_thumbnails_that_have_no_key_choose_nothing():
+def test_thumbnails_without_a_key_choose_nothing():
     row = thumbnail_row([np.zeros((2, 2, 3), np.uint8)] * 11, chosen=None)
     assert (row.count("<img"), row.count("onclick")) == (11, 9)
 
 
-def test_without_nodejs_the_formats_that_need_it_are_refused(page, monkeypatch, tmp_path):
+def test_formats_that_need_nodejs_are_refused_without_it(page, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     browser = Browser()
     page.saving.kind.value = "spz"
@@ -312,7 +312,7 @@ def test_without_nodejs_the_formats_that_need_it_are_refused(page, monkeypatch, 
     assert "need Node.js" in browser.messages[0]
 
 
-def test_the_object_is_cut_out_of_pictures_when_that_is_switched_on(completion, model, monkeypatch):
+def test_the_object_is_cut_out_when_that_is_switched_on(completion, model, monkeypatch):
     seen, read = [], type(model).read
 
     def reading(self, file, *given, remove_background=False):

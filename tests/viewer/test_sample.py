@@ -54,7 +54,7 @@ def test_broken_descriptions_and_folders_without_samples_are_refused(tmp_path, t
         read_scene(tmp_path)
 
 
-def test_the_pivot_is_what_the_middle_of_the_picture_shows_whatever_faint_gaussians_are_there():
+def test_the_pivot_is_in_the_middle_of_the_image_despite_faint_gaussians():
     pivot, scene = balls_sample().pivot(), balls()
     assert pivot.tolist() == [0, 0, pytest.approx(4, abs=0.25)]  # within the red ball
     ghosts = replace(scene, means=scene.means + torch.tensor([0, 0, 20.0]), opacities=scene.opacities * 0.01)
@@ -63,7 +63,7 @@ def test_the_pivot_is_what_the_middle_of_the_picture_shows_whatever_faint_gaussi
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_next_to_nothing_has_a_camera_and_a_pivot(count):
+def test_almost_empty_scenes_have_a_camera_and_a_pivot(count):
     scene = balls()[:count]
     camera = framing_camera(scene)
     assert Sample(scene, 1, camera).pivot().isfinite().all()

@@ -1,4 +1,4 @@
-"""The page of a Space, without gradio: what it needs, and what it makes of a picture. In a browser: `test_browser`."""
+"""The page of a Space, without gradio: its packages, and its results for an image. In a browser: `test_browser`."""
 
 import html
 import re
@@ -26,17 +26,18 @@ def test_without_its_packages_the_extra_is_named(monkeypatch, missing):
         make_space("nothing")
 
 
+@pytest.mark.processes
 def test_without_weights_it_is_one_line():
     done = subprocess.run([sys.executable, "-m", "completesplat.viewer.space"], capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert done.stderr.startswith("error: give the weights")
 
 
-def test_a_picture_becomes_frames_with_a_sample_each_a_sheet_and_files(tmp_path):
-    picture, out = tmp_path / "photo.png", tmp_path / "out"
-    Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(picture)
-    shown, sheet, files = completed(tiny_generator(), ReferenceRasterizer(), picture, out, SETTINGS)
-    frames = re.findall(r'<iframe sandbox="allow-scripts" [^>]*srcdoc="([^"]*)"></iframe>', shown)
+def test_an_image_becomes_a_frame_for_each_sample_a_sheet_and_files(tmp_path):
+    image, out = tmp_path / "photo.png", tmp_path / "out"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)).save(image)
+    frames_html, sheet, files = completed(tiny_generator(), ReferenceRasterizer(), image, out, SETTINGS)
+    frames = re.findall(r'<iframe sandbox="allow-scripts" [^>]*srcdoc="([^"]*)"></iframe>', frames_html)
     pages = [out / f"sample_0{i}.html" for i in range(2)]
     assert [html.unescape(frame) for frame in frames] == [page.read_text() for page in pages]
     assert sheet == str(out / "sheet.png")
@@ -44,8 +45,8 @@ def test_a_picture_becomes_frames_with_a_sample_each_a_sheet_and_files(tmp_path)
         str(out / "scene.json")
     ]
     assert strict_json(out / "scene.json")["settings"].items() >= {**SETTINGS, "image": "photo.png"}.items()
-    # A page has its own sample alone: what others have asked for before is not in it.
+    # A page holds one sample; earlier ones of the same process are not in it.
     assert pages[0].stat().st_size == pytest.approx(pages[1].stat().st_size, rel=0.1)
-    picture.write_bytes(picture.read_bytes()[:60])
+    image.write_bytes(image.read_bytes()[:60])
     with pytest.raises(ImageError, match=r"photo\.png"):
-        completed(tiny_generator(), ReferenceRasterizer(), picture, out, SETTINGS)
+        completed(tiny_generator(), ReferenceRasterizer(), image, out, SETTINGS)

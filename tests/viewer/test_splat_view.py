@@ -1,4 +1,4 @@
-"""Where samples stand on the page, from where they are seen, and the splats that viser takes."""
+"""Places of samples on the page, its camera, and conversion to viser's splats."""
 
 from dataclasses import replace
 
@@ -29,22 +29,22 @@ def test_all_of_a_row_are_in_view_and_none_overlap(count):
     arrangement = arrangement_of([balls_sample()] * count)
     shifts = np.stack([arrangement.shift(i) for i in range(count)])
     assert shifts.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-5)
-    picture = 2 * arrangement.pivots[0][2].item() * np.tan(np.radians(25))  # the width that its camera sees there
-    assert (np.diff(shifts[:, 0]) > picture).all()
+    width = 2 * arrangement.pivots[0][2].item() * np.tan(np.radians(25))  # the width that its camera sees there
+    assert (np.diff(shifts[:, 0]) > width).all()
     half_width = arrangement.distance * np.tan(arrangement.fov / 2) * 1.1  # a window a little wider than high
-    assert abs(shifts[:, 0]).max() + picture / 2 < half_width
+    assert abs(shifts[:, 0]).max() + width / 2 < half_width
 
 
 def test_side_by_side_samples_reach_no_further_than_to_the_middle_between_them():
-    """A scene's floor and walls are far larger than the picture of its object: whole ones would hide each other."""
+    """A scene's floor and walls are far larger than the image of its object: whole ones would hide each other."""
     sample, wall = balls_sample(), balls()
     wall = replace(wall, means=wall.means * torch.tensor([30.0, 30, 1]))
     large = replace(wall[:4], means=sample.pivot().expand(4, 3), scales=torch.full((4, 3), 3.0))
     scene = concatenate([sample.gaussians, wall, large])
     both = arrangement_of([replace(sample, gaussians=scene)] * 2)
-    kept = both.beside(1, scene)
-    assert kept.count >= sample.gaussians.count - 60  # the yellow ball's far side is outside
-    reach = (kept.means - both.pivots[1]).norm(dim=-1) + 2 * kept.scales.amax(-1)
+    part = both.beside(1, scene)
+    assert part.count >= sample.gaussians.count - 60  # the yellow ball's far side is outside
+    reach = (part.means - both.pivots[1]).norm(dim=-1) + 2 * part.scales.amax(-1)
     assert reach.max() <= both.spacing / 2
     alone = arrangement_of([replace(sample, gaussians=scene)])
     assert alone.beside(0, scene).count == scene.count
@@ -60,16 +60,16 @@ def test_narrow_windows_show_as_much_to_the_sides_as_wide_ones(count):
 
 def test_a_camera_stays_while_the_scene_changes_a_little():
     sample = balls_sample()
-    one = arrangement_of([sample])
+    arrangement = arrangement_of([sample])
     nudged = replace(sample, gaussians=replace(sample.gaussians, means=sample.gaussians.means * 1.01))
-    assert arrangement_of([nudged]).looks_like(one)
-    assert not arrangement_of([sample, sample]).looks_like(one)
+    assert arrangement_of([nudged]).looks_like(arrangement)
+    assert not arrangement_of([sample, sample]).looks_like(arrangement)
     aside = look_at(torch.tensor([3.0, 0, 4]), torch.tensor([0.0, 0, 4]), torch.tensor([0.0, -1, 0]))
     turned = replace(sample, reference=replace(sample.reference, world_to_camera=aside))
-    assert not arrangement_of([turned]).looks_like(one)
+    assert not arrangement_of([turned]).looks_like(arrangement)
 
 
-def test_covariances_stretch_directions_as_the_axes_say():
+def test_covariances_have_the_rotated_axes_and_squared_scales():
     """The variance along each of a Gaussian's axes, found by rotating unit vectors one by one, is its scale squared."""
     gaussians = balls(points=5)
     splats = to_splats(gaussians)
@@ -89,11 +89,11 @@ def test_half_precision_keeps_the_shapes_at_every_size(size):
     halves = scaled.covariances.astype(np.float16).astype(np.float64)
     assert np.isfinite(halves).all()
     for half, scales in zip(halves, gaussians.scales.numpy() * size, strict=True):
-        found = np.sqrt(np.linalg.eigvalsh(half)) * scaled.scale
-        assert found == pytest.approx(np.sort(scales), rel=0.01)
+        deviations = np.sqrt(np.linalg.eigvalsh(half)) * scaled.scale
+        assert deviations == pytest.approx(np.sort(scales), rel=0.01)
 
 
-def test_centers_and_bytes_of_what_is_finite():
+def test_centers_and_bytes_of_finite_gaussians():
     gaussians = balls(points=2)
     gaussians.colors[0] = torch.tensor([2.0, 0.5, 0.0])
     splats = to_splats(gaussians)

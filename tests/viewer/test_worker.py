@@ -23,7 +23,7 @@ def blocked(worker: Worker) -> threading.Event:
     return release
 
 
-def test_of_waiting_jobs_of_a_kind_the_newest_is_done_in_another_thread(worker):
+def test_the_newest_waiting_job_of_a_kind_is_done_in_another_thread(worker):
     done: dict[str, threading.Thread] = {}
     release = blocked(worker)
     for kind, name in (("draw", "first"), ("draw", "second"), ("draw", "third"), ("save", "saved")):
@@ -43,7 +43,7 @@ def test_an_error_is_reported_and_the_next_job_done(worker):
     assert done == [True]
 
 
-def test_what_waits_is_forgotten_when_it_closes(worker):
+def test_waiting_jobs_are_dropped_on_close(worker):
     done = []
     release = blocked(worker)
     worker.submit("draw", lambda: done.append(True))

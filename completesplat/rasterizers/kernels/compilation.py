@@ -8,10 +8,11 @@ import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 
+Result = TypeVar("Result")
 numba_config: Any = numba.config
 logger = logging.getLogger(__name__)
 
@@ -25,23 +26,23 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def kernel(function: Callable[..., Result]) -> Callable[..., Result]:
     """Compile an entry point on its first call; later processes load it from the cache."""
-    directory = _cache_directory()
-    if directory is None:
-        return numba.njit(**OPTIONS)(inspect.unwrap(function))
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(directory)
+    before, directory = numba_config.CACHE_DIR, _cache_directory()
+    numba_config.CACHE_DIR = before if directory is None else str(directory)
+    cached = directory is not None
     try:
-        return numba.njit(cache=True, **OPTIONS)(inspect.unwrap(function))
+        compiled: Callable[..., Result] = numba.njit(cache=cached, **OPTIONS)(inspect.unwrap(function))
     finally:
         numba_config.CACHE_DIR = before
+    return compiled
 
 
-def helper(function: Callable[..., Any]) -> Any:
+def helper(function: Callable[..., Result]) -> Callable[..., Result]:
     """Compile a part of a kernel that is always inlined."""
     # Unwrapping removes a type checker's wrappers, which numba could not compile.
-    return numba.njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
+    compiled: Callable[..., Result] = numba.njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
+    return compiled
 
 
 @cache

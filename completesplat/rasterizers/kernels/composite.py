@@ -4,8 +4,6 @@
 the block has a pixel that is not opaque.
 """
 
-from typing import Any
-
 import numpy as np
 from llvmlite import ir
 from numba.core import types
@@ -346,7 +344,7 @@ def state_vector(state, offset, channel):
 
 
 @vector_function(types.void)
-def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
+def store_blocks(builder, array, offset, vector):
     """Store the block numbers of pixels, truncated to integers, in a flat int32 array."""
     places = ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)
     blocks = builder.ashr(builder.fptosi(vector, INTEGERS_IR), places)
@@ -354,25 +352,25 @@ def store_blocks(builder: Any, array: Any, offset: Any, vector: Any) -> None:
 
 
 @vector_function(VECTOR)
-def load_block(builder: Any, array: Any, corner: Any, width: Any) -> Any:
+def load_block(builder, array, corner, width):
     """Load 4 x 4 pixels, row-major, of a flat image of this width, from the one at `corner` on."""
     rows = [builder.load(row, align=4) for row in _block_rows(builder, array, corner, width)]
     return _joined(builder, _joined(builder, *rows[:2]), _joined(builder, *rows[2:]))
 
 
 @vector_function(types.void)
-def store_block(builder: Any, array: Any, corner: Any, width: Any, vector: Any) -> None:
+def store_block(builder, array, corner, width, vector):
     """Store 4 x 4 pixels as `load_block` reads them."""
     for y, row in enumerate(_block_rows(builder, array, corner, width)):
         lanes = ir.Constant(ir.VectorType(I32, BLOCK), [y * BLOCK + x for x in range(BLOCK)])
         builder.store(builder.shuffle_vector(vector, vector, lanes), row, align=4)
 
 
-def _block_rows(builder: Any, array: Any, corner: Any, width: Any) -> list[Any]:
+def _block_rows(builder, array, corner, width):
     firsts = [builder.add(corner, builder.mul(width, ir.Constant(I64, y))) for y in range(BLOCK)]
     return [address(builder, array, first, ir.VectorType(F32, BLOCK)) for first in firsts]
 
 
-def _joined(builder: Any, a: Any, b: Any) -> Any:
+def _joined(builder, a, b):
     lanes = list(range(2 * a.type.count))
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -82,7 +82,7 @@ class Buffers:
     def __init__(self) -> None:
         self._blocks: list[np.ndarray] = []
 
-    def empty(self, shape: tuple[int, ...], dtype: Any = np.float32) -> np.ndarray:
+    def empty(self, shape: tuple[int, ...], dtype: type[np.number] = np.float32) -> np.ndarray:
         """Return an uninitialised array at an aligned address."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         block = _take(size)

@@ -1,7 +1,6 @@
 """Projection of a scene to the visible Gaussians of one view, packed in depth order, and its backward pass."""
 
 import math
-from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -210,7 +209,7 @@ def radix_sort(depths, keys, order, count):
 
 
 @vector_function(VECTOR)
-def packed_blocks(builder: Any, first: Any, last: Any) -> Any:
+def packed_blocks(builder, first, last):
     """Return, as the bits of int32, the block of each first pixel, and that of each last pixel shifted up."""
     low, high = (builder.fptosi(pixel, INTEGERS_IR) for pixel in (first, last))
     low, high = (builder.ashr(pixel, ir.Constant(INTEGERS_IR, [layout.BLOCK_SHIFT] * LANES)) for pixel in (low, high))
@@ -218,14 +217,14 @@ def packed_blocks(builder: Any, first: Any, last: Any) -> Any:
 
 
 @vector_function(VECTOR)
-def index_bits(builder: Any, start: Any) -> Any:
+def index_bits(builder, start):
     """Return start, ..., start + 15 as the bits of int32."""
     first = in_every_lane(builder, builder.trunc(start, I32))
     return builder.bitcast(builder.add(first, ir.Constant(INTEGERS_IR, list(range(LANES)))), VECTOR_IR)
 
 
 @vector_function(types.int64)
-def append(builder: Any, mask: Any, vectors: Any, rows: Any, vector: Any, numbers: Any, count: Any) -> Any:
+def append(builder, mask, vectors, rows, vector, numbers, count):
     """Append lane i of 16 vectors as a row to a flat array, and lane i of `vector` to `numbers`, for i in the mask.
 
     Return the new number of rows. One row beyond them is overwritten.

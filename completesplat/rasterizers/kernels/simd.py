@@ -2,10 +2,8 @@
 
 import inspect
 import operator
-from collections.abc import Callable
 from functools import reduce
 from itertools import product
-from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -28,7 +26,7 @@ _EXP2_POLYNOMIAL = (
 class LanesType(types.Type):
     """Type of a vector of 16 numbers or booleans."""
 
-    def __init__(self, name: str, element: Any) -> None:
+    def __init__(self, name, element):
         super().__init__(name=f"{name}x{LANES}")
         self.llvm = ir.VectorType(element, LANES)
 
@@ -39,21 +37,21 @@ MASK = LanesType("Mask", ir.IntType(1))
 
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, type_: Any) -> None:
-        super().__init__(manager, type_, type_.llvm)  # type: ignore[no-untyped-call]
+    def __init__(self, manager, type_):
+        super().__init__(manager, type_, type_.llvm)
 
 
-def constant(values: Any) -> ir.Constant:
+def constant(values):
     """Return LLVM's constant vector of 16 numbers."""
     return ir.Constant(VECTOR_IR, [ir.Constant(F32, float(value)) for value in values])
 
 
-def uniform(value: float) -> ir.Constant:
+def uniform(value):
     """Return LLVM's constant vector with the same number in every lane."""
     return constant([value] * LANES)
 
 
-def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
+def vector_function(result):
     """Turn `emit(builder, *operands)`, which writes LLVM code, into a function for kernels with this type of result.
 
     A kernel's arguments arrive in `emit` as follows: an array as the address of its first element, an integer with 64
@@ -61,8 +59,8 @@ def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
     returns becomes a tuple. `result` may be a function of the operands' types that returns the signature.
     """
 
-    def decorate(emit: Callable[..., Any]) -> Any:
-        def function(typing_context: Any, *operands: Any) -> Any:
+    def decorate(emit):
+        def function(typing_context, *operands):
             return result(*operands), _generator(emit)
 
         function.__name__ = emit.__name__
@@ -72,20 +70,20 @@ def vector_function(result: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-def _generator(emit: Callable[..., Any]) -> Callable[..., Any]:
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+def _generator(emit):
+    def generate(context, builder, signature, values):
         pairs = zip(values, signature.args, strict=True)
         wide = any(DOUBLES in (type_, getattr(type_, "dtype", None)) for type_ in signature.args)
         element = types.float64 if wide else types.float32
-        found = emit(builder, *(_operand(context, builder, value, type_, element) for value, type_ in pairs))
-        if isinstance(found, list):
-            return context.make_tuple(builder, signature.return_type, found)
-        return context.get_dummy_value() if signature.return_type == types.void else found
+        code = emit(builder, *(_operand(context, builder, value, type_, element) for value, type_ in pairs))
+        if isinstance(code, list):
+            return context.make_tuple(builder, signature.return_type, code)
+        return context.get_dummy_value() if signature.return_type == types.void else code
 
     return generate
 
 
-def _operand(context: Any, builder: Any, value: Any, type_: Any, element: Any) -> Any:
+def _operand(context, builder, value, type_, element):
     if isinstance(type_, types.Array):
         return context.make_array(type_)(context, builder, value).data
     if isinstance(type_, types.Integer):
@@ -95,25 +93,25 @@ def _operand(context: Any, builder: Any, value: Any, type_: Any, element: Any) -
     return in_every_lane(builder, context.cast(builder, value, type_, element))
 
 
-def in_every_lane(builder: Any, scalar: Any) -> Any:
+def in_every_lane(builder, scalar):
     undefined = ir.Constant(ir.VectorType(scalar.type, LANES), ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(I32, 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INTEGERS_IR, [0] * LANES))
 
 
-def _define_operator(function: Any, emit: Callable[..., Any], mask: bool = False, count: int = 2) -> None:
+def _define_operator(function, emit, mask=False, count=2):
     """Define a Python operator with `count` operands for vectors and scalars beside them; `mask`: it returns a mask."""
     for kind in (VECTOR, DOUBLES):
         _define_for(kind, MASK if mask else kind, function, emit, count)
 
 
-def _define_for(kind: Any, result: Any, function: Any, emit: Callable[..., Any], count: int = 2) -> None:
-    def type_of(*operands: Any) -> Any:
+def _define_for(kind, result, function, emit, count=2):
+    def type_of(*operands):
         return result if kind in operands and all(t == kind or isinstance(t, types.Float) for t in operands) else None
 
     # numba needs fixed operands.
     typer = (lambda a: type_of(a)) if count == 1 else (lambda a, b: type_of(a, b))
-    type_callable(function)(lambda context: typer)  # type: ignore[no-untyped-call]
+    type_callable(function)(lambda context: typer)
     for kinds in product((kind, types.Float), repeat=count):
         if kind in kinds:
             lower_builtin(function, *kinds)(_generator(emit))
@@ -134,85 +132,85 @@ _define_operator(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(
 _define_operator(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
-def _vectors(count: int, kind: Any = VECTOR) -> Any:
-    return types.UniTuple(kind, count)  # type: ignore[no-untyped-call]
+def _vectors(count, kind=VECTOR):
+    return types.UniTuple(kind, count)
 
 
-def lane_constant(values: Any) -> Any:
+def lane_constant(values):
     """Return a function without arguments that returns these 16 lanes."""
     vector = constant(values)
     return vector_function(VECTOR)(lambda builder: vector)
 
 
-def zeros(count: int) -> Any:
+def zeros(count):
     """Return a function without arguments that returns a tuple of `count` vectors of zeros."""
     return vector_function(_vectors(count))(lambda builder: [uniform(0)] * count)
 
 
 @vector_function(VECTOR)
-def splat(builder: Any, scalar: Any) -> Any:
+def splat(builder, scalar):
     """Return a vector with the scalar in every lane."""
     return scalar
 
 
 @vector_function(lambda mask, vector: vector(mask, vector))
-def keep(builder: Any, mask: Any, vector: Any) -> Any:
+def keep(builder, mask, vector):
     """Return the vector where the mask is set, zero elsewhere."""
     return builder.select(mask, vector, ir.Constant(vector.type, None))
 
 
 @vector_function(lambda mask, vector, scalar: vector(mask, vector, scalar))
-def choose(builder: Any, mask: Any, vector: Any, scalar: Any) -> Any:
+def choose(builder, mask, vector, scalar):
     """Return the vector where the mask is set, the scalar elsewhere."""
     return builder.select(mask, vector, scalar)
 
 
 @vector_function(lambda vectors: _vectors(len(vectors), DOUBLES)(vectors))
-def widen(builder: Any, vectors: Any) -> Any:
+def widen(builder, vectors):
     """Convert a tuple of vectors to float64."""
-    return [builder.fpext(one, DOUBLES.llvm) for one in unpack(builder, vectors)]
+    return [builder.fpext(vector, DOUBLES.llvm) for vector in unpack(builder, vectors)]
 
 
 @vector_function(lambda vectors: _vectors(len(vectors))(vectors))
-def narrow(builder: Any, vectors: Any) -> Any:
+def narrow(builder, vectors):
     """Convert a tuple of vectors from float64 to float32."""
-    return [builder.fptrunc(one, VECTOR_IR) for one in unpack(builder, vectors)]
+    return [builder.fptrunc(vector, VECTOR_IR) for vector in unpack(builder, vectors)]
 
 
 @vector_function(lambda mask, vectors: vectors(mask, vectors))
-def keep_each(builder: Any, mask: Any, vectors: Any) -> Any:
+def keep_each(builder, mask, vectors):
     """Apply `keep` to every vector of a tuple."""
-    return [builder.select(mask, one, uniform(0)) for one in unpack(builder, vectors)]
+    return [builder.select(mask, vector, uniform(0)) for vector in unpack(builder, vectors)]
 
 
 @vector_function(MASK)
-def all_within(builder: Any, vectors: Any, limit: Any) -> Any:
+def all_within(builder, vectors, limit):
     """Return a mask of the lanes in which no vector of a tuple is NaN or exceeds the limit in magnitude."""
-    masks = [builder.fcmp_ordered("<=", _each(builder, "fabs", one), limit) for one in unpack(builder, vectors)]
+    masks = [builder.fcmp_ordered("<=", _each(builder, "fabs", vector), limit) for vector in unpack(builder, vectors)]
     return reduce(builder.and_, masks)
 
 
 @vector_function(lambda a, b: a(a, b))
-def add_each(builder: Any, a: Any, b: Any) -> Any:
+def add_each(builder, a, b):
     """Add two tuples of vectors."""
     return [builder.fadd(x, y, flags=FLAGS) for x, y in zip(unpack(builder, a), unpack(builder, b), strict=True)]
 
 
 @vector_function(types.boolean)
-def any_lane(builder: Any, mask: Any) -> Any:
+def any_lane(builder, mask):
     """Return whether the mask is set in any lane."""
     bits = builder.bitcast(mask, ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
 @vector_function(lambda vector: vector(vector))
-def square_root(builder: Any, vector: Any) -> Any:
+def square_root(builder, vector):
     """Return the square root of every lane."""
     return _each(builder, "sqrt", vector)
 
 
 @vector_function(VECTOR)
-def exp2(builder: Any, x: Any) -> Any:
+def exp2(builder, x):
     """Return 2^x with a relative error of 2e-7, for x from -126 to 127; meaningless (but harmless) outside.
 
     x is split into an integer, which is added to the exponent bits, and a rest in [-1/2, 1/2] for a polynomial.
@@ -229,7 +227,7 @@ def exp2(builder: Any, x: Any) -> Any:
 
 
 @vector_function(VECTOR)
-def lane_sums(builder: Any, vectors: Any) -> Any:
+def lane_sums(builder, vectors):
     """Return the vector whose lane i is the sum over vector i of a tuple of up to 16; other lanes are zero."""
     rows = unpack(builder, vectors)
     rows += [uniform(0)] * (LANES - len(rows))
@@ -240,58 +238,58 @@ def lane_sums(builder: Any, vectors: Any) -> Any:
     return rows[0]
 
 
-def _fold(builder: Any, a: Any, b: Any, step: int) -> Any:
-    kept = [LANES + lane if lane & step else lane for lane in range(LANES)]
+def _fold(builder, a, b, step):
+    chosen = [LANES + lane if lane & step else lane for lane in range(LANES)]
     partner = [LANES + (lane ^ step) if lane & step else (lane ^ step) for lane in range(LANES)]
-    halves = [builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, order)) for order in (kept, partner)]
+    halves = [builder.shuffle_vector(a, b, ir.Constant(INTEGERS_IR, order)) for order in (chosen, partner)]
     return builder.fadd(*halves, flags=FLAGS)
 
 
 @vector_function(types.int64)
-def lowest_bit(builder: Any, bits: Any) -> Any:
+def lowest_bit(builder, bits):
     """Return the index of the lowest set bit of a nonzero uint64."""
     return builder.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
-def _each(builder: Any, name: str, vector: Any) -> Any:
+def _each(builder, name, vector):
     """Apply LLVM's function of this name to every lane."""
     suffix = "f64" if vector.type == DOUBLES.llvm else "f32"
     kind = ir.FunctionType(vector.type, [vector.type])
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{suffix}")  # type: ignore[no-untyped-call]
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}{suffix}")
     return builder.call(function, [vector])
 
 
-def unpack(builder: Any, values: Any) -> list[Any]:
-    return list(cgutils.unpack_tuple(builder, values))  # type: ignore[no-untyped-call]
+def unpack(builder, values):
+    return list(cgutils.unpack_tuple(builder, values))
 
 
 # None of the following checks bounds.
 
 
 @vector_function(VECTOR)
-def load(builder: Any, array: Any, offset: Any) -> Any:
+def load(builder, array, offset):
     """Load 16 floats of a flat float32 array, from element `offset` on."""
     return builder.load(address(builder, array, offset, VECTOR_IR), align=4)
 
 
 @vector_function(types.void)
-def store(builder: Any, array: Any, offset: Any, vector: Any) -> None:
+def store(builder, array, offset, vector):
     """Store a vector as `load` reads it."""
     builder.store(vector, address(builder, array, offset, VECTOR_IR), align=4)
 
 
-def address(builder: Any, array: Any, offset: Any, kind: Any) -> Any:
+def address(builder, array, offset, kind):
     return builder.bitcast(builder.gep(array, [offset], inbounds=True), kind.as_pointer())
 
 
-def gather(count: int) -> Any:
+def gather(count):
     """Return a function (array, stride, column, start, last) that returns `count` neighbouring columns of an array.
 
     The first is array[i * stride + column] for i = start, ..., start + 15, with last - 1 for any i beyond that.
     """
 
     @vector_function(_vectors(count))
-    def gather(builder: Any, array: Any, stride: Any, column: Any, start: Any, last: Any) -> Any:
+    def gather(builder, array, stride, column, start, last):
         vectors = [ir.Constant(VECTOR_IR, ir.Undefined)] * count
         firsts = _rows(builder, stride, start, last)
         for k, (lane, first) in product(range(count), enumerate(firsts)):
@@ -304,7 +302,7 @@ def gather(count: int) -> Any:
 
 
 @vector_function(types.void)
-def scatter(builder: Any, array: Any, start: Any, last: Any, vectors: Any) -> None:
+def scatter(builder, array, start, last, vectors):
     """Write vectors as `gather` reads them, one for each column. No row beyond last - 1 is written."""
     rows = unpack(builder, vectors)
     firsts = _rows(builder, ir.Constant(I64, len(rows)), start, last)
@@ -315,11 +313,11 @@ def scatter(builder: Any, array: Any, start: Any, last: Any, vectors: Any) -> No
         builder.store(value, builder.gep(array, [place], inbounds=True))
 
 
-def columns(count: int) -> Any:
+def columns(count):
     """Return a function (array, stride, start) that returns 16 neighbours of each of `count` rows of a flat array."""
 
     @vector_function(_vectors(count))
-    def columns(builder: Any, array: Any, stride: Any, start: Any) -> Any:
+    def columns(builder, array, stride, start):
         firsts = [builder.add(start, builder.mul(stride, ir.Constant(I64, k))) for k in range(count)]
         return [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in firsts]
 
@@ -327,7 +325,7 @@ def columns(count: int) -> Any:
 
 
 @vector_function(types.void)
-def store_columns(builder: Any, array: Any, stride: Any, start: Any, vectors: Any) -> None:
+def store_columns(builder, array, stride, start, vectors):
     """Store vectors as `columns` reads them."""
     for k, vector in enumerate(unpack(builder, vectors)):
         first = builder.add(start, builder.mul(stride, ir.Constant(I64, k)))
@@ -335,13 +333,13 @@ def store_columns(builder: Any, array: Any, stride: Any, start: Any, vectors: An
 
 
 @vector_function(_vectors(LANES))
-def transposed_rows(builder: Any, array: Any, stride: Any, start: Any, last: Any) -> Any:
+def transposed_rows(builder, array, stride, start, last):
     """Return the same as `gather(16)` from column 0 on, by loads of whole rows."""
     rows = _rows(builder, stride, start, last)
     return transposed(builder, [builder.load(address(builder, array, first, VECTOR_IR), align=4) for first in rows])
 
 
-def transposed(builder: Any, matrix: list[Any]) -> list[Any]:
+def transposed(builder, matrix):
     for step in (1, 2, 4, 8):  # each round swaps the off-diagonal squares of this size
         for i in (i for i in range(LANES) if not i & step):
             a, b = matrix[i], matrix[i + step]
@@ -352,7 +350,7 @@ def transposed(builder: Any, matrix: list[Any]) -> list[Any]:
     return matrix
 
 
-def _rows(builder: Any, stride: Any, start: Any, last: Any) -> list[Any]:
+def _rows(builder, stride, start, last):
     """Return the offsets of the rows start, ..., start + 15 of a flat array; row last - 1 replaces those beyond it."""
     final = builder.sub(last, ir.Constant(last.type, 1))
     numbers = [builder.add(start, ir.Constant(start.type, lane)) for lane in range(LANES)]

@@ -40,6 +40,7 @@ def test_every_task_runs_once_and_exceptions_come_back() -> None:
         parallel(lambda task: 1 / 0, 2)
 
 
+@pytest.mark.processes
 @pytest.mark.usefixtures("two_threads")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -61,6 +62,7 @@ def test_a_forked_child_renders() -> None:
         process.join()
 
 
+@pytest.mark.processes
 def test_a_second_process_compiles_nothing() -> None:
     image()
     if compilation._cache_directory() is None:
@@ -79,7 +81,7 @@ def test_a_second_process_compiles_nothing() -> None:
 
 def test_without_a_writable_folder_kernels_are_compiled_but_not_kept(tmp_path, monkeypatch) -> None:
     blocked = tmp_path / "file"
-    blocked.touch()  # no folder can be made under a file, whoever asks
+    blocked.touch()  # no folder can be made under a file
     monkeypatch.setattr(compilation.numba_config, "CACHE_DIR", str(blocked))
     compilation._cache_directory.cache_clear()
     try:

@@ -1,0 +1,107 @@
+"""`completesplat bench data`: how epochs are counted and timed, and what it writes, prints and refuses."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from packed_sequences import ListedSource
+from support import strict_json
+
+from completesplat.benchmarks import data_loading
+from completesplat.benchmarks.data_loading import Epoch, read_epoch, rows
+from completesplat.data.loading.loader import EpochSampler, SceneLoader
+from completesplat.data.loading.scenes import SceneStore, TrainingScenes
+from completesplat.data.loading.view_selection import training_views
+from completesplat.data.toy import rooms
+
+QUICK = [
+    *("bench", "data", "repeats=1"),
+    *("objects.write.scenes=3", "objects.write.frames=4", "objects.write.size=24", "objects.write.workers=1"),
+    *("objects.data.image_size=16", "objects.data.batch_size=2"),
+    "objects.references_per_sequence={raw: 2, prepared: 4}",
+    *("rooms.write.scenes=14", "rooms.write.frames=4", "rooms.write.size=16", "rooms.write.workers=1"),
+    *("rooms.data.image_size=16", "rooms.data.references_per_sequence=2"),
+]
+
+
+def test_an_epoch_counts_batches_scenes_and_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five scenes of three views, in batches of two."""
+    source = ListedSource([f"sequence {number}" for number in range(5)])
+    store = SceneStore(source, source.names)
+    scenes = TrainingScenes(store, lambda n, _, rng: training_views(n, 2, rng), lambda scene, rng: scene, 1, 0)
+    loader = SceneLoader(scenes, 2, EpochSampler(scenes.groups(), 0), 0)
+    monkeypatch.setattr(data_loading, "time", SimpleNamespace(perf_counter=iter([3.0, 5.5]).__next__))
+    assert read_epoch(loader, 7) == Epoch(2.5, batches=3, scenes=5, images=15)
+    assert loader.sampler.epoch == 7  # each epoch draws anew
+
+
+def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = {"a": iter([60.0, 10.0, 1.0, 20.0] * 2), "b": iter([90.0, 2.0, 2.5, 50.0] * 2)}
+    epochs = []
+
+    def read_from(name: str, number: int) -> Epoch:
+        epochs.append((name, number))
+        return Epoch(next(seconds[name[0]]), batches=3, scenes=5, images=15)
+
+    def form(name: str) -> Callable[..., SimpleNamespace]:
+        return lambda workers: SimpleNamespace(train_dataloader=lambda: f"{name}{workers}")
+
+    monkeypatch.setattr(data_loading, "read_epoch", read_from)
+    messages: list[str] = []
+    result = rows({"a": form("a"), "b": form("b")}, [0, 2], 3, messages.append)
+    assert epochs == [(f"{form}{workers}", number) for workers in (0, 2) for number in range(4) for form in "ab"]
+    assert len(messages) == len(epochs)
+    keys = [(row["form"], row["workers"], row["epoch_seconds"]) for row in result]
+    assert keys == [(form, workers, taken) for workers in (0, 2) for form, taken in (("a", 10.0), ("b", 2.5))]
+    slow, fast = result[:2]
+    assert (slow["batches_per_second"], slow["scenes_per_second"], slow["images_per_second"]) == (0.3, 0.5, 1.5)
+    assert (slow["times_first"], fast["times_first"]) == (1.0, 4.0)
+
+
+@pytest.fixture
+def quick(command, tmp_path, monkeypatch):
+    """Run the benchmark; return its results, its output and its folder."""
+    # Twelve clips that are not for testing, one of which is for validation, in three chunks.
+    monkeypatch.setattr(rooms, "CLIPS_PER_CHUNK", 4)
+    monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few files
+
+    def run(*arguments: str) -> tuple[dict[str, Any], str, Path]:
+        finished = command(*QUICK, *arguments, f"out={tmp_path / 'out'}")
+        assert finished.status == 0, finished.err
+        assert finished.out.splitlines()[-1] == str(tmp_path / "out")
+        return strict_json(tmp_path / "out/data.json"), finished.out, tmp_path / "out"
+
+    return run
+
+
+@pytest.mark.slow
+def test_everything_is_measured_written_and_printed(quick):
+    results, printed, out = quick()
+    prepared = ["prepared bmp", "prepared png", "prepared jpeg"]
+    for form_rows, forms in [(results["rows"], ["raw", *prepared]), (results["clips"], ["chunks", "text", *prepared])]:
+        assert [(row["workers"], row["form"]) for row in form_rows] == [(n, form) for n in (0, 2) for form in forms]
+        for row in form_rows:
+            assert row["images_per_second"] == pytest.approx(4 * row["scenes_per_second"])
+    for text in ("Training batches", "Training batches of clips", results["machine"]["processor"]):
+        assert text in printed
+    assert not list(out.glob("bench_data_*"))
+
+
+def test_parts_can_be_left_out_and_files_stay(quick):
+    results, _, out = quick("rooms=false", "workers=[0]", "codecs=[jpeg]", "keep=true")
+    assert set(results) == {"machine", "rows"}
+    assert [row["form"] for row in results["rows"]] == ["raw", "prepared jpeg"]
+    (files,) = out.glob("bench_data_*")
+    assert len(list(files.glob("objects/*/*/images/*.jpg"))) == 12
+    assert strict_json(files / "prepared objects/jpeg/manifest.json")["codec"] == "jpeg"
+
+
+def test_nothing_is_left_behind_when_it_fails(command, tmp_path):
+    codecs = ("codecs=[png,webp]", "error: codecs=['png', 'webp']: choose one of png, jpeg, bmp\n")
+    for setting, message in (("objects.write.frames=1", "toy_objects: frames=1: must lie between 2 and 1000"), codecs):
+        finished = command(*QUICK, setting, f"out={tmp_path / 'out'}")
+        assert finished.status == 2
+        assert message in finished.err
+        assert not list((tmp_path / "out").glob("*data*"))
