@@ -45,7 +45,6 @@ def test_the_lists_of_tiles_are_those_of_gsplat() -> None:
 
 
 def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a frustum margin that gsplat does not have, and where there is no gsplat."""
     pytest.importorskip("gsplat")
     with pytest.raises(CompleteSplatError, match="frustum_margin"):
         GsplatTorchRasterizer(OTHER_CONSTANTS)

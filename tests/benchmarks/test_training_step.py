@@ -62,14 +62,14 @@ def test_seconds_are_those_of_both_passes_and_of_nothing_else(clock: SimpleNames
     assert clock.now == 2 * (4 * sum(NETWORK) + sum(RASTERIZER))
 
 
-def test_the_watched_rasterizer_draws_what_it_would_draw_alone() -> None:
+def test_the_watched_rasterizer_renders_the_same() -> None:
     gaussians, cameras = scenes(0, 2, 2, (11, 14), RenderingConstants(), count=20)
-    (alone, gradients), (watched, found) = (
+    (alone, gradients), (watched, watched_gradients) = (
         render_with_gradients(rasterizer, gaussians, cameras, cotangents_for(cameras, 0))
         for rasterizer in (TiledRasterizer(), StopWatch(TiledRasterizer()))
     )
     for name, tensor in (vars(alone) | gradients).items():
-        assert torch.equal(tensor, (vars(watched) | found)[name]), name
+        assert torch.equal(tensor, (vars(watched) | watched_gradients)[name]), name
 
 
 def test_no_zeros_are_made_where_the_loss_sends_no_gradient() -> None:
