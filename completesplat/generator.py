@@ -11,31 +11,25 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import load_file
 from torch import Tensor
 
+from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel, VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.files import is_published
+from completesplat.baselines.splatter_image.model import PublishedOneAnswer
 from completesplat.diffusion.guidance import allowed_skip_weight
-from completesplat.diffusion.sampling import draw_noise, in_parts, with_forward_process
+from completesplat.diffusion.sampling import Sampler, draw_noise, in_parts, with_forward_process
 from completesplat.errors import WeightsError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.parts import (
-    architecture_of_run,
-    build,
-    check_architecture,
-    check_sizes,
-    read_architecture,
-    sizes_in,
-    untrained,
-)
-from completesplat.published import PublishedGenerator
+from completesplat.opening import SavedModel, locate, read_saved
+from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel, require_one
+from completesplat.scene_model import SceneModel, camera_tensors, require_one
 from completesplat.settings.schema import Positive, Seed
+from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate
-from completesplat.weights import CAMERA, CONFIG_FILE, RUN_CONFIG_FILE, WEIGHTS_FILE, checkpoint_of, weights_folder
-from completesplat.weights.checkpoint_reading import not_finite, read_checkpoint
+from completesplat.weights import first_line
+from completesplat.weights.checkpoint_reading import not_finite
 
 
 class CompleteSplat(SceneModel):
@@ -47,10 +41,10 @@ class CompleteSplat(SceneModel):
     Args:
         autoreconstructor, conditioning, denoiser, sampler: configs of the parts.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingPictures`).
+        training: facts about the training images (`completesplat.opening.parts.TrainingImages`).
 
     Raises:
-        WeightsError: a config has a part or an option that weights may not name (`parts`).
+        WeightsError: a config has a part or an option that weights may not name (`completesplat.opening.parts`).
     """
 
     latent_mean: Tensor
@@ -60,33 +54,35 @@ class CompleteSplat(SceneModel):
 
     def __init__(
         self,
-        autoreconstructor: Mapping[str, Any],
-        conditioning: Mapping[str, Any],
-        denoiser: Mapping[str, Any],
-        sampler: Mapping[str, Any],
+        autoreconstructor: PartConfig,
+        conditioning: PartConfig,
+        denoiser: PartConfig,
+        sampler: PartConfig,
         image_size: int,
-        training: Mapping[str, Any] | None = None,
+        training: Mapping[str, object] | None = None,
     ) -> None:
         parts = {"autoreconstructor": autoreconstructor, "conditioning": conditioning, "denoiser": denoiser}
-        saved = {name: untrained(part) for name, part in parts.items()}
-        facts = {} if training is None else {"training": dict(training)}
-        architecture = {**saved, "sampler": dict(sampler), "image_size": image_size, **facts}
-        check_architecture(architecture)
-        super().__init__(architecture)
+        saved: dict[str, PartConfig] = {name: untrained(part) for name, part in parts.items()}
+        super().__init__(_checked({**saved, "sampler": dict(sampler), "image_size": image_size}, training))
         # Its weights come from a trained stage, so Stable Diffusion's are not needed.
-        self.autoreconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
+        self.autoreconstructor: VariationalAutoReconstructor = build(saved["autoreconstructor"]).requires_grad_(False)
         self.conditioning = build(conditioning)
         self.denoiser = build(denoiser)
-        self.sampler = build(sampler)
+        self.sampler: Sampler = build(sampler)
         # The training stage measures these on the training set.
         channels = self.denoiser.latent_channels
         self.register_buffer("latent_mean", torch.zeros(channels, 1, 1))
         self.register_buffer("latent_std", torch.ones(channels, 1, 1))
 
     @property
-    def reconstructing(self) -> Any:
+    def reconstruction_model(self) -> VariationalAutoReconstructor:
         """Return the autoreconstructor."""
         return self.autoreconstructor
+
+    @property
+    def default_steps(self) -> int:
+        """Return the sampler's number of denoising steps."""
+        return self.sampler.steps
 
     def train(self, mode: bool = True) -> "CompleteSplat":
         """Switch the trainable parts; the autoreconstructor stays frozen in evaluation mode."""
@@ -160,7 +156,7 @@ class CompleteSplat(SceneModel):
         image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)
         decode = partial(self._decode, image_of, features, weight, cameras, depth_range)
 
-        def draw(part: slice) -> Any:
+        def draw(part: slice) -> Tensor:
             watch = None if on_step is None else lambda step, level, latent: on_step(step, level, decode(latent, part))
             return self.sampler(self.denoiser, noise[part], conditioning[image_of[part]], guidance_weight, steps, watch)
 
@@ -181,9 +177,9 @@ class CompleteSplat(SceneModel):
         """Decode the latents of a part of all samples; `image_of` maps each sample to the index of its image."""
         indices = image_of[part]
         skips = [feature[indices] for feature in features], skip_weight
-        splatter_image = self.autoreconstructor.reconstructor(latent * self.latent_std + self.latent_mean, *skips)
-        gaussians: Gaussians = splatter_image.gaussians(cameras[indices], depth_range[indices])
-        return gaussians
+        unscaled = latent * self.latent_std + self.latent_mean
+        splatter_image: SplatterImage = self.autoreconstructor.reconstructor(unscaled, *skips)
+        return splatter_image.gaussians(cameras[indices], depth_range[indices])
 
     def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
         """Use another sampler from now on, with the noise schedule and prediction type of training."""
@@ -193,34 +189,28 @@ class CompleteSplat(SceneModel):
         self.architecture["sampler"] = config
 
     @staticmethod
-    def from_pretrained(path: Path | str) -> "SceneModel":
+    def from_pretrained(path: Path | str) -> SceneModel:
         """Load what `save_pretrained` wrote or a run trained, in evaluation mode on the CPU; stage 1 is a `OneAnswer`.
 
         Args:
-            path: a folder of weights or of a run, a checkpoint of a run, a name of weights in the package, or an id on
-                the Hugging Face hub (`weights_folder`). `splatter_image:NAME`, or a file or folder of these weights,
-                gives a `PublishedGenerator`.
+            path: a name, folder, run, checkpoint or hub id (`completesplat.opening.locate`). Published weights of
+                Splatter Image give a `PublishedOneAnswer`.
 
         Raises:
             WeightsError: files are missing, unreadable, changed, not finite, do not belong together, or name parts that
-                `parts` does not allow; or the run's model makes no scene from a photo.
+                `completesplat.opening.parts` does not allow; or the run's model makes no scene from a photo.
         """
         try:
-            if is_published(path):
-                model: SceneModel = PublishedGenerator(str(path))
-            elif (checkpoint := checkpoint_of(path)) is not None:
-                model = _read_checkpoint(checkpoint)
-            else:
-                model = _read_folder(weights_folder(path))
+            file = locate(path)
+            model = PublishedOneAnswer(str(file)) if is_published(file) else _load(read_saved(file))
             name = not_finite(model.state_dict())
         except WeightsError:
             raise
         except Exception as error:
-            reason = str(error).strip().splitlines()
-            raise WeightsError(f"{path}: cannot be loaded: {reason[0] if reason else type(error).__name__}") from error
+            raise WeightsError(f"{path}: cannot be loaded: {first_line(error)}") from error
         if name is not None:
             raise WeightsError(f"{path}: {name} is not finite")
-        return model
+        return model.eval()
 
 
 class OneAnswer(SceneModel):
@@ -229,21 +219,19 @@ class OneAnswer(SceneModel):
     Args:
         network: config of the network, as in `conf/`.
         image_size: side of the square images, in pixels.
-        training: facts about the training images (`completesplat.parts.TrainingPictures`).
+        training: facts about the training images (`completesplat.opening.parts.TrainingImages`).
 
     Raises:
-        WeightsError: the config has a part or an option that weights may not name (`parts`).
+        WeightsError: the config has a part or an option that weights may not name (`completesplat.opening.parts`).
     """
 
-    def __init__(self, network: Mapping[str, Any], image_size: int, training: Mapping[str, Any] | None = None) -> None:
-        facts = {} if training is None else {"training": dict(training)}
-        architecture = {"network": untrained(network), "image_size": image_size, **facts}
-        check_architecture(architecture)
-        super().__init__(architecture)
-        self.network = build(self.architecture["network"])
+    def __init__(self, network: PartConfig, image_size: int, training: Mapping[str, object] | None = None) -> None:
+        super().__init__(_checked({"network": untrained(network), "image_size": image_size}, training))
+        with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
+            self.network: ReconstructionModel = build(self.architecture["network"])
 
     @property
-    def reconstructing(self) -> Any:
+    def reconstruction_model(self) -> ReconstructionModel:
         """Return the network."""
         return self.network
 
@@ -255,7 +243,7 @@ class OneAnswer(SceneModel):
         depth_range: Float[Tensor, "batch 2"],
         samples: int = 1,
         visible: Float[Tensor, "batch 1 height width"] | None = None,
-        **settings: Any,
+        **settings: object,
     ) -> Gaussians:
         """Reconstruct the scene of each image, in its camera's frame.
 
@@ -267,9 +255,8 @@ class OneAnswer(SceneModel):
             CompleteSplatError: several samples are asked for.
         """
         require_one(samples)
-        splatter_image = self.eval().network(images if visible is None else images * visible).splatter_image
-        gaussians: Gaussians = splatter_image.gaussians(cameras, depth_range)
-        return gaussians
+        reconstruction: Reconstruction = self.eval().network(images if visible is None else images * visible)
+        return reconstruction.splatter_image.gaussians(cameras, depth_range)
 
     @staticmethod
     def with_trained(
@@ -278,37 +265,21 @@ class OneAnswer(SceneModel):
         """Return a model with a trained network's weights, and with its training set's typical camera.
 
         Raises:
-            WeightsError: the camera lacks `fov_degrees`, `depth_range` or `up`, or they are no numbers.
+            WeightsError: as the constructor and `camera_tensors`.
         """
-        with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
-            model = OneAnswer(**architecture)
-        names = ("fov_degrees", "depth_range", "up")
-        try:
-            measured = {name: torch.tensor(camera[name], dtype=torch.float32) for name in names}
-        except (KeyError, TypeError, ValueError) as error:
-            raise WeightsError("the training set's typical camera is not known") from error
-        model.load_state_dict({f"network.{name}": x for name, x in network.items()} | measured)
+        model = OneAnswer(**architecture)
+        model.load_state_dict({f"network.{name}": x for name, x in network.items()} | camera_tensors(camera))
         return model.eval()
 
 
-def _read_folder(folder: Path) -> SceneModel:
-    architecture = read_architecture(folder)
-    check_sizes(architecture, sizes_in(folder / WEIGHTS_FILE), (WEIGHTS_FILE, CONFIG_FILE))
-    model = (OneAnswer if "network" in architecture else CompleteSplat)(**architecture)
-    model.load_state_dict(load_file(folder / WEIGHTS_FILE))
-    return model.eval()
+def _checked(architecture: dict[str, Any], training: Mapping[str, object] | None) -> dict[str, Any]:
+    """Return a model's config with the facts about its training images, if they are known, after checking it."""
+    complete = architecture if training is None else {**architecture, "training": dict(training)}
+    check_architecture(complete)
+    return complete
 
 
-def _read_checkpoint(checkpoint: Path) -> SceneModel:
-    """Return the model of a run's checkpoint, with averaged weights if the run averages them."""
-    architecture, prefix = architecture_of_run(checkpoint)
-    contents = read_checkpoint(checkpoint)
-    state = {k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
-    whose = "network." if "network" in architecture else ""
-    sizes = {f"{whose}{name}": value.shape for name, value in state.items()}
-    check_sizes(architecture, sizes, (checkpoint.name, RUN_CONFIG_FILE))
-    if whose:
-        return OneAnswer.with_trained(architecture, state, contents.get(CAMERA, {}))
-    model = CompleteSplat(**architecture)
-    model.load_state_dict(state)
-    return model.eval()
+def _load(saved: SavedModel) -> SceneModel:
+    model = (OneAnswer if "network" in saved.architecture else CompleteSplat)(**saved.architecture)
+    model.load_state_dict(saved.tensors)
+    return model

@@ -1,7 +1,8 @@
-"""Base class of all models that make scenes from photos: its inputs, cameras, units and files."""
+"""Base class of all models that make scenes from photos: inputs, cameras, units and files."""
 
 import json
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from jaxtyping import Float
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.data.images.photograph import Photograph, Picture, picture_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import atomic_path, make_folder, write_text
@@ -22,7 +24,7 @@ from completesplat.weights import CONFIG_FILE, WEIGHTS_FILE, write_sums
 
 
 class SceneModel(nn.Module):
-    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedGenerator`.
+    """Base class of models from photos to scenes: `CompleteSplat`, which samples, `OneAnswer`, `PublishedOneAnswer`.
 
     Args:
         architecture: the config that is written beside the weights; it has `image_size`.
@@ -35,6 +37,12 @@ class SceneModel(nn.Module):
     draws_samples = False
     """Whether it has several answers for one photo."""
 
+    note: str | None = None
+    """Advice to users about the photos that it needs."""
+
+    background: float | None = None
+    """Grey value behind the objects in all its training images; None if they show whole scenes."""
+
     def __init__(self, architecture: dict[str, Any]) -> None:
         super().__init__()
         self.architecture = architecture
@@ -46,8 +54,13 @@ class SceneModel(nn.Module):
 
     @property
     @abstractmethod
-    def reconstructing(self) -> Any:
-        """Return the network that makes a Splatter Image from one image, or from several views, without sampling."""
+    def reconstruction_model(self) -> ReconstructionModel:
+        """Return the network that makes a Splatter Image without sampling."""
+
+    @property
+    def default_steps(self) -> int:
+        """Return the number of denoising steps of a drawing without `steps`; 1 if it draws no samples."""
+        return 1
 
     @abstractmethod
     def generate(self, *inputs: Any, **settings: Any) -> Gaussians:
@@ -56,8 +69,15 @@ class SceneModel(nn.Module):
     @property
     def parameterization(self) -> Parameterization:
         """Return the parameterization of its Splatter Images."""
-        parameterization: Parameterization = self.reconstructing.parameterization
-        return parameterization
+        return self.reconstruction_model.parameterization
+
+    def replace_sampler(self, sampler: Mapping[str, Any]) -> None:
+        """Use another sampler from now on; raise CompleteSplatError if the model draws no samples."""
+        raise CompleteSplatError("these weights draw no samples: leave out sampler")
+
+    def needed_of_data(self, data: Mapping[str, object]) -> dict[str, object]:
+        """Return the settings that a data set with the config `data` must have for this model."""
+        return {"image_size": self.image_size}
 
     def forward(
         self, image: Photograph | Picture, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
@@ -93,7 +113,7 @@ class SceneModel(nn.Module):
         """Reconstruct the scene of several views at the posterior's mean, without sampling.
 
         Args:
-            views: [view ...], in the model's units (`in_own_units`); the first is the reference, its frame the world.
+            views: [view ...], in the model's units (`in_model_units`); the first is the reference, its frame the world.
 
         Returns:
             Gaussians in the frame of the first camera.
@@ -101,14 +121,13 @@ class SceneModel(nn.Module):
         Raises:
             WeightsError: the posterior of these weights sees one image alone.
         """
-        if not getattr(self.reconstructing, "sees_views", False):
-            raise WeightsError("these weights reconstruct from one picture: they were trained with posterior=image")
+        if not self.reconstruction_model.sees_views:
+            raise WeightsError("these weights reconstruct from one image: they were trained with posterior=image")
         batch, depth_range = views.to(self.up.device)[None], self.depth_range[None]
-        splatter_image = self.eval().reconstructing(batch.images[:, 0], batch, depth_range).splatter_image
-        scene: Gaussians = splatter_image.gaussians(batch.cameras[:, 0], depth_range)[0]
-        return scene
+        reconstruction: Reconstruction = self.eval().reconstruction_model(batch.images[:, 0], batch, depth_range)
+        return reconstruction.splatter_image.gaussians(batch.cameras[:, 0], depth_range)[0]
 
-    def in_own_units(self, cameras: Cameras) -> Cameras:
+    def in_model_units(self, cameras: Cameras) -> Cameras:
         """Scale the world of cameras in any units to the model's units.
 
         The point nearest to all optical axes gets the depth at which untrained Gaussians start
@@ -125,9 +144,9 @@ class SceneModel(nn.Module):
         share = self.parameterization.first_depth
         return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
 
-    def read(self, picture: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+    def read(self, image: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's."""
-        return read_photograph(picture, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
+        return read_photograph(image, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
 
     @property
     def knows_hidden(self) -> bool:
@@ -171,3 +190,15 @@ def require_one(samples: int) -> None:
     """Raise CompleteSplatError if several samples are asked of a model that gives one answer."""
     if samples != 1:
         raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")
+
+
+def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return a training set's typical camera as tensors of a `SceneModel`.
+
+    Raises:
+        WeightsError: the camera lacks `fov_degrees`, `depth_range` or `up`, or they are no numbers.
+    """
+    try:
+        return {name: torch.tensor(camera[name], dtype=torch.float32) for name in ("fov_degrees", "depth_range", "up")}
+    except (KeyError, TypeError, ValueError) as error:
+        raise WeightsError("the training set's typical camera is not known") from error

@@ -8,15 +8,15 @@ import torch
 from PIL import Image
 
 from completesplat.export.video import write_video
-from completesplat.results.html_page import EMPTY
 
+EMPTY = {"img", "meta", "link", "br"}  # elements that have no end tag
 HOSTILE = '<img src=x onerror=alert(1)> & "quoted"'
 FRAMES, SAMPLES = 12, 3
 PROTOCOL = {"data_set": "toy_objects", "resolution": 64, "scenes": 2, "method": HOSTILE}
 
 
 def grey(sample: int, frame: int) -> float:
-    """What all pixels of a frame of a sample's video are."""
+    """Return the value of all pixels of a frame of a sample's video."""
     return (frame + 1) / (FRAMES + 1) * (1 - 0.2 * sample)
 
 
@@ -28,7 +28,8 @@ def write_results(root: Path) -> None:
     (run / "config.yaml").write_text(f"seed: 0 # {HOSTILE}\n")
     for step in range(5):
         picture(run / f"pictures/step_00000{step}.png", 40 * step)
-    _write(root / "modes/hidden_modes.json", {"model": {"coverage": 0.875, "scenes": 2, "samples": 4}})
+    modes = {"coverage": 0.875, "total_variation": 0.5, "sharpness": 1.0, "rejected": 0.25, "scenes": 2, "samples": 4}
+    _write(root / "modes/hidden_modes.json", {"model": modes})
     _write(root / "modes/protocol.json", PROTOCOL)
     picture(root / "modes/hidden_modes.png", 200, (2400, 60))
     _write(root / "samplers/samplers.json", {"rows": [{"sampler": "ddim", "steps": 50, "psnr": 17.25, "more": {}}]})
@@ -77,4 +78,4 @@ class Page(HTMLParser):
     def all(self, tag: str, **attributes: str) -> list[dict[str, str | None]]:
         """The attributes of all elements of a kind; `class_` for `class`."""
         wanted = {key.rstrip("_").replace("_", "-"): value for key, value in attributes.items()}
-        return [found for name, found in self.elements if name == tag and wanted.items() <= found.items()]
+        return [present for name, present in self.elements if name == tag and wanted.items() <= present.items()]

@@ -48,11 +48,19 @@ class Logging(BoringModel):
         self.log("val/loss", self.layer(batch).square().mean())
 
 
-def fit(folder: Path, steps: int = STEPS, every: int = 1, model: type[Logging] = Logging, **settings: object) -> None:
+def fit(
+    folder: Path,
+    steps: int = STEPS,
+    every: int = 1,
+    model: type[Logging] = Logging,
+    keep_every: int = 5,
+    start: Path | None = None,
+    **settings: object,
+) -> None:
     """Go on in a folder, as `completesplat fit ckpt_path=last` does, and write the final row."""
     torch.manual_seed(0)
     module, logger = model(), ContinuedCSVLogger(str(folder))
-    checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=every, keep_every=5 * every)
+    checkpoints = Checkpoints(str(folder / "checkpoints"), every_n_train_steps=every, keep_every=keep_every * every)
     trainer = Trainer(
         max_steps=steps, accelerator="cpu", logger=logger, plugins=[CheckpointFiles()], callbacks=[checkpoints],
         log_every_n_steps=2, val_check_interval=3, check_val_every_n_epoch=None, num_sanity_val_steps=0,
@@ -60,7 +68,8 @@ def fit(folder: Path, steps: int = STEPS, every: int = 1, model: type[Logging] =
     )  # fmt: skip
     last = folder / "checkpoints" / LAST
     validation = torch.utils.data.DataLoader(torch.ones(1, 32))
-    trainer.fit(module, Batches(), validation, ckpt_path=last if last.is_file() else None, weights_only=True)
+    start = start or (last if last.is_file() else None)
+    trainer.fit(module, Batches(), validation, ckpt_path=start, weights_only=True)
     figures = {name: value.item() for name, value in trainer.callback_metrics.items()}
     logger.log_metrics(figures, step=trainer.global_step)
 

@@ -44,16 +44,16 @@ def jpeg(content: str) -> str:
 def slimmed(notebook: Notebook) -> Notebook:
     """With small pictures, each stream in one piece, without bars that moved, and with its hash."""
     for cell in code_cells(notebook):
-        kept: list[dict[str, Any]] = []
+        outputs: list[dict[str, Any]] = []
         for output in cell["outputs"]:
             data = output.get("data", {})
             if "image/png" in data:
                 data["image/jpeg"] = jpeg("".join(data.pop("image/png")))
-            if kept and output["output_type"] == "stream" and kept[-1].get("name") == output["name"]:
-                kept[-1]["text"] += output["text"]
+            if outputs and output["output_type"] == "stream" and outputs[-1].get("name") == output["name"]:
+                outputs[-1]["text"] += output["text"]
             elif output["output_type"] != "display_data" or "image/jpeg" in data:
-                kept.append(output)
-        cell["outputs"] = kept
+                outputs.append(output)
+        cell["outputs"] = outputs
     notebook["metadata"]["language_info"] = {"name": "python"}
     notebook["metadata"]["completesplat"] = {HASH: hash_of(notebook)}
     return notebook

@@ -22,7 +22,7 @@ TREES = {path: ast.parse(text, path) for path, text in FILES.items()}
 LAYERS = """
     errors signals files settings ply_files weights tensors geometry gaussians splatter_image scene
     rasterizers
-    opening data autoreconstructor diffusion losses metrics baselines parts scene_model published generator export
+    data autoreconstructor diffusion losses metrics scene_model baselines opening generator export
     training viewer results studies commands cli
     benchmarks
 """

@@ -41,18 +41,18 @@ DELTAS = ["experiment", "ablation", "posterior", "objective"]
 def needed(group: str, option: str) -> list[str]:
     """What else has to be said for an option, so that nothing is missing in the configuration."""
     given = ["data.category=y"] if option == "co3d_category" else []
-    given += ["data.root=x"] if option.startswith(("co3d_", "re10k_", "realestate10k")) else []
+    given += ["data.root=x"] if option.startswith(("co3d_", "paper_", "realestate10k")) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
-    given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked", "_from_checkpoint")) else []
+    given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
     given += ["model.model.weights=x"] if option == "splatter_image_published" else []
     stage2 = group == "experiment" and option.endswith("_diffusion")
     given += ["evaluation.data.scene_list=x"] if option == "realestate10k_100" else []
-    indexed = option.startswith(("re10k_", "realestate10k_")) and option != "realestate10k_100"
+    indexed = option.startswith("realestate10k_") and option != "realestate10k_100"
     given += ["evaluation.data.evaluation_index=x"] if indexed else []
-    return given + (["model.autoreconstructor_checkpoint=null"] if stage2 or option == "latent_diffusion" else [])
+    return given + (["model.autoreconstructor_checkpoint=null"] if stage2 else [])
 
 
-def complete(group: str, option: str):
+def complete(group: str, option: str, *more: str):
     """A configuration with this option in which nothing is missing."""
     chosen = {group: option}
     if group not in DELTAS:
@@ -60,7 +60,7 @@ def complete(group: str, option: str):
         others = [other for other in TRAINING_GROUPS if other not in DELTAS]
         chosen = {other: options(other)[number % len(options(other))] for other in others}
     settings = dict.fromkeys(setting for item in chosen.items() for setting in needed(*item))
-    return compose_config("fit", *(f"{key}={value}" for key, value in chosen.items()), *settings, "out=/nowhere")
+    return compose_config("fit", *(f"{key}={value}" for key, value in chosen.items()), *settings, *more, "out=/nowhere")
 
 
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
@@ -96,32 +96,37 @@ STARTS = {
 
 
 @pytest.mark.parametrize(
-    ("data", "stage"), [(d, s) for d in ("co3d", "re10k", "toy") for s in STARTS if f"{d}_{s}" in options("experiment")]
+    ("kind", "stage"), [(k, s) for k in ("paper", "toy") for s in STARTS if f"{k}_{s}" in options("experiment")]
 )
-def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from(data, stage):
-    config = compose_config("fit", f"experiment={data}_{stage}")
+def test_an_experiment_asks_for_its_data_and_for_what_it_starts_from(kind, stage):
+    config = compose_config("fit", f"experiment={kind}_{stage}")
     missing = OmegaConf.missing_keys(config.data) | OmegaConf.missing_keys(config.model)
-    assert missing == {STARTS[stage]} | (set() if data == "toy" else {"data.root"})
+    missing |= {f"model.{key}" for key, value in OmegaConf.to_container(config.model).items() if value == ""}
+    assert missing == {STARTS[stage]} | (set() if kind == "toy" else {"data.root"})
 
 
 def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock():
-    for experiment in [option for option in options("experiment") if option.startswith(("co3d_", "re10k_"))]:
+    for experiment in [option for option in options("experiment") if option.startswith(("co3d_", "paper_"))]:
         config = compose_config("fit", f"experiment={experiment}")
         assert config.rasterizer._target_.endswith("selection.cuda")
         checkpoint = config.callbacks.checkpoint
         assert (checkpoint.every_n_train_steps, checkpoint.every_minutes) == (None, 30)
         if "small" not in experiment:  # the table that the test after training is for, and Inria's near plane
-            assert config.evaluation.name == ("co3d" if experiment.startswith("co3d_") else "realestate10k_128")
+            assert config.evaluation.name == "co3d"
         assert config.rasterizer.constants.near_plane == 0.2
         elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
         assert instantiate(elsewhere.rasterizer) is not None
 
 
-@pytest.mark.parametrize("data", ["co3d", "re10k"])
+REALESTATE = ["data=realestate10k", "evaluation=realestate10k_128", "evaluation.data.evaluation_index=x"]
+DATA = {"co3d": [], "realestate10k": REALESTATE}
+
+
+@pytest.mark.parametrize("data", DATA)
 def test_the_papers_stages(data):
-    one, two = (complete("experiment", f"{data}_var_stage{n}") for n in (1, 2))
+    one, two = (complete("experiment", f"paper_var_stage{n}", *DATA[data]) for n in (1, 2))
     lengths = [(c.trainer.get("max_epochs"), c.trainer.max_steps) for c in (one, two)]
-    assert lengths == {"co3d": [(6000, -1), (8000, -1)], "re10k": [(None, 200_000), (None, 270_000)]}[data]
+    assert lengths == {"co3d": [(6000, -1), (8000, -1)], "realestate10k": [(None, 200_000), (None, 270_000)]}[data]
     assert [c.optimizer.lr for c in (one, two)] == [5e-5, 5e-6]
     reconstructor = one.autoreconstructor.reconstructor
     assert (reconstructor.parameterization.layers, reconstructor.skip_levels) == (2, [0])
@@ -133,11 +138,13 @@ def test_the_papers_stages(data):
     if data == "co3d":  # tested on sequences never seen, with all their frames
         assert (one.data.subset, one.data.allow_shared_sequences) == ("fewview_dev", False)
         assert (one.data.validation_targets, one.data.evaluation_targets) == (8, None)
+    else:  # the second part goes on with the largest gap
+        assert [(c.data.max_gap.first, c.data.max_gap.last) for c in (one, two)] == [(30, 150), (150, 150)]
 
 
-@pytest.mark.parametrize("data", ["co3d", "re10k"])
+@pytest.mark.parametrize("data", DATA)
 def test_the_papers_diffusion(data):
-    main, masked = (complete("experiment", f"{data}_{name}") for name in ("diffusion", "diffusion_masked"))
+    main, masked = (complete("experiment", f"paper_{name}", *DATA[data]) for name in ("diffusion", "diffusion_masked"))
     assert [c.trainer.max_steps for c in (main, masked)] == [1_000_000, 100_000]
     for config in (main, masked):
         assert (config.optimizer.lr, config.data.batch_size, config.data.image_size) == (1e-4, 32, 128)
@@ -190,14 +197,14 @@ NOT_IN_THE_PAPER = {
     "evaluation/realestate10k_100": "data",
     "evaluation/images": "criterion precision",
     "experiment/_paper": "near_plane",
-    "experiment/co3d_diffusion": "decay color_jitter val_check_interval",
-    "experiment/co3d_diffusion_masked": "defaults box_masks",
+    "experiment/paper_diffusion": "decay color_jitter val_check_interval",
+    "experiment/paper_diffusion_masked": "defaults box_masks",
     "loss/stage2": "term",
-    "model/_latent_diffusion": "background scale_batches",
+    "model/latent_diffusion": "background scale_batches",
     "model/preoptimized_vae": "vae normalization_batches opacity_weight kl_weight",
     "model/reconstructor_only": "background code_steps",
     "model/splatter_image": "background",
-    "model/var_from_checkpoint": "background",
+    "model/var": "background",
     "rasterizer/_constants": "near_plane",
     "sampler/_noise": "num_train_timesteps",
     "sampler/ddim50": "_target_",

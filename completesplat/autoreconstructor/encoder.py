@@ -13,11 +13,11 @@ from completesplat.autoreconstructor.posterior import LOG_VARIANCE_RANGE, Poster
 from completesplat.settings.schema import Few, Range, Width, Widths
 
 
-def recompute(block: nn.Module, *inputs: Any) -> Any:
+def recompute(block: nn.Module, *inputs: Tensor | None) -> Tensor:
     """Apply a block; in training, do not store its activations but recompute them in the backward pass."""
-    if block.training and torch.is_grad_enabled():
-        return checkpoint(block, *inputs, use_reentrant=False)
-    return block(*inputs)
+    recomputed = block.training and torch.is_grad_enabled()
+    output: Tensor = checkpoint(block, *inputs, use_reentrant=False) if recomputed else block(*inputs)
+    return output
 
 
 def vae_encoder(
@@ -104,5 +104,6 @@ class Encoder(nn.Module):
             features.append(hidden)
         return features
 
-    def _run(self, block: nn.Module, *inputs: Any) -> Any:
-        return recompute(block, *inputs) if self.gradient_checkpointing else block(*inputs)
+    def _run(self, block: nn.Module, *inputs: Tensor | None) -> Tensor:
+        output: Tensor = recompute(block, *inputs) if self.gradient_checkpointing else block(*inputs)
+        return output

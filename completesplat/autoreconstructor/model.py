@@ -24,7 +24,17 @@ class Reconstruction(TensorDataclass):
     posterior: Posterior | None
 
 
-class VariationalAutoReconstructor(nn.Module):
+class ReconstructionModel(nn.Module):
+    """Base class of networks from images to a `Reconstruction`: the autoreconstructor, and baselines without views."""
+
+    parameterization: Parameterization
+    """Parameterization of the predicted Splatter Images."""
+
+    sees_views = False
+    """Whether the posterior depends on views other than the reference."""
+
+
+class VariationalAutoReconstructor(ReconstructionModel):
     """Encoder and reconstructor (paper, Section 3.2 and Figure 3).
 
     In training a latent is drawn from the posterior, and all skip features of a sample are zeroed together with
@@ -59,20 +69,12 @@ class VariationalAutoReconstructor(nn.Module):
         self.reconstructor = reconstructor
         self.skip_dropout = skip_dropout
         self.view_encoder = view_encoder
+        self.sees_views = view_encoder is not None
+        self.parameterization = reconstructor.parameterization
         self.variational = variational
         encoder.gradient_checkpointing = reconstructor.gradient_checkpointing = gradient_checkpointing
         if pretrained is not None:
-            load_pretrained(encoder, reconstructor, pretrained)
-
-    @property
-    def sees_views(self) -> bool:
-        """Whether the posterior depends on views other than the reference."""
-        return self.view_encoder is not None
-
-    @property
-    def parameterization(self) -> Parameterization:
-        """Return the parameterization of the predicted Splatter Images."""
-        return self.reconstructor.parameterization
+            load_pretrained(pretrained, encoder, reconstructor)
 
     def posterior(
         self,

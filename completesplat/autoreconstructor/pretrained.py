@@ -13,10 +13,11 @@ from torch import Tensor, nn
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.reconstructor import Reconstructor
 from completesplat.errors import WeightsError
+from completesplat.weights import CONFIG_FILE, first_line, from_hub
+from completesplat.weights.checkpoint_reading import mismatch
 
-CONFIG_FILE = "config.json"
 WEIGHTS_FILES = ("diffusion_pytorch_model.safetensors", "diffusion_pytorch_model.bin")
-SUBFOLDERS = ("", "vae")  # a VAE by itself, or within a whole pipeline
+PLACES = ("", "vae/")  # a VAE by itself, or within a whole pipeline
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
 ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
@@ -31,7 +32,7 @@ SETTINGS = {
 }
 
 
-def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str) -> None:
+def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor | None = None) -> None:
     """Load a VAE, except for the last convolution, whose outputs are a Splatter Image here.
 
     The reconstructor's skips have no counterpart in the checkpoint and keep their values.
@@ -39,56 +40,29 @@ def load_pretrained(encoder: Encoder, reconstructor: Reconstructor, source: str)
     Args:
         source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), a folder with these
             in a subfolder `vae`, or a hub id of either.
+        reconstructor: None loads the encoder alone; the checkpoint may then lack a decoder.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
     """
     folder = _vae_folder(source)
-    decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
-    _load(folder, encoder, decoder, _read_vae(folder))
-
-
-def load_pretrained_encoder(encoder: Encoder, source: str) -> None:
-    """Load the encoder of a VAE like `load_pretrained`; the checkpoint may lack a decoder.
-
-    Raises:
-        WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
-    """
-    folder = _vae_folder(source)
-    weights = {name: value for name, value in _read_vae(folder).items() if name.startswith(ENCODER)}
-    _load(folder, encoder, {}, weights)
-
-
-def _read_vae(folder: Path) -> dict[str, Tensor]:
-    return {_current_name(name): value for name, value in _read_weights(folder).items()}
-
-
-def _load(folder: Path, encoder: Encoder, decoder: Mapping[str, nn.Module], weights: Mapping[str, Tensor]) -> None:
+    weights = {_current_name(name): value for name, value in _read_weights(folder).items()}
+    decoder: dict[str, nn.Module] = {}
+    if reconstructor is None:
+        weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
+    else:
+        decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
     config = _read_config(folder / CONFIG_FILE)
     # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
     vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
-    groups: Any = encoder.network.conv_norm_out
-    mismatch = _mismatch(weights, vae.state_dict(), config.get("norm_num_groups", 32), groups.num_groups)
-    if mismatch:
-        raise WeightsError(f"{folder}: {mismatch}; {_needed_settings(config)}")
-    vae.load_state_dict({name: value for name, value in weights.items() if name not in HEAD}, strict=False)
-
-
-def _mismatch(weights: Mapping[str, Tensor], own: Mapping[str, Tensor], groups: int, own_groups: int) -> str | None:
-    """Describe the first mismatch between a checkpoint and the network, if there is one."""
-    own = {name: value for name, value in own.items() if name not in HEAD}
-    for name, value in own.items():
-        if name in weights and weights[name].shape != value.shape:
-            return f"{name} is {list(weights[name].shape)} there and {list(value.shape)} here"
-    for name in own:
-        if name not in weights:
-            return f"{name} is missing there"
-    for name in weights:
-        if name not in own and name not in HEAD:
-            return f"{name} has no place here"
-    if groups != own_groups:  # no tensor's shape shows it
-        return f"its group normalisation has {groups} groups and {own_groups} here"
-    return None
+    expected, given = ({k: x for k, x in named.items() if k not in HEAD} for named in (vae.state_dict(), weights))
+    reason, groups = mismatch(expected, given), config.get("norm_num_groups", 32)
+    assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
+    if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
+        reason = f"its group normalisation has {groups} groups and {encoder.network.conv_norm_out.num_groups} here"
+    if reason is not None:
+        raise WeightsError(f"{folder}: {reason}; {_needed_settings(config)}")
+    vae.load_state_dict(given, strict=False)
 
 
 def _needed_settings(config: Mapping[str, Any]) -> str:
@@ -108,7 +82,8 @@ def _vae_folder(source: str) -> Path:
         folder = _find(local)
     elif HUB_ID.fullmatch(source):
         hint = _fetch_hint(source)
-        folder = _find(_download(source, WEIGHTS_FILES[0])) or _find(_download(source, WEIGHTS_FILES[1]))
+        names = [[f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)] for file in WEIGHTS_FILES]
+        folder = _find(from_hub(source, names[0], hint)) or _find(from_hub(source, names[1], hint))
     else:
         raise WeightsError(f"{source}: no such folder; {_fetch_hint('CompVis/stable-diffusion-v1-4')}")
     if folder is None:
@@ -118,23 +93,10 @@ def _vae_folder(source: str) -> Path:
 
 
 def _find(folder: Path) -> Path | None:
-    for candidate in (folder / subfolder for subfolder in SUBFOLDERS):
+    for candidate in (folder / place for place in PLACES):
         if (candidate / CONFIG_FILE).is_file() and any((candidate / name).is_file() for name in WEIGHTS_FILES):
             return candidate
     return None
-
-
-def _download(hub_id: str, weights_file: str) -> Path:
-    from huggingface_hub import snapshot_download
-
-    wanted = [f"{subfolder}/{name}".lstrip("/") for subfolder in SUBFOLDERS for name in (CONFIG_FILE, weights_file)]
-    try:
-        return Path(snapshot_download(hub_id, allow_patterns=wanted))
-    except Exception as error:  # from the hub, its HTTP library or the file system
-        reason = _first_line(error).split(". ")[0]
-        raise WeightsError(
-            f"{hub_id}: no folder here, and not to be had from the hub ({reason}); {_fetch_hint(hub_id)}"
-        ) from error
 
 
 def _fetch_hint(hub_id: str) -> str:
@@ -148,7 +110,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise WeightsError(f"{path}: cannot be read: {_first_line(error)}") from error
+        raise WeightsError(f"{path}: cannot be read: {first_line(error)}") from error
     config = config if isinstance(config, dict) else {}
     kind = config.get("_class_name")
     if kind != "AutoencoderKL":
@@ -165,7 +127,7 @@ def _read_weights(folder: Path) -> dict[str, Tensor]:
             return load_file(path)
         weights = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        raise WeightsError(f"{path}: damaged or no weights ({_first_line(error)}); fetch it again") from error
+        raise WeightsError(f"{path}: damaged or no weights ({first_line(error)}); fetch it again") from error
     if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise WeightsError(f"{path}: not a mapping of names to tensors; give diffusers' own file")
     return weights
@@ -175,7 +137,3 @@ def _current_name(name: str) -> str:
     path, _, rest = name.partition(".attentions.0.")
     layer, _, kind = rest.partition(".")
     return f"{path}.attentions.0.{OLD_ATTENTION[layer]}.{kind}" if layer in OLD_ATTENTION else name
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)

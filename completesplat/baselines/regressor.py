@@ -4,15 +4,15 @@ from typing import Any
 
 from diffusers import UNet2DModel
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from completesplat.autoreconstructor.encoder import recompute
-from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.settings.schema import Few, Levels, Share, Width, Widths
 from completesplat.splatter_image import Parameterization, from_channels, initialize_head
 
 
-class SplatterImageUNet(nn.Module):
+class SplatterImageUNet(ReconstructionModel):
     """U-Net from an image to a Splatter Image, after Szymanowicz et al., "Splatter Image" (CVPR 2024).
 
     Upstream's network is EDM's SongUNet without noise level (`scene/gaussian_predictor.py`); defaults are its sizes.

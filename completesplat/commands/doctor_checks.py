@@ -17,7 +17,7 @@ from completesplat.metrics.image_sets import URL as INCEPTION_URL
 from completesplat.rasterizers import Rasterizer, RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.selection import FASTER, TOLERANCE, failure
-from completesplat.weights import BOX, CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, weights_folder
+from completesplat.weights import CONFIG_FILE, SHIPPED, SUMS_FILE, WEIGHTS_FILE, check_folder
 
 GOOD = "a test rendering is as it should be"
 WEIGHTS_FILES = (CONFIG_FILE, WEIGHTS_FILE, SUMS_FILE)
@@ -60,7 +60,7 @@ def wrong(rasterizer: Rasterizer) -> str | None:
     return None
 
 
-def check_weights(box: Path = BOX) -> Iterator[Finding]:
+def check_weights(box: Path = SHIPPED) -> Iterator[Finding]:
     """Yield the package's weights, in folders of `box`, and published ones, which are downloaded if missing."""
     folders = sorted({path.parent for path in box.glob("*/*.*") if path.name in WEIGHTS_FILES})
     yield from map(_own, folders)
@@ -77,7 +77,7 @@ def check_weights(box: Path = BOX) -> Iterator[Finding]:
 
 def _own(folder: Path) -> Finding:
     try:
-        weights_folder(folder)
+        check_folder(folder)
     except (OSError, WeightsError) as error:
         return Finding(folder.name, "broken", f"{error}; install completesplat again")
     count = (folder / WEIGHTS_FILE).stat().st_size

@@ -1,14 +1,14 @@
-"""`completesplat test`: images of a trained model against true ones, as `fit` scores them, too; and hidden modes."""
+"""`completesplat test`: score a trained model's images against true ones, and its samples against hidden modes."""
 
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict, cast
 
 import torch
 from hydra.utils import instantiate
-from lightning import seed_everything
-from omegaconf import OmegaConf
+from lightning import Trainer, seed_everything
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import track
 
@@ -17,53 +17,54 @@ from completesplat.commands.jobs import CONFIG, METRICS
 from completesplat.commands.protocol import drawing, protocol, provenance, write_json
 from completesplat.commands.trained import Trained
 from completesplat.data.hidden_modes import hidden_modes
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_modes, log_shown
+from completesplat.results.wandb import begin, finished, log_modes, log_test
 from completesplat.settings.schema import Natural, Positive, Range
-from completesplat.training.loggers import finished
+from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 
 
-def scored_data(run_config: Any, evaluation: Mapping[str, Any]) -> Any:
-    """The data of a run's settings, which are changed as the protocol says.
+def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneDataModule:
+    """Return the data of a run's config, with the protocol's changes.
 
-    Where it scores at a larger size than the model's, the model sees what the data give at its own size.
+    If the protocol scores at a larger size than the model's, the model still sees images of its size.
 
     Raises:
-        CompleteSplatError: the protocol is of no pictures or of other data, changes a setting that these data have not
-            got, lacks a file, or scores at a smaller size.
+        CompleteSplatError: the protocol is not for images or for other data, changes a setting that these data lack,
+            lacks a file, or scores at a smaller size.
         DataError: the protocol's files cannot be used, or prepared images are smaller than it needs.
     """
     chosen = f"evaluation={evaluation['name']}"
     if "scoring" not in evaluation:
-        raise CompleteSplatError(f"{chosen}: fit scores pictures only; set test=false")
+        raise CompleteSplatError(f"{chosen}: fit scores images only; set test=false")
     for key, value in evaluation["data"].items():
         if key not in run_config.data:
             raise CompleteSplatError(f"{chosen}: the data of this run have no setting {key}")
         if value == "???":
             raise CompleteSplatError(f"{chosen} needs evaluation.data.{key}=FILE (fit: or test=false)")
         run_config.data[key] = value
-    data = instantiate(run_config.data, _convert_="all")
-    found = data.describe()["data_set"]
-    if evaluation["data_set"] is not None and found.partition("/")[0] != evaluation["data_set"]:
-        said = f"is of {evaluation['data_set']}, this run's data are {found}: use evaluation=images"
-        raise CompleteSplatError(f"{chosen} {said}")
+    data: SceneDataModule = instantiate(run_config.data, _convert_="all")
+    data_set = str(data.describe()["data_set"])
+    if evaluation["data_set"] not in (None, data_set.partition("/")[0]):
+        message = f"is of {evaluation['data_set']}, this run's data are {data_set}: use evaluation=images"
+        raise CompleteSplatError(f"{chosen} {message}")
     resolution, size = evaluation["resolution"], data.image_size
     if resolution is None or resolution == size:
         return data
     if resolution < size:
         raise CompleteSplatError(f"evaluation.resolution={resolution}: below the model's {size}")
-    larger = instantiate(run_config.data, image_size=resolution, _convert_="all")
+    larger: SceneDataModule = instantiate(run_config.data, image_size=resolution, _convert_="all")
     if is_packed(data.root):
         settings_must_match(larger.root, larger.packed_settings())
     larger.at_model_size = data
     return larger
 
 
-def set_scoring(module: Any, evaluation: Mapping[str, Any]) -> None:
-    """Give a model the protocol's metrics; `CompleteSplatError` for several samples of one that gives one answer."""
+def set_scoring(module: Stage, evaluation: Mapping[str, Any]) -> None:
+    """Give a model the protocol's metrics; raise CompleteSplatError if it cannot draw several samples."""
     module.evaluation = instantiate(evaluation["scoring"], _convert_="all")
     if module.evaluation.samples > 1 and not module.draws_samples:
         raise CompleteSplatError("evaluation.scoring.samples: this model draws no samples, it gives one answer")
@@ -81,7 +82,7 @@ def run(
 
     Args:
         trained: the arguments of `Trained`.
-        evaluation, trainer, logger: configurations of the protocol, the trainer (without precision), loggers by name.
+        evaluation, trainer, logger: configs of the protocol, the trainer (without precision), loggers by name.
     """
     tested = Trained(**trained)
     run_config = tested.configuration()
@@ -91,19 +92,23 @@ def run(
     module = tested.open_module(run_config)
     set_scoring(module, evaluation)
     loggers = list(instantiate(logger or {}, _convert_="all").values())
-    testing = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
+    tester: Trainer = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
     with finished(loggers):
-        shown = begin(module, testing, OmegaConf.load(out / CONFIG), out)
-        testing.test(module, datamodule=data, verbose=False)
+        scenes = begin(module, tester, _config_of(out), out)
+        tester.test(module, datamodule=data, verbose=False)
         results = module.test_results()
-        if not testing.is_global_zero:
+        if not tester.is_global_zero:
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         write_json(out / METRICS, {"protocol": described} | results)
-        log_shown(results, shown, testing, out)
+        log_test(results, scenes, tester)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
+
+
+def _config_of(out: Path) -> DictConfig:
+    return cast(DictConfig, OmegaConf.load(out / CONFIG))
 
 
 class HiddenModesEvaluation(TypedDict):
@@ -133,10 +138,13 @@ def run_hidden_modes(
     logger: Mapping[str, Any] | None,
     out: Path,
 ) -> None:
-    """Write the JSON files of hidden_modes, shares, calibration and protocol, `hidden_modes.png`, and print the table.
+    """Write JSON files of hidden modes, shares, calibration and protocol, draw `hidden_modes.png`, print the table.
 
-    Args: as those of `run`; of `trainer` only the `accelerator` counts: "cpu" leaves a GPU alone.
-    `CompleteSplatError`: data whose hidden parts are not known, or no scene that can be used.
+    Args:
+        trainer: only its `accelerator` has an effect; "cpu" leaves a GPU alone.
+
+    Raises:
+        CompleteSplatError: the data's hidden parts are not known, or no scene can be used.
     """
     from completesplat.studies.mode_benchmark import draw, measure, predictors, usable
 
@@ -159,26 +167,25 @@ def run_hidden_modes(
         evaluation["shown_samples"],
         progress,
     )
-    results, calibration = measured.results(samples), measured.calibration()
+    results = measured.results(samples)
     write_json(out / "hidden_modes.json", results)
-    write_json(out / "calibration.json", calibration)
     write_json(out / "shares.json", measured.shares())
     used = {"scenes": measured.names, "skipped": skipped}
     write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
-    draw(measured.shown, results, calibration, samples, out / "hidden_modes.png")
+    draw(measured, samples, out / "hidden_modes.png")
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     with finished(loggers):
-        log_modes(results, out / "hidden_modes.png", OmegaConf.load(out / CONFIG), loggers)
+        log_modes(results, out / "hidden_modes.png", _config_of(out), loggers)
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
-    Console(width=140).print(table(title, COLUMNS, [{"method": method, **found} for method, found in results.items()]))
+    Console(width=140).print(table(title, COLUMNS, [{"method": name, **values} for name, values in results.items()]))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 
 
 def _hidden_modes_protocol(
-    tested: Trained, evaluation: Mapping[str, Any], module: Any, data: Any, scenes: dict[str, list[str]], out: Path
+    tested: Trained, evaluation: Mapping[str, Any], module: Stage, data: Any, scenes: dict[str, list[str]], out: Path
 ) -> dict[str, Any]:
-    """The statement of what was measured and how, with the names of the scenes."""
+    """Return the record of what was measured and how, with the names of the scenes."""
     return {
         "name": evaluation["name"],
         "method": module.method,

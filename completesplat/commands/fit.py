@@ -7,28 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate as build
-from lightning import seed_everything
+from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import WeightAveraging
-from omegaconf import OmegaConf
-from torch import nn
+from lightning.pytorch.utilities.model_summary.model_summary import ModelSummary
+from omegaconf import DictConfig, OmegaConf
 
-from completesplat.baselines.splatter_image.files import write_trained
-from completesplat.baselines.splatter_image.model import PublishedSplatterImage
 from completesplat.commands import quieten
 from completesplat.commands.evaluate import scored_data, set_scoring
 from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.generator import OneAnswer
-from completesplat.opening import without_training
-from completesplat.results.tables import Table, evaluation_table, show, table
-from completesplat.results.wandb import begin, log_shown
+from completesplat.results.tables import evaluation_table, show
+from completesplat.results.wandb import begin, finished, log_test
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
-from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.loggers import finished
-from completesplat.training.reconstruction import ReconstructionModule
+from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.weights import RUN_WEIGHTS
 from completesplat.weights.checkpoint_reading import check_whole
@@ -43,23 +38,9 @@ EXAMPLES = {
     "autoreconstructor_checkpoint": "RUN/checkpoints/last.ckpt of stage 1",
 }
 """Examples of settings that may be missing."""
-COLUMNS = [("part", "part", ""), ("parameters, millions", "millions", ".2f"), ("of these trained", "trained", ".2f")]
 
 
-def parameter_table(module: nn.Module) -> Table:
-    """A line for each network of a module, and for each part of a network with several, if it has parameters."""
-    rows = []
-    for name, child in module.named_children():
-        parts = [(f"  {part}", grandchild) for part, grandchild in child.named_children()]
-        for label, network in [(name, child), *(parts if len(parts) > 1 else [])]:
-            sizes = [(parameter.numel(), parameter.requires_grad) for parameter in network.parameters()]
-            if sizes:
-                millions, trained = sum(n for n, _ in sizes) / 1e6, sum(n for n, learns in sizes if learns) / 1e6
-                rows.append({"part": label, "millions": millions, "trained": trained})
-    return table("Model", COLUMNS, rows)
-
-
-def instantiate(config: Any) -> tuple[Any, Any]:
+def instantiate(config: DictConfig) -> tuple[SceneDataModule, Stage]:
     """Return the LightningDataModule and the LightningModule of a config that `completesplat.compose` returned.
 
     They are what `completesplat fit` trains. Checkpoints of the model hold its config, which `load_from_checkpoint`
@@ -74,142 +55,111 @@ def instantiate(config: Any) -> tuple[Any, Any]:
     check_image_size(config)
     check_optimizer(config.optimizer)
     data, module = build(config.data, _convert_="all"), build(config.model, _convert_="all")
-    check_published_size(module, config)
     if config.test:
         set_scoring(module, config.evaluation)
-    model: Any = OmegaConf.create({"model": OmegaConf.to_container(config.model, resolve=True)})
-    module.config = OmegaConf.to_container(without_training(model))
+    module.keep_config(config.model)
     return data, module
 
 
 @stopped_together()
-def run(config: Any, out: Path) -> None:
-    """Leave `metrics.csv`, checkpoints and, when all is done, `metrics.json` in the run directory."""
+def run(config: DictConfig, out: Path) -> None:
+    """Train and test; write `metrics.csv`, checkpoints and at the end `metrics.json` into the run directory."""
     quieten()
     checkpoint = checkpoint_to_continue(config, out)
     seed_everything(config.seed, verbose=False)
     data, module = instantiate(config)
-    # What cannot be scored is refused now, not after the training.
+    # A test that cannot work is refused now, not after the training.
     tested = scored_data(copy.deepcopy(config), config.evaluation) if config.test else None
-    callbacks, loggers = _parts(config.callbacks), _parts(config.logger)
+    callbacks, loggers = (
+        [part for part in build(parts, _convert_="all").values() if part is not None]
+        for parts in (config.callbacks, config.logger)
+    )
     trainer = build(config.trainer, callbacks=callbacks, logger=loggers, _convert_="all")
     share = batch_per_process(data.batch_size, trainer.world_size, trainer.accumulate_grad_batches)
     if trainer.is_global_zero:
-        show(parameter_table(module))
+        print(ModelSummary(module, max_depth=2))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
     with finished(loggers):
-        shown = begin(module, trainer, config, out)
-        metrics = _train(trainer, module, data, checkpoint)
-        if trainer.is_global_zero:
-            export_weights(config, module, data, out / RUN_WEIGHTS)
+        scenes, metrics = begin(module, trainer, config, out), {}
+        if any(parameter.requires_grad for parameter in module.parameters()):
+            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+            metrics = _logged(trainer)
+            if trainer.is_global_zero:
+                module.save_weights(out / RUN_WEIGHTS)
         if tested is not None:
             metrics |= _test(config, module, tested)
-        for one in loggers:  # a run shorter than the logging interval leaves its figures too
-            one.log_metrics(metrics, step=trainer.global_step)
-            one.save()
-        scores = module.test_results() if tested is not None else None
+        for run_logger in loggers:  # a run shorter than the logging interval has its figures too
+            run_logger.log_metrics(metrics, step=trainer.global_step)
+            run_logger.save()
+        scores = module.test_results() if tested is not None else None  # all processes gather them
         if not trainer.is_global_zero:
             return
-        results = {"steps": trainer.global_step, "epochs": _epochs(trainer), "data.batch_per_process": share}
-        results |= metrics
+        results: dict[str, Any] = {"steps": trainer.global_step, "epochs": _epochs(trainer)}
+        results |= {"data.batch_per_process": share, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
         if scores is not None:
-            log_shown(scores, shown, trainer, out)
+            log_test(scores, scenes, trainer)
 
 
-def _parts(config: Any) -> list[Any]:
-    """Callbacks or loggers: those that are not null."""
-    return [part for part in build(config, _convert_="all").values() if part is not None]
+def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
+    """Return the checkpoint that the run continues from, if any, and remove other weights from the config.
 
-
-def checkpoint_to_continue(config: Any, out: Path) -> str | None:
-    """The checkpoint that the run starts from, if any; `WeightsError` if one that is named is missing or damaged.
-
-    The other weights that the configuration names are not needed then.
+    Raises:
+        WeightsError: the checkpoint is missing or damaged.
     """
-    last = config.ckpt_path == "last"
-    path = newest_whole(out / LAST) if last else None if config.ckpt_path is None else Path(config.ckpt_path)
+    if config.ckpt_path == "last":
+        path = newest_whole(out / LAST)
+    else:
+        path = None if config.ckpt_path is None else Path(config.ckpt_path)
+        if path is not None and not path.is_file():
+            raise WeightsError(f"{path}: no such checkpoint")
+        if path is not None:
+            check_whole(path)
     if path is None:
         return None
-    if not path.is_file():
-        raise WeightsError(f"{path}: no such checkpoint")
-    if not last:
-        check_whole(path)
     for part in (config.autoreconstructor, config.conditioning, config.model):
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None
     return str(path)
 
 
-def refuse_missing(config: Any) -> None:
-    """`CompleteSplatError` for a setting that data or model need and that is not given; it shows what to give."""
-    for part in (config.data, config.model):
-        for key in sorted(OmegaConf.missing_keys(part)):
-            example = EXAMPLES.get(key.rpartition(".")[2], "VALUE")
-            raise CompleteSplatError(f"{key} is needed: give {key}={example}")
+def refuse_missing(config: DictConfig) -> None:
+    """Raise CompleteSplatError, with an example, for a setting of data or model that is missing or an empty text."""
+    missing = [key for part in (config.data, config.model) for key in sorted(OmegaConf.missing_keys(part))]
+    missing += [f"model.{key}" for key in sorted(OTHER_WEIGHTS) if config.model.get(key) == ""]
+    for key in missing[:1]:
+        raise CompleteSplatError(f"{key} is needed: give {key}={EXAMPLES.get(key.rpartition('.')[2], 'VALUE')}")
 
 
-def check_published_size(module: Any, config: Any) -> None:
-    """`CompleteSplatError`: published weights know pictures of another size than the data have."""
-    network = getattr(module, "model", None)
-    if isinstance(network, PublishedSplatterImage) and config.data.image_size != network.image_size:
-        said = f"{network.file.name} wants {network.image_size}"
-        raise CompleteSplatError(f"data.image_size={config.data.image_size}: {said}")
+def _epochs(trainer: Trainer) -> int:
+    """Return the number of begun epochs. (`current_epoch` differs between processes after the last one.)"""
+    if not trainer.global_step:
+        return 0
+    steps_of_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+    return int(-(-trainer.global_step // steps_of_epoch))
 
 
-def export_weights(config: Any, module: Any, data: Any, folder: Path) -> None:
-    """Write what `predict` and `from_pretrained` read: of either stage, and of Splatter Image, the published one too.
-
-    A network that weights may not name is left out, with a warning.
-    """
-    if isinstance(module, LatentDiffusion):
-        module.completesplat.architecture["training"] = data.training_facts()
-        return module.completesplat.save_pretrained(folder)
-    if type(module) is not ReconstructionModule:
-        return None
-    if isinstance(module.model, PublishedSplatterImage):
-        return write_trained(folder, module.model.file, module.model.state_dict())
-    architecture: Any = {"network": OmegaConf.to_container(config.model.model), "image_size": config.data.image_size}
-    try:
-        model = OneAnswer.with_trained(architecture, module.model.state_dict(), module.camera)
-    except WeightsError as error:
-        return logger.warning("no weights are written to %s: %s", folder, error)
-    model.architecture["training"] = data.training_facts()
-    return model.save_pretrained(folder)
-
-
-def _train(trainer: Any, module: Any, data: Any, checkpoint: str | None) -> dict[str, float]:
-    """Everything that was logged, in the end; a model that has nothing to learn beforehand is not trained."""
-    if not any(parameter.requires_grad for parameter in module.parameters()):
-        return {}
-    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+def _logged(trainer: Trainer) -> dict[str, float]:
     return {name: value.item() for name, value in trainer.callback_metrics.items()}
 
 
-def _epochs(trainer: Any) -> int:
-    """How many were begun. (`current_epoch` counts the last one in the process alone that came to its end.)"""
-    if not trainer.global_step:
-        return 0
-    steps_of_one = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
-    return int(-(-trainer.global_step // steps_of_one))
-
-
-def _test(config: Any, module: Any, data: Any) -> dict[str, float]:
-    """Score as `completesplat test` does, in the protocol's precision; everything that was logged."""
+def _test(config: DictConfig, module: Stage, data: SceneDataModule) -> dict[str, float]:
+    """Score as `completesplat test` does, in the protocol's precision, and return all logged figures."""
     progress = build(config.callbacks.progress, _convert_="all")
     settings = {"callbacks": [] if progress is None else [progress], "logger": False, "enable_checkpointing": False}
     trainer = build(config.trainer, precision=config.evaluation.precision, **settings, _convert_="all")
     trainer.test(module, datamodule=data, verbose=False)
-    return {name: value.item() for name, value in trainer.callback_metrics.items()}
+    return _logged(trainer)
 
 
-def _facts(trainer: Any, out: Path) -> dict[str, Any]:
-    """Facts of the weights that were scored: those of the last checkpoint, if any was written."""
+def _facts(trainer: Trainer, out: Path) -> dict[str, Any]:
+    """Return facts of the scored weights: those of the last checkpoint, if one was written."""
     facts = checkpoint_facts(out / LAST) if (out / LAST).is_file() else {}
     if facts.get("checkpoint", {}).get("step") == trainer.global_step:
         return facts
-    return {"checkpoint": None, "ema": any(isinstance(callback, WeightAveraging) for callback in trainer.callbacks)}
+    callbacks: list[object] = trainer.callbacks  # type: ignore[attr-defined]
+    return {"checkpoint": None, "ema": any(isinstance(callback, WeightAveraging) for callback in callbacks)}

@@ -185,7 +185,7 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
         raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
     model = open_generator(config)
     views = read_photographs(pictures, Path(config.cameras), model.image_size)
-    views = replace(views, cameras=model.in_own_units(views.cameras))
+    views = replace(views, cameras=model.in_model_units(views.cameras))
     scene = model.reconstruct(views)
     recorded = {
         "seed": config.seed,

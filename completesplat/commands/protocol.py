@@ -1,56 +1,59 @@
-"""The statement of what was measured and how, which stands beside all figures of a test."""
+"""Protocol of a measurement: what was measured, with which program, and how."""
 
 import json
 import math
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from completesplat import __version__
 from completesplat.files import write_text
 from completesplat.results.machine import machine
 from completesplat.results.runs import origin
 
+if TYPE_CHECKING:
+    from completesplat.data.loading.data_module import SceneDataModule
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write results in one step, so that a file that is there is whole.
 
-    JSON has no NaN and no infinities: they become null, and an entry `not_finite` lists what they were.
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write results in one step, so that an existing file is whole.
+
+    JSON has no NaN and no infinities: they become null, and the entry `not_finite` lists their values.
     """
-    found: list[str] = []
-    kept = {key: _finite(value, key, found) for key, value in content.items()}
-    kept |= {"not_finite": found} if found else {}
-    write_text(path, json.dumps(kept, indent=2, allow_nan=False) + "\n")
+    not_finite: list[str] = []
+    finite = {key: _finite(value, key, not_finite) for key, value in content.items()}
+    finite |= {"not_finite": not_finite} if not_finite else {}
+    write_text(path, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
 
-def _finite(value: Any, place: str, found: list[str]) -> Any:
+def _finite(value: object, place: str, not_finite: list[str]) -> object:
     if isinstance(value, Mapping):
-        return {key: _finite(part, f"{place}.{key}", found) for key, part in value.items()}
+        return {key: _finite(part, f"{place}.{key}", not_finite) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(part, f"{place}.{index}", found) for index, part in enumerate(value)]
+        return [_finite(part, f"{place}.{index}", not_finite) for index, part in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
-        found.append(f"{place}: {value}")
+        not_finite.append(f"{place}: {value}")
         return None
     return value
 
 
 def git_commit() -> str | None:
-    """The commit of the source, marked when there are changes on top; None where there is no repository."""
+    """Return the commit of the source, with `-dirty` if files have changed since; None without a repository."""
 
     def git(*arguments: str) -> str:
         command = ["git", "--no-optional-locks", "-C", str(Path(__file__).parent), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
-        if not git("ls-files", "."):  # an installed package inside somebody else's repository
+        if not git("ls-files", "."):  # the package is installed inside another repository
             return None
         return git("rev-parse", "HEAD").strip() + ("-dirty" if git("status", "--porcelain") else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 
 
-METRICS: dict[str, dict[str, Any]] = {
+METRICS: dict[str, dict[str, object]] = {
     "psnr": {"range": [0, 1], "limit_db": 100},
     "ssim": {"window": 11, "sigma": 1.5, "border": "mirrored, counted", "range": [0, 1]},
     "lpips": {"net": "vgg", "version": "0.1", "range": [-1, 1]},
@@ -60,7 +63,7 @@ METRICS: dict[str, dict[str, Any]] = {
 def protocol(
     evaluation: Mapping[str, Any], module: Any, data: Any, results: dict[str, Any], out: Path
 ) -> dict[str, Any]:
-    """The statement beside a test's results in `out`, which followed a configuration of `conf/evaluation/`."""
+    """Describe what was measured and how, in a test by a config of `conf/evaluation/` with results in `out`."""
     from completesplat.metrics.scoring import BEST_RULES
 
     scored, model = module.evaluation, results["model"]
@@ -88,14 +91,14 @@ def protocol(
     return described
 
 
-def provenance(data: Any, out: Path) -> dict[str, Any]:
-    """The test data, and which program measured with it where; its command is that of `run.json` in `out`."""
+def provenance(data: "SceneDataModule", out: Path) -> dict[str, object]:
+    """Return the test data's fingerprint, and program, command (that of `run.json` in `out`) and machine."""
     program = {"version": __version__, "commit": git_commit(), "command": origin(out, levels=0)["command"]}
     return {"data_fingerprint": data.source("test").fingerprint(), **program, "machine": machine()}
 
 
-def drawing(module: Any) -> dict[str, Any]:
-    """How samples are drawn; nulls for a model that draws none."""
+def drawing(module: Any) -> dict[str, object]:
+    """Return how samples are drawn; nulls for a model that draws none."""
     if not module.draws_samples:
         return dict.fromkeys(("sampler", "steps", "skip_weight", "guidance_weight"))
     sampler = module.completesplat.sampler
@@ -108,7 +111,7 @@ def drawing(module: Any) -> dict[str, Any]:
 
 
 def checkpoint_facts(path: Path) -> dict[str, Any]:
-    """Path, checksum and step of a checkpoint, and whether it holds an average (Lightning's `WeightAveraging`)."""
+    """Return path, checksum and step of a checkpoint, and whether it holds averages (`WeightAveraging`)."""
     from completesplat.weights import sha256_of
     from completesplat.weights.checkpoint_reading import read_checkpoint
 

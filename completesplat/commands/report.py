@@ -3,29 +3,16 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, TypedDict
 
 from completesplat.errors import CompleteSplatError
-from completesplat.files import atomic_path
-from completesplat.results.html_page import page
+from completesplat.files import write_text
+from completesplat.results.html_page import Limits, page
 from completesplat.results.paper_figures import tables as published_tables
 from completesplat.results.runs import find, origin
-from completesplat.results.sweeps import show_summary, write_summary
+from completesplat.results.sweeps import write_summary
 from completesplat.results.tables import show, write_tables
-from completesplat.settings.schema import Positive, Range
 
 logger = logging.getLogger(__name__)
-
-
-class Most(TypedDict):
-    """Limits on the contents of a page; `conf/report_task/html.yaml` explains each."""
-
-    frames: Positive
-    samples: Positive
-    predictions: Positive
-    runs: Positive
-    pictures: Positive
-    megabytes: Annotated[float, Range(1)]
 
 
 def tables(runs: str | None, out: Path) -> None:
@@ -48,14 +35,13 @@ def summary(sweeps: Sequence[str], out: Path) -> None:
     for folder in folders:
         if not folder.is_dir():
             raise CompleteSplatError(f"sweeps={folder}: no such folder")
-    show_summary(write_summary(out, *folders))
+    show(write_summary(out, *folders), width=160)
 
 
-def html(runs: str, most: Most, out: Path) -> None:
+def html(runs: str, most: Limits, out: Path) -> None:
     """Write `report.html`, the `page` on all results below the folder `runs`, and print its size."""
     text, warnings = page(Path(runs), out, most, origin(out, levels=0))
-    with atomic_path(out / "report.html") as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(out / "report.html", text)
     for warning in warnings:
         logger.warning(warning)
     print(f"{out / 'report.html'}: {(out / 'report.html').stat().st_size / 1e6:.1f} MB")

@@ -1,13 +1,14 @@
 """`completesplat report`: studies of a trained model's samples.
 
 Each study raises the errors of `Trained.open`, `first_scenes`, the functions of its module in `completesplat.studies`
-and, if it draws samples, `diffusion_of`. Skip and guidance weights outside of [0, 1] are refused.
+and, if it draws samples, `diffusion_of`.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, Unpack
+from typing import Annotated, TypedDict, Unpack
 
 import torch
 from rich.console import Console
@@ -16,38 +17,44 @@ from completesplat.commands import quieten
 from completesplat.commands.protocol import write_json
 from completesplat.commands.trained import Trained, diffusion_of
 from completesplat.errors import CompleteSplatError
+from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.results.machine import machine
-from completesplat.results.tables import SSIM_NOTE, Column, table
+from completesplat.results.tables import SSIM_NOTE, records_table, show
 from completesplat.scene import SceneBatch
-from completesplat.settings.schema import Entries, Positive, Range
+from completesplat.settings.schema import Entries, Positive, Range, Share
 from completesplat.studies import controls as controls_study
 from completesplat.studies import depth as depth_study
 from completesplat.studies import samplers as samplers_study
 from completesplat.studies import stage1 as stage1_study
-from completesplat.studies.figures import draw_strips
 from completesplat.studies.samples import SampleRenderer, first_scenes
+from completesplat.training.stage import Stage
 
-Numbers = Annotated[Sequence[float], Entries(1)]
+Weights = Annotated[Sequence[Share], Entries(1)]
 
 
 class Run(TypedDict):
-    """A run (`Trained`), the number of its first test scenes, and the number of samples for each."""
+    """A run (`Trained`), and the number of its first test scenes."""
 
     ckpt: str
     overrides: Sequence[str]
     trust: bool
-    seed: int
     scenes: Positive
+
+
+class SampledRun(Run):
+    """A run of stage 2, and the number of samples for each scene."""
+
+    seed: int
     samples: Annotated[int, Range(2)]
 
 
 def samplers(
-    samplers: Mapping[str, Mapping[str, Any]],
+    samplers: Mapping[str, Mapping[str, object]],
     steps: Mapping[str, Annotated[Sequence[Annotated[int, Range(1, 1000)]], Entries(1)]],
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     out: Path,
-    **run: Unpack[Run],
+    **run: Unpack[SampledRun],
 ) -> None:
     """Write `samplers.json` and `samplers.png`; print the table and the fewest steps that are enough.
 
@@ -59,161 +66,132 @@ def samplers(
     for name in steps:
         if name not in samplers:
             raise CompleteSplatError(f"steps.{name}: no such sampler; there are {', '.join(samplers)}")
-    renderer, scenes, settings = _open(run)
+    renderer, scenes, settings = _open_sampled(run)
     weights = {"skip_weight": skip_weight, "guidance_weight": guidance_weight}
     with _status() as tick:
         rows = samplers_study.rows(renderer, samplers, steps, scenes, weights, tick)
     best = samplers_study.fewest(rows)
-    report = {"machine": machine(), "settings": settings | weights, "rows": rows, "fewest": dict(best)}
+    report = {
+        "machine": machine(),
+        "settings": settings | weights,
+        "rows": list(map(asdict, rows)),
+        "fewest": asdict(best),
+    }
     write_json(out / "samplers.json", report)
     title = f"Samplers: {len(scenes)} scenes, {run['samples']} samples each"
     samplers_study.plot_samplers(rows, out / "samplers.png", title)
-    Console(width=120).print(table(f"Samplers, from the same noise. {SSIM_NOTE}", SAMPLERS, rows))
-    name, count = rows[0]["sampler"], rows[0]["steps"]
+    show(records_table(f"Samplers, from the same noise. {SSIM_NOTE}", list(map(asdict, rows))))
     print(
-        f"fewest denoiser calls within {samplers_study.CLOSE} dB of {name} with {count} steps: {best['calls']} "
-        f"({best['sampler']}, {best['steps']} steps, {best['psnr'] - rows[0]['psnr']:+.2f} dB)"
+        f"fewest denoiser calls within {samplers_study.CLOSE} dB of {rows[0].sampler} with {rows[0].steps} steps: "
+        f"{best.calls} ({best.sampler}, {best.steps} steps, {best.psnr - rows[0].psnr:+.2f} dB)"
     )
 
 
 def controls(
-    skip_weights: Numbers, guidance_weights: Numbers, near_degrees: float, shown: int, out: Path, **run: Unpack[Run]
+    skip_weights: Weights,
+    guidance_weights: Weights,
+    near_degrees: float,
+    shown: int,
+    out: Path,
+    **run: Unpack[SampledRun],
 ) -> None:
     """Write `controls.json`, `controls.png` and `controls_grid.png`, and print the table.
 
     All pairs of the weights and the paper's three are measured; `conf/report_task/controls.yaml` explains the settings.
     """
     weights = controls_study.grid(skip_weights, guidance_weights)
-    renderer, scenes, settings = _open(run)
+    renderer, scenes, settings = _open_sampled(run)
     with _status() as tick:
         rows = controls_study.rows(renderer, weights, scenes, near_degrees, tick)
         tick("the grid")
-        pictures = controls_study.strips(renderer, weights, scenes[0], shown)
+        grid = controls_study.strips(renderer, weights, scenes[0], shown)
     write_json(out / "controls.json", {"settings": settings | {"near_degrees": near_degrees}, "rows": rows})
     title = f"Controls: {len(scenes)} scenes, {run['samples']} samples each; (skip, guidance) of the paper in red"
     controls_study.plot_controls(rows, out / "controls.png", title)
-    far = f"far view of {min(shown, run['samples'])}"
-    title = f"{scenes[0].names[0]}: reference view of one sample, {far}; the paper's settings in red"
-    draw_strips(*pictures, out / "controls_grid.png", title)
-    Console(width=120).print(table("Faithfulness (PSNR, dB) and diversity", CONTROLS, rows))
+    title = f"{scenes[0].names[0]}: reference view of one sample, far view of {min(shown, run['samples'])}"
+    _write_sheet(grid, out / "controls_grid.png", title)
+    show(records_table("Faithfulness (PSNR, dB) and diversity", rows))
 
 
-def masked(boxes: Sequence[Sequence[float]], views: int, guidance_weight: float, out: Path, **run: Unpack[Run]) -> None:
+def masked(
+    boxes: Sequence[Sequence[float]], views: int, guidance_weight: Share, out: Path, **run: Unpack[SampledRun]
+) -> None:
     """Write `masked.png`: inputs with boxes over them, and several completions of each.
 
     Boxes are [x0, y0, x1, y1] in fractions of the image (`check_box`); see `conf/report_task/masked.yaml` for the rest.
     """
     for box in boxes:
         controls_study.check_box(box)
-    renderer, scenes, _ = _open(run)
+    renderer, scenes, _ = _open_sampled(run)
     with _status() as tick:
         tick("completions")
-        pictures = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
-    draw_strips(*pictures, out / "masked.png", "Completions of partly hidden inputs, without skips")
+        rows = controls_study.masked_strips(renderer, scenes, boxes, views, guidance_weight)
+    _write_sheet(rows, out / "masked.png", "Completions of partly hidden inputs, without skips")
 
 
 def depth(
-    skip_weight: float,
-    guidance_weight: float,
+    skip_weight: Share,
+    guidance_weight: Share,
     shown_scenes: Positive,
     shown: Positive,
     far_degrees: Annotated[float, Range(0, 180)],
     out: Path,
-    **run: Unpack[Run],
+    **run: Unpack[SampledRun],
 ) -> None:
     """Write `depth.json` and `depth.png`, and print the table; `conf/report_task/depth.yaml` explains the settings."""
     weights = controls_study.grid([skip_weight], [guidance_weight])
-    renderer, scenes, settings = _open(run)
-    drawn = scenes[:shown_scenes]
+    renderer, scenes, settings = _open_sampled(run)
     with _status() as tick:
         rows = depth_study.rows(renderer, weights, scenes, far_degrees, tick)
         tick("the figure")
-        pictures = depth_study.strips(renderer, drawn, skip_weight, guidance_weight, shown)
+        sheet = depth_study.strips(renderer, scenes[:shown_scenes], skip_weight, guidance_weight, shown)
     write_json(out / "depth.json", {"settings": settings | {"far_degrees": far_degrees}, "rows": rows})
     title = f"Render, depth and normals in a far view, and deviation of {run['samples']} samples' depth"
     title += f" in the reference and the far view; skip {skip_weight:g}, guidance {guidance_weight:g}"
-    draw_strips(pictures, [scene.names[0] for scene in drawn], out / "depth.png", title)
-    Console(width=120).print(table("Deviation of depth over samples, scene units", DEPTH, rows))
+    _write_sheet(sheet, out / "depth.png", title)
+    show(records_table("Deviation of depth over samples, scene units", rows))
 
 
-def views(
-    ckpt: str,
-    overrides: Sequence[str],
-    trust: bool,
-    scenes: Positive,
-    counts: Annotated[Sequence[Positive], Entries(1)],
-    out: Path,
-) -> None:
+def views(counts: Annotated[Sequence[Positive], Entries(1)], out: Path, **run: Unpack[Run]) -> None:
     """Write `views.json` and `views.png`, and print the table; `conf/report_task/views.yaml` explains the settings."""
-    module, test_scenes = _open_stage1(ckpt, overrides, trust, scenes)
+    module, scenes = _open(run)
     with _status() as tick:
-        rows = stage1_study.rows_of_views(module, counts, test_scenes, tick)
-    write_json(out / "views.json", {"settings": {"scenes": scenes}, "rows": rows})
-    stage1_study.plot_views(rows, out / "views.png", f"{scenes} scenes, posterior's mean")
-    Console(width=120).print(table("PSNR (dB) of other views by the number of views", VIEWS, rows))
+        rows = stage1_study.rows_of_views(module, counts, scenes, tick)
+    write_json(out / "views.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
+    stage1_study.plot_views(rows, out / "views.png", f"{run['scenes']} scenes, posterior's mean")
+    show(records_table("PSNR (dB) of other views by the number of views", rows))
 
 
-def layers(ckpt: str, overrides: Sequence[str], trust: bool, scenes: Positive, out: Path) -> None:
+def layers(out: Path, **run: Unpack[Run]) -> None:
     """Write `layers.json`, and print the table; `conf/report_task/layers.yaml` explains the settings."""
-    module, test_scenes = _open_stage1(ckpt, overrides, trust, scenes)
+    module, scenes = _open(run)
     with _status() as tick:
-        rows = stage1_study.rows_of_layers(module, test_scenes, tick)
-    write_json(out / "layers.json", {"settings": {"scenes": scenes}, "rows": rows})
-    Console(width=120).print(table("Layers on the object, behind what the picture shows (scene units)", LAYERS, rows))
+        rows = stage1_study.rows_of_layers(module, scenes, tick)
+    write_json(out / "layers.json", {"settings": {"scenes": run["scenes"]}, "rows": rows})
+    show(records_table("Layers on the object, behind the front (scene units)", rows))
 
 
-def _open_stage1(ckpt: str, overrides: Sequence[str], trust: bool, scenes: int) -> tuple[Any, list[SceneBatch]]:
+def _open(run: Run) -> tuple[Stage, list[SceneBatch]]:
     """Return a run's module and its first test scenes, on a GPU if there is one."""
     quieten()
-    module, data = Trained(ckpt, overrides, trust).open()
+    module, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
     module.to("cuda" if torch.cuda.is_available() else "cpu").eval()
-    return module, [scene.to(module.device) for scene in first_scenes(data, scenes)]
+    return module, [scene.to(module.device) for scene in first_scenes(data, run["scenes"])]
 
 
-def _open(run: Run) -> tuple[SampleRenderer, list[SceneBatch], dict[str, Any]]:
+def _open_sampled(run: SampledRun) -> tuple[SampleRenderer, list[SceneBatch], dict[str, float]]:
     """Return the renderer of a run's samples, its first test scenes, and the settings to write beside the results."""
-    quieten()
-    stage, data = Trained(run["ckpt"], run["overrides"], run["trust"]).open()
+    stage, scenes = _open(run)
+    settings: dict[str, float] = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
     model = diffusion_of(stage)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    scenes = [scene.to(device) for scene in first_scenes(data, run["scenes"])]
-    settings = {"scenes": run["scenes"], "samples": run["samples"], "seed": run["seed"]}
-    renderer = SampleRenderer(model.to(device).eval(), stage.rasterizer, stage.background, run["samples"], run["seed"])
-    return renderer, scenes, settings
+    return SampleRenderer(model, stage.rasterizer, stage.background, run["samples"], run["seed"]), scenes, settings
+
+
+def _write_sheet(rows: Sequence[Sequence[SheetCell | None]], path: Path, title: str) -> None:
+    write_png(path, image_sheet([""] * max(map(len, rows)), rows, title))
 
 
 @contextmanager
 def _status() -> Iterator[Callable[[str], None]]:
     with Console(stderr=True).status("drawing") as status:
         yield lambda text: status.update(f"drawing: {text}")
-
-
-SAMPLERS: list[Column] = [
-    ("sampler", "sampler", ""),
-    ("steps", "steps", "d"),
-    ("calls", "calls", "d"),
-    ("PSNR", "psnr", ".2f"),
-    ("SSIM", "ssim", ".4f"),
-    ("diversity", "diversity", ".4f"),
-    ("agreement", "agreement", ".1f"),
-    ("ms", "ms", ".1f"),
-]
-WEIGHTS: list[Column] = [("skip", "skip_weight", "g"), ("guidance", "guidance_weight", "g")]
-CONTROLS: list[Column] = [
-    *WEIGHTS,
-    ("reference", "reference_psnr", ".2f"),
-    ("near object", "near_object_psnr", ".2f"),
-    ("diversity", "diversity", ".4f"),
-]
-VIEWS: list[Column] = [("views", "views", "d"), ("all pixels", "psnr", ".2f"), ("object", "object_psnr", ".2f")]
-LAYERS: list[Column] = [
-    ("", "layer", ""),
-    ("opacity", "opacity", ".2f"),
-    ("behind the front", "behind", ".3f"),
-    ("of the thickness", "ratio", ".0%"),
-    ("pixels on the back", "on_back", ".0%"),
-]
-DEPTH = [*WEIGHTS]
-for _view in ("reference", "far"):
-    DEPTH += [(_view, f"{_view}_deviation", ".4f"), ("object", f"{_view}_object_deviation", ".4f")]
-    DEPTH += [("measured", f"{_view}_measured", ".0%")]

@@ -124,8 +124,7 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
         page.show(samples, step_of(samples) if config.watch is not None else "")
         return page
     page = Page(server, splats, saver, model.parameterization.layers)
-    own_steps = model.sampler.steps if model.draws_samples else 1
-    steps = own_steps if config.steps is None else config.steps
+    steps = model.default_steps if config.steps is None else config.steps
     start = {name: config[name] for name in SLIDERS} | {"steps": steps, "remove_background": remove}
     completion = Completion(page, model, start)
     if photograph is not None:

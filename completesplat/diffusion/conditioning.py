@@ -8,14 +8,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
-from completesplat.autoreconstructor.pretrained import load_pretrained_encoder
+from completesplat.autoreconstructor.pretrained import load_pretrained
 from completesplat.errors import WeightsError
 from completesplat.settings.schema import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
 """Scale of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
 
-# Options as errors of `load_pretrained_encoder` name them, and a conditioning's options in their place.
+# Options as errors of `load_pretrained` name them, and a conditioning's options in their place.
 SETTINGS = {
     "autoreconstructor.encoder.latent_channels=": "conditioning.out_channels=",
     "autoreconstructor.encoder.": "conditioning.",
@@ -97,7 +97,7 @@ class StableDiffusionConditioning(nn.Module):
 
 def _load_encoder(encoder: Encoder, source: str) -> None:
     try:
-        load_pretrained_encoder(encoder, source)
+        load_pretrained(source, encoder)
     except WeightsError as error:
         message = str(error)
         for theirs, ours in SETTINGS.items():

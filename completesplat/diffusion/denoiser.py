@@ -5,7 +5,7 @@ from typing import Any, TypedDict, Unpack
 import torch
 from diffusers import UNet2DConditionModel, UNet2DModel
 from diffusers.models.attention import BasicTransformerBlock
-from diffusers.models.attention_processor import AttnProcessor2_0
+from diffusers.models.attention_processor import Attention, AttnProcessor2_0
 from jaxtyping import Int
 from torch import Tensor, nn
 
@@ -37,7 +37,7 @@ class ConditionalUNet(nn.Module):
         self,
         kind: Any,
         attention: str,
-        attention_settings: dict[str, Any],
+        attention_settings: dict[str, int],
         latent_channels: int = 4,
         conditioning_channels: int = 4,
         channels: Widths = (320, 640, 1280, 1280),
@@ -79,7 +79,9 @@ class AttentionToNothing(AttnProcessor2_0):
     In training, queries and keys are computed because DDP waits for every weight's gradient, even if it is zero.
     """
 
-    def __call__(self, attn: Any, hidden_states: Tensor, *inputs: Any, **settings: Any) -> Tensor:
+    def __call__(
+        self, attn: Attention, hidden_states: Tensor, *inputs: Tensor | None, **settings: Tensor | None
+    ) -> Tensor:
         """Attend like diffusers' `AttnProcessor2_0`; input and output are [batch, place, channel]."""
         if torch.is_grad_enabled():
             attended: Tensor = super().__call__(attn, hidden_states, *inputs, **settings)

@@ -11,17 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
+from completesplat.settings.schema import Share, check_value
 
 Latents = Float[Tensor, "batch channel height width"]
 Features = Float[Tensor, "batch feature height width"]
 Denoise = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Denoiser: (noisy latent, timestep, conditioning) -> predicted noise."""
-
-
-def check_guidance_weight(weight: float) -> None:
-    """Raise CompleteSplatError for a weight outside of [0, 1], which is no share of the unconditional prediction."""
-    if not 0 <= weight <= 1:
-        raise CompleteSplatError(f"guidance_weight={weight:g}: must lie between 0 and 1")
 
 
 def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> float:
@@ -30,12 +25,12 @@ def allowed_skip_weight(given: float | None, visible: Tensor | None = None) -> f
     Raises:
         CompleteSplatError: the weight lies outside of [0, 1], or is above 0 although something is hidden.
     """
-    if given is not None and not 0 <= given <= 1:
-        raise CompleteSplatError(f"skip_weight={given:g}: must lie between 0 and 1")
+    if given is not None:
+        check_value("skip_weight", Share, given)
     hidden = visible is not None and bool((visible < 1).any())
     if hidden and given:
         raise CompleteSplatError(
-            f"skip_weight={given:g}: must be 0 where the picture is hidden, as skips carry its pixels into the scene"
+            f"skip_weight={given:g}: must be 0 where the image is hidden, as skips carry its pixels into the scene"
         )
     return (0.0 if hidden else 1.0) if given is None else given
 
@@ -51,7 +46,7 @@ def guided_noise(
     Raises:
         CompleteSplatError: w lies outside of [0, 1].
     """
-    check_guidance_weight(weight)
+    check_value("guidance_weight", Share, weight)
     if weight == 0:
         return denoise(noisy_latent, timestep, conditioning)
     nothing = torch.zeros_like(conditioning)

@@ -12,6 +12,7 @@ flow matching a = 1 - t and b = t (Lipman et al. 2023; Liu et al. 2023, "rectifi
 from typing import Any
 
 from diffusers import FlowMatchEulerDiscreteScheduler
+from diffusers.configuration_utils import ConfigMixin
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -33,7 +34,7 @@ def signal_and_noise(
     return alpha_bar.sqrt(), (1 - alpha_bar).sqrt()
 
 
-def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
+def target(scheduler: ConfigMixin, latent: Latents, noise: Latents, timestep: Int[Tensor, " batch"]) -> Latents:
     """Return the true prediction for a latent and the noise added to it; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     if kind == "v_prediction":
@@ -42,7 +43,9 @@ def target(scheduler: Any, latent: Latents, noise: Latents, timestep: Int[Tensor
     return {"epsilon": noise, "sample": latent, "flow": noise - latent}[kind]
 
 
-def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]) -> Latents:
+def clean_estimate(
+    scheduler: ConfigMixin, noisy_latent: Latents, predicted: Latents, timestep: Int[Tensor, ""]
+) -> Latents:
     """Return the clean latent h that a prediction implies; raise like `prediction_type`."""
     kind = prediction_type(scheduler)
     signal, noise = signal_and_noise(scheduler, timestep, noisy_latent)
@@ -53,16 +56,16 @@ def clean_estimate(scheduler: Any, noisy_latent: Latents, predicted: Latents, ti
     return noisy_latent - noise * predicted if kind == "flow" else predicted
 
 
-def is_flow(scheduler: Any) -> bool:
+def is_flow(scheduler: object) -> bool:
     """Return whether a scheduler samples along the straight lines of flow matching."""
     return isinstance(scheduler, FlowMatchEulerDiscreteScheduler)
 
 
-def prediction_type(scheduler: Any) -> str:
+def prediction_type(scheduler: ConfigMixin) -> str:
     """Return one of `PREDICTION_TYPES`, or "flow"; raise CompleteSplatError if the scheduler has another type."""
     if is_flow(scheduler):
         return "flow"
-    kind: str = scheduler.config.prediction_type
+    kind: str = scheduler.config["prediction_type"]
     if kind not in PREDICTION_TYPES:
         raise CompleteSplatError(
             f"sampler.scheduler.prediction_type={kind}: unknown; choose one of {', '.join(PREDICTION_TYPES)}"

@@ -42,10 +42,10 @@ def to_bytes(images: Float[Tensor, "*batch 3 height width"]) -> UInt8[np.ndarray
     return scaled.movedim(-3, -1).cpu().numpy()
 
 
-def write_png(path: Path, picture: Image.Image) -> None:
+def write_png(path: Path, image: Image.Image) -> None:
     """Write an image as PNG with `write_bytes`."""
     content = io.BytesIO()
-    picture.save(content, format="PNG")
+    image.save(content, format="PNG")
     write_bytes(path, content.getvalue())
 
 
@@ -72,13 +72,19 @@ class SheetCell:
     label: str = ""
 
 
-def picture_sheet(
+def strip(images: Float[Tensor, "_ 3 height width"], label: str = "", width: int = 0) -> list[SheetCell | None]:
+    """Return images side by side on a sheet, a label above the first, and empty cells up to `width`."""
+    cells = [SheetCell(image, "" if index else label) for index, image in enumerate(images)]
+    return [*cells, *[None] * (width - len(cells))]
+
+
+def image_sheet(
     headings: Sequence[str], rows: Sequence[Sequence[SheetCell | None]], title: str | None = None
 ) -> Image.Image:
     """Return images in rows and columns, each enlarged by a whole factor to about 144 px, with its label above it.
 
     Args:
-        rows: at least one, none longer than `headings`; None leaves a cell empty. All images have one size.
+        rows: at least one, none longer than `headings`; None leaves a cell empty. All images have the same size.
         title: the first line; None leaves no space for it.
     """
     first = next(cell.image for row in rows for cell in row if cell is not None)

@@ -17,7 +17,8 @@ from completesplat.export.images import (
     SheetCell,
     color_depth,
     color_normals,
-    picture_sheet,
+    image_sheet,
+    strip,
     surface_depth,
     to_bytes,
     write_png,
@@ -65,15 +66,6 @@ class Wanted:
     screen_space_dilation: bool = True
 
 
-@dataclass(frozen=True)
-class SampleViews:
-    """Renderings of one sample from several directions, and the depth seen from the first of them."""
-
-    label: str
-    images: Float[Tensor, "view 3 height width"]
-    depth: Float[Tensor, "1 height width"]
-
-
 def write_prediction(
     folder: Path,
     image: Float[Tensor, "3 size size"],
@@ -101,15 +93,17 @@ def write_prediction(
     # Refuse samples without intact Gaussians before anything is written.
     scenes = [cleaned(scene, f"{settings['image']}: sample {i}") for i, scene in enumerate(scenes)]
     make_folder(folder)
-    rows: list[SampleViews] = []
+    views, depths = [], []
     files: dict[str, str] = {}
     for i, scene in enumerate(scenes):
         comments = [*(f"{name} {value}" for name, value in settings.items()), f"sample {i}"]
-        row, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
-        rows.append(row)
+        around, depth, written = _write_sample(folder, i, scene, reference, rasterizer, up, wanted, comments)
+        views.append(around)
+        depths.append(depth)
         files |= written
         on_sample()
-    contact_sheet(folder / "sheet.png", f"{settings['image']}: views around each sample", image, rows)
+    title = f"{settings['image']}: views around each sample"
+    contact_sheet(folder / "sheet.png", title, image, torch.stack(views), torch.stack(depths))
     recorded = {**settings, "gaussians": [scene.count for scene in scenes], "up": up.tolist()}
     recorded["colors_clipped"] = [int(beyond_gamut(scene).sum()) for scene in scenes]
     if "spz" in wanted.formats:
@@ -144,11 +138,8 @@ def write_fitted_scene(
     stored = with_screen_space_dilation(cleaned(scene, name), cameras[0])
     write_ply(folder / "scene.ply", stored, [f"scene {name}"])
     indices = sorted({i * len(images) // DIRECTIONS for i in range(DIRECTIONS)})
-    rows = [
-        [SheetCell(pictures[i].clamp(0, 1), label if i == 0 else "") for i in indices]
-        for label, pictures in (("true", truth), ("fitted", images))
-    ]
-    write_png(folder / "sheet.png", picture_sheet([f"view {i}" for i in indices], rows, name))
+    rows = [strip(truth[indices].clamp(0, 1), "true"), strip(images[indices].clamp(0, 1), "fitted")]
+    write_png(folder / "sheet.png", image_sheet([f"view {i}" for i in indices], rows, name))
     files = {"scene": "scene.ply", "sheet": "sheet.png"}
     settings = {"scene": name, "gaussians": [stored.count], "screen_space_dilation": True}
     write_scene_json(folder / "scene.json", cameras[0], settings, seed, files)
@@ -163,8 +154,8 @@ def _write_sample(
     up: Float[Tensor, "3"],
     wanted: Wanted,
     comments: Sequence[str],
-) -> tuple[SampleViews, dict[str, str]]:
-    """Write a sample's splats and videos; return its row of the contact sheet, and file names by purpose."""
+) -> tuple[Float[Tensor, "view 3 height width"], Float[Tensor, "1 height width"], dict[str, str]]:
+    """Write a sample's splats and videos; return views around it, the depth in the first, and file names by purpose."""
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
@@ -175,7 +166,7 @@ def _write_sample(
         frames, _ = render_views(rasterizer, scene, cameras, wanted.background)
         write_video(folder / f"{kind}_{index:02}.mp4", frames)
     views, depths = orbit_views(rasterizer, scene, reference, pivot, DIRECTIONS, wanted.background, up)
-    return SampleViews(f"sample {index}", views, depths[0]), files
+    return views, depths[0], files
 
 
 @torch.no_grad()
@@ -194,21 +185,25 @@ def seen_center(rasterizer: Rasterizer, scene: Gaussians, reference: Cameras) ->
 
 
 def contact_sheet(
-    path: str | Path, title: str, reference: Float[Tensor, "3 height width"], samples: Sequence[SampleViews]
+    path: Path,
+    title: str,
+    reference: Float[Tensor, "3 height width"],
+    views: Float[Tensor, "sample view 3 height width"],
+    depths: Float[Tensor, "sample 1 height width"],
 ) -> None:
     """Write a PNG with the input image in the first column, and a row for each sample with its views and depth.
 
-    Depth is coloured on one scale for all rows. All samples have the same number of views, spread evenly over a turn.
+    Depth is coloured on one scale for all rows. The views are spread evenly over a turn.
     """
-    depths, (near, far) = color_depth(torch.stack([sample.depth for sample in samples]))
+    colored, (near, far) = color_depth(depths)
     rows = [
-        [None, SheetCell(sample.images[0], sample.label), *map(SheetCell, sample.images[1:]), SheetCell(depth)]
-        for sample, depth in zip(samples, depths, strict=True)
+        [None, *strip(torch.cat([images, depth[None]]), f"sample {index}")]
+        for index, (images, depth) in enumerate(zip(views, colored, strict=True))
     ]
     rows[0][0] = SheetCell(reference)
-    views = len(samples[0].images)
-    headings = ["input", *(f"{360 / views * k:g}°" for k in range(views)), f"depth {near:.3g} to {far:.3g}"]
-    write_png(Path(path), picture_sheet(headings, rows, title))
+    count = views.shape[1]
+    headings = ["input", *(f"{360 / count * k:g}°" for k in range(count)), f"depth {near:.3g} to {far:.3g}"]
+    write_png(path, image_sheet(headings, rows, title))
 
 
 @torch.no_grad()
@@ -225,18 +220,18 @@ def write_maps(
     """
     views = [rasterizer(scene[None], camera[None][None])[0, 0] for scene in scenes]
     depth = torch.stack([surface_depth(view) for view in views])
-    depth_pictures, ends = color_depth(depth)
+    colored, ends = color_depth(depth)
     files = {}
     for index, view in enumerate(views):
-        pictures = {
-            "depth": depth_pictures[index],
+        maps = {
+            "depth": colored[index],
             "normals": color_normals(normals_from_depth(depth[index], camera)),
             "opacity": view.alpha.expand(3, -1, -1),
         }
-        for kind, picture in pictures.items():
+        for kind, image in maps.items():
             name = f"{kind}_{index:02}"
             files[name] = f"{name}.png"
-            write_png(folder / files[name], Image.fromarray(to_bytes(picture)))
+            write_png(folder / files[name], Image.fromarray(to_bytes(image)))
     return files, ends
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -20,6 +20,7 @@ SHA256 = "f58cb9b6ec323ed63459aa4fb441fe750cfe39fafad6da5cb504a16f19e958f4"
 ADVICE = "give inception-2015-12-05.pt as evaluation.scoring.sets.inception.weights=FILE_OR_URL"
 DOWNLOAD_ADVICE = f"fetch Inception with `curl -LO {URL}` and give it as evaluation.scoring.sets.inception.weights=FILE"
 
+Settings = Mapping[str, str | int]
 Descriptors = list[Tensor]  # of several images; one tensor [images * n features] for each kind of descriptor
 
 
@@ -35,7 +36,7 @@ class SetMetric(Protocol):
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """Return figures by name; lower is better."""
 
-    def settings(self) -> dict[str, dict[str, Any]]:
+    def settings(self) -> dict[str, Settings]:
         """Return the settings that figures depend on, by the figures' names."""
 
 
@@ -46,12 +47,12 @@ class ImageSets:
 
     def __init__(self, metrics: Sequence[SetMetric]) -> None:
         self.metrics = metrics
-        self.kept: dict[tuple[str, str, int], dict[str, Descriptors]] = defaultdict(dict)
+        self.described: dict[tuple[str, str, int], dict[str, Descriptors]] = defaultdict(dict)
 
     def add(self, owner: str, region: str, scene: str, images: Images, seeds: Sequence[int]) -> None:
         """Describe images of a scene, by a predictor or `TRUE`, unless that scene has been described already."""
         for index, metric in enumerate(self.metrics):
-            scenes = self.kept[owner, region, index]
+            scenes = self.described[owner, region, index]
             if region in metric.regions and scene not in scenes:
                 scenes[scene] = [kind.float().cpu() for kind in metric.describe(images, seeds)]
 
@@ -59,16 +60,16 @@ class ImageSets:
         """Return the distances of a predictor's images from the true images of the same scenes."""
         figures: dict[str, float] = {}
         for index, metric in enumerate(self.metrics):
-            predicted, true = self.kept[owner, region, index], self.kept[self.TRUE, region, index]
+            predicted, true = self.described[owner, region, index], self.described[self.TRUE, region, index]
             if predicted:
                 parts = ([scenes[name] for name in sorted(predicted)] for scenes in (true, predicted))
                 figures |= metric.distances(*([torch.cat(kind) for kind in zip(*part, strict=True)] for part in parts))
         return figures
 
-    def merge(self, kept: dict[tuple[str, str, int], dict[str, Descriptors]]) -> None:
+    def merge(self, described: dict[tuple[str, str, int], dict[str, Descriptors]]) -> None:
         """Add the descriptors of another process."""
-        for key, scenes in kept.items():
-            self.kept[key] |= scenes
+        for key, scenes in described.items():
+            self.described[key] |= scenes
 
 
 class Patches:
@@ -87,49 +88,41 @@ class Patches:
         """See `SetMetric`."""
         return {"swd": sliced_wasserstein(true, predicted)}
 
-    def settings(self) -> dict[str, dict[str, Any]]:
+    def settings(self) -> dict[str, Settings]:
         """See `SetMetric`."""
         return {"swd": {"patches": self.patches, "patch": 7, "projections": 512, "factor": 1000}}
 
 
-class InceptionFeatures(nn.Module):
-    """Frozen TorchScript Inception, which takes 8-bit images, resizes them itself and returns pool features.
-
-    `network` is called as in NVlabs' `stylegan2-ada-pytorch/metrics`: `network(bytes, return_features=True)`.
-    """
-
-    def __init__(self, network: torch.jit.ScriptModule) -> None:
-        super().__init__()
-        self.network = network.eval()
-        self.requires_grad_(False)
-
-    @torch.no_grad()
-    def forward(self, images: Images) -> Float[Tensor, "image feature"]:
-        """Return features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
-        pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
-        with torch.autocast(images.device.type, enabled=False):
-            features: Tensor = self.network(pixels, return_features=True).float()
-        return features
-
-
 class Inception:
-    """FID and KID (over subsets of at most `subset_size` items), as "fid" and "kid", for all and for object pixels."""
+    """FID and KID (over subsets of at most `subset_size` items), as "fid" and "kid", for all and for object pixels.
+
+    `network` is a TorchScript Inception, which takes 8-bit images, resizes them itself and returns pool features. It is
+    called as in NVlabs' `stylegan2-ada-pytorch/metrics`: `network(bytes, return_features=True)`.
+    """
 
     regions = ("full", "object")
 
-    def __init__(self, features: InceptionFeatures, subset_size: int = 1000) -> None:
-        self.features, self.subset_size = features, subset_size
+    def __init__(self, network: torch.jit.ScriptModule, subset_size: int = 1000) -> None:
+        self.network, self.subset_size = network.eval(), subset_size
+
+    @torch.no_grad()
+    def features(self, images: Images) -> Float[Tensor, "image feature"]:
+        """Return features (2048 of NVlabs' network) of sRGB images with values in [0, 1], rounded to 8 bits."""
+        pixels = (255 * images.clamp(0, 1)).round().to(torch.uint8)
+        with torch.autocast(images.device.type, enabled=False):
+            features: Tensor = self.network.to(images.device)(pixels, return_features=True).float()
+        return features
 
     def describe(self, images: Images, seeds: Sequence[int]) -> Descriptors:
         """See `SetMetric`; nothing is random here."""
-        return [self.features.to(images.device)(images)]
+        return [self.features(images)]
 
     def distances(self, true: Descriptors, predicted: Descriptors) -> dict[str, float]:
         """See `SetMetric`."""
         (a,), (b,) = true, predicted
         return {"fid": frechet_distance(a, b), "kid": kernel_distance(a, b, self.subset_size)}
 
-    def settings(self) -> dict[str, dict[str, Any]]:
+    def settings(self) -> dict[str, Settings]:
         """See `SetMetric`."""
         network = {"network": "inception-2015-12-05", "features": "pool, 2048"}
         return {"fid": network, "kid": network | {"subset_size": self.subset_size, "subsets": 100, "factor": 1}}
@@ -137,11 +130,11 @@ class Inception:
 
 def inception(weights: str | None, sha256: str | None = None, subset_size: int = 1000) -> Inception | Missing:
     """Return FID and KID, or why they are missing; see `load_inception` for the weights."""
-    load = lambda source: Inception(load_inception(source, sha256), subset_size)  # noqa: E731
+    load = lambda source: load_inception(source, sha256, subset_size)  # noqa: E731
     return unless_missing(weights, load, ADVICE, ("fid", "kid"))
 
 
-def load_inception(weights: str = URL, sha256: str | None = SHA256) -> InceptionFeatures:
+def load_inception(weights: str = URL, sha256: str | None = SHA256, subset_size: int = 1000) -> Inception:
     """Load NVlabs' translation of the network that defines FID (Heusel et al. 2017; `inception-2015-12-05`).
 
     A TorchScript file is a program. Only one with this SHA-256 (or these first digits) is run; with None, any file.
@@ -160,7 +153,7 @@ def load_inception(weights: str = URL, sha256: str | None = SHA256) -> Inception
         raise WeightsError(f"{path}: not a readable TorchScript file; {DOWNLOAD_ADVICE}") from error
     if "return_features" not in {argument.name for argument in network.forward.schema.arguments}:
         raise WeightsError(f"{path}: a TorchScript file, but of a network that gives no features; {DOWNLOAD_ADVICE}")
-    return InceptionFeatures(network)
+    return Inception(network, subset_size)
 
 
 def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor, "second feature"]) -> float:
@@ -170,7 +163,6 @@ def frechet_distance(first: Float[Tensor, "first feature"], second: Float[Tensor
     """
     from torchmetrics.image.fid import FrechetInceptionDistance
 
-    _check_sizes(first, second)
     identity = nn.Identity()
     identity.num_features = first.shape[1]  # type: ignore[assignment]
     # The sets are complete; among several processes torchmetrics would wait for the others' sets and add them.
@@ -194,7 +186,6 @@ def kernel_distance(
     """
     from torchmetrics.image.kid import poly_mmd
 
-    _check_sizes(first, second)
     size = min(subset_size, len(first), len(second))
     generator = torch.Generator().manual_seed(seed)
     values = []
@@ -202,8 +193,3 @@ def kernel_distance(
         a, b = (x[torch.randperm(len(x), generator=generator)[:size].to(x.device)] for x in (first, second))
         values.append(poly_mmd(a.double(), b.double()))
     return torch.stack(values).mean().item()
-
-
-def _check_sizes(first: Tensor, second: Tensor) -> None:
-    if min(len(first), len(second)) < 2:
-        raise ValueError("needs two items in each set")

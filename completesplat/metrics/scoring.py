@@ -150,13 +150,13 @@ class Evaluation:
         # Seeds depend on names only, so that the same images have the same scores in every run.
         seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(truth.images))]
         for region in REGIONS:
-            for owner, pictures in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
-                with torch.autocast(pictures.device.type, enabled=False):
-                    self.sets.add(owner, region, name, _region(pictures.float(), truth, region)[1:], seeds)
+            for owner, views in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
+                with torch.autocast(views.device.type, enabled=False):
+                    self.sets.add(owner, region, name, _region(views.float(), truth, region)[1:], seeds)
 
     def gather(self) -> None:
         """Merge the scores of all processes; each of them must call this."""
-        local = self.scores, self.views, self.drawn, self.sets.kept, self.skipped
+        local = self.scores, self.views, self.drawn, self.sets.described, self.skipped
         self.reset()
         for scores, views, drawn, sets, skipped in gathered(local):
             for predictor, scenes in scores.items():
@@ -281,7 +281,5 @@ def _worst_first(scores: Sequence[float], higher_is_better: bool) -> list[float]
 
 def diversity(images: Float[Tensor, "sample view 3 height width"]) -> float:
     """Return the root mean square difference of two samples' renders, averaged over all pairs and views."""
-    if len(images) < 2:
-        raise ValueError("needs two samples")
     differences = [(a - b).square().mean((1, 2, 3)).sqrt() for a, b in combinations(images, 2)]
     return torch.stack(differences).mean().item()

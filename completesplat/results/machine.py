@@ -5,23 +5,38 @@ import platform
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
 
 
-def machine() -> dict[str, Any]:
-    """Return processor, GPU, versions and date as values that JSON can hold."""
+class Machine(TypedDict):
+    """Processor, GPU (if there is one), versions, and the date."""
+
+    processor: str
+    cores: int | None
+    threads: int
+    system: str
+    python: str
+    torch: str
+    date: str
+    gpu: NotRequired[str]
+
+
+def machine() -> Machine:
+    """Return the description as values that JSON can hold."""
     import torch
 
-    described = {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "date": time.strftime("%Y-%m-%d"),
-    }
-    return described | ({"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {})
+    described = Machine(
+        processor=_processor(),
+        cores=os.cpu_count(),
+        threads=torch.get_num_threads(),
+        system=platform.system(),
+        python=platform.python_version(),
+        torch=torch.__version__,
+        date=time.strftime("%Y-%m-%d"),
+    )
+    if torch.cuda.is_available():
+        described["gpu"] = torch.cuda.get_device_name()
+    return described
 
 
 def _processor() -> str:

@@ -4,26 +4,27 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict, cast
 
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.own import alike, mode_tables, own_tables, protocol_said
-from completesplat.results.runs import HOW, MODES, SCORES, Job, RunTree, collect
-from completesplat.results.scores import (
+from completesplat.results.measured import (
+    ALIKE,
     BEST_BY_METRIC,
     BEST_OF_K,
-    COST,
     LEADING,
-    MODEL,
+    OURS,
     Entry,
+    alike,
+    described,
     entries,
-    figures,
     leading_headings,
-    rows,
-    time_cell,
+    mode_tables,
+    score_tables,
 )
+from completesplat.results.runs import HOW, MODES, SCORES, Job, Protocol, RunTree, collect
+from completesplat.results.sweeps import figures, sweep_rows
 from completesplat.results.tables import (
     ABSENT,
     BEST,
@@ -36,10 +37,10 @@ from completesplat.results.tables import (
     Notes,
     Table,
     TableRow,
-    metric,
 )
 
 FILE = Path(__file__).with_name("figures.yaml")
+PAPER = "Liao et al., Complete Gaussian Splats from a Single Image with Denoising Diffusion Models, 3DV 2026"
 MARKS = ("best", "second", "dagger", "star")
 METRICS = ("psnr", "lpips", "fid", "kid")
 
@@ -48,11 +49,7 @@ VIEWS = (
     "The paper names both reference and novel views in its protocol and does not say how it weighs them; "
     "our rows are of novel views."
 )
-COLUMNS = [f"full_novel_{name}" for name in ("psnr", "ssim", "lpips", "fid", "kid")]
-APART = (
-    "The published columns are by the paper's protocol, ours by the one stated here: figures compare within the "
-    "columns of one heading only."
-)
+APART = "Rows of ours are by the protocol in their note, not by the paper's: they compare among each other only."
 
 
 @dataclass(frozen=True)
@@ -65,11 +62,19 @@ class PrintedCell:
 
 @dataclass(frozen=True)
 class PrintedColumn:
-    """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; the data set, if any."""
+    """Column as printed: joined levels of its heading; a key of `LEADING` or `METRICS`; a data set, or the table's."""
 
     heading: str
     key: str
-    data_set: str
+    data_set: str = ""
+
+
+class Requirements(TypedDict):
+    """Values that a run by one of our protocols must have; without `scenes`, it has all scenes of the list."""
+
+    scenes: NotRequired[list[int]]
+    resolution: int
+    protocol_views: str
 
 
 @dataclass(frozen=True)
@@ -82,26 +87,34 @@ class PublishedTable:
     title: str
     region: str
     view: str
-    evaluations: Mapping[str, Mapping[str, Any]]
+    evaluations: Mapping[str, Requirements]
     says: list[str]
     columns: list[PrintedColumn]
     rows: list[list[PrintedCell]]
-    legend: Mapping[str, str]
+    legend: Mapping[str, str] = field(default_factory=dict)
+    data_set: str = ""
     resolution: str = ""
     subset: str = ""
     oracle_samples: int | None = None
     remarks: list[str] = field(default_factory=list)
     options: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def scored(self) -> list[tuple[int, PrintedColumn, str]]:
+        """Number, column and data set of each column of scores."""
+        numbered = enumerate(self.columns)
+        return [(n, column, column.data_set or self.data_set) for n, column in numbered if column.key in METRICS]
 
+
+@cache
 def published() -> list[PublishedTable]:
     """Return all tables, in the paper's order."""
-    return [_table(entry) for entry in _content()["tables"]]
-
-
-def _source(table: PublishedTable) -> str:
-    marking = "best in bold and second best underlined as printed"
-    return f"Published figures: {_content()['source']}, {table.place}; {marking}."
+    tables = []
+    for entry in cast(list[dict[str, Any]], OmegaConf.to_container(OmegaConf.load(FILE).tables)):
+        columns = [PrintedColumn(**column) for column in entry.pop("columns")]
+        rows = [[parse(cell) for cell in line.split("|")] for line in entry.pop("rows").splitlines()]
+        tables.append(PublishedTable(columns=columns, rows=rows, **entry))
+    return tables
 
 
 def parse(cell: str) -> PrintedCell:
@@ -110,18 +123,8 @@ def parse(cell: str) -> PrintedCell:
     return PrintedCell(" ".join(word for word in words if word not in MARKS), frozenset(words) & set(MARKS))
 
 
-@cache
-def _content() -> dict[str, Any]:
-    content: Any = OmegaConf.to_container(OmegaConf.load(FILE))
-    return dict(content)
-
-
-def _table(entry: Mapping[str, Any]) -> PublishedTable:
-    fields = {key: value for key, value in entry.items() if key not in ("data_set", *MARKS)}
-    data_set = {"data_set": entry.get("data_set", "")}
-    fields["columns"] = [PrintedColumn(**data_set | column) for column in entry["columns"]]
-    fields["rows"] = [[parse(cell) for cell in line.split("|")] for line in entry["rows"].splitlines()]
-    return PublishedTable(**fields, legend={mark: entry[mark] for mark in MARKS if mark in entry})
+def _source(table: PublishedTable) -> str:
+    return f"Published figures: {PAPER}, {table.place}; best in bold and second best underlined as printed."
 
 
 def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
@@ -129,19 +132,24 @@ def beside(table: PublishedTable, entries: Sequence[Entry]) -> Table:
 
     Times are of one sequence, warm, for the complete pipeline.
     """
-    notes = Notes()
+    notes, rows = Notes(), []
     has_speed = any(column.key == "speed" for column in table.columns)
     keys = [key for key in LEADING if key != "speed" or has_speed]
-    scored = [column for column in table.columns if column.key in METRICS]
-    headings = [*leading_headings(keys), *(Heading(column.heading) for column in scored)]
-    rows = [TableRow("paper", _published(table, row, keys)) for row in table.rows]
+    headings = [*leading_headings(keys), *(Heading(column.heading) for _, column, _ in table.scored)]
+    for row in table.rows:
+        cells = {column.key: printed(cell) for column, cell in zip(table.columns, row, strict=True)}
+        cells = {"resolution": Cell(table.resolution or ABSENT)} | cells
+        scores = [printed(row[number]) for number, _, _ in table.scored]
+        rows.append(TableRow("paper", [*(cells.get(key, Cell(ABSENT)) for key in keys), *scores]))
     for entry in (entry for entry in entries if belongs(table, entry)):
         leading = entry.leading(notes)
-        cells = [leading[key] for key in keys]
-        for column in scored:
-            fits = column.data_set == entry.run.protocol["data_set"]
-            cells.append(entry.cell(f"{table.region}_{table.view}_{column.key}", notes) if fits else Cell(ABSENT))
-        rows.append(TableRow("ours", cells))
+        scores = [
+            entry.cell(f"{table.region}_{table.view}_{column.key}", notes)
+            if data_set == entry.run.protocol["data_set"]
+            else Cell(ABSENT)
+            for _, column, data_set in table.scored
+        ]
+        rows.append(TableRow("ours", [*(leading[key] for key in keys), *scores]))
     signs = [f"{SIGNS[mark]}: {meaning}." for mark, meaning in table.legend.items()]
     remarks = [_source(table), *signs, LEGEND, VIEWS, *table.remarks]
     return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
@@ -161,92 +169,46 @@ def belongs(table: PublishedTable, entry: Entry) -> bool:
         return False
     if protocol.get("background") is not None or protocol.get("skip_weight") not in (None, 1):
         return False
-    data_sets = {column.data_set for column in table.columns if column.key in METRICS}
-    if protocol["data_set"] not in data_sets or (table.subset and protocol.get("subset") != table.subset):
+    if protocol["data_set"] not in {data_set for *_, data_set in table.scored}:
+        return False
+    if table.subset and protocol.get("subset") != table.subset:
         return False
     if entry.predictor in (BEST_OF_K, BEST_BY_METRIC) and protocol.get("samples") != table.oracle_samples:
         return False
     if protocol["scenes"] not in wanted.get("scenes", [protocol.get("scenes_listed")]):
         return False
-    return all(protocol.get(key) == wanted[key] for key in ("resolution", "protocol_views"))
+    return (protocol["resolution"], protocol.get("protocol_views")) == (wanted["resolution"], wanted["protocol_views"])
 
 
-def _size(table: PublishedTable, row: Sequence[PrintedCell]) -> dict[str, str]:
-    """Return a row's scenes and resolution as the paper states them; empty where it does not."""
-    printed = {column.key: cell.text for column, cell in zip(table.columns, row, strict=True)}
-    return {"scenes": printed.get("scenes", ""), "resolution": printed.get("resolution", table.resolution)}
-
-
-def _published(table: PublishedTable, row: Sequence[PrintedCell], keys: Sequence[str]) -> list[Cell]:
-    printed = {column.key: shown(cell) for column, cell in zip(table.columns, row, strict=True)}
-    printed |= {key: Cell(text or ABSENT) for key, text in _size(table, row).items()}
-    scored = [shown(cell) for column, cell in zip(table.columns, row, strict=True) if column.key in METRICS]
-    return [*(printed.get(key, Cell(ABSENT)) for key in keys), *scored]
-
-
-def shown(printed: PrintedCell) -> Cell:
+def printed(cell: PrintedCell) -> Cell:
     """Return the cell of a table for a published cell, its marks as signs and as best or second."""
-    signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in printed.marks)
-    mark = next((mark for mark in (BEST, SECOND) if mark in printed.marks), UNMARKED)
-    return Cell((printed.text or BLANK) + signs, mark)
+    signs = "".join(f" {sign}" for mark, sign in SIGNS.items() if mark in cell.marks)
+    mark = next((mark for mark in (BEST, SECOND) if mark in cell.marks), UNMARKED)
+    return Cell((cell.text or BLANK) + signs, mark)
 
 
-def published_ablations(table: PublishedTable) -> Table:
-    """Return a table of the paper's figures alone."""
-    headings = [Heading("setting", figures=False), *(Heading(c.heading, "published") for c in table.columns[1:])]
-    body = [TableRow("paper", [shown(cell) for cell in row]) for row in table.rows]
-    return Table(table.name, f"{table.place}: {table.title}", headings, body, [_source(table), LEGEND])
+def ablations_beside(table: PublishedTable, sweeps: Mapping[str, Sequence[Job]]) -> Table:
+    """Return the published rows, followed by means over seeds of sweeps, by name and protocol."""
+    notes, names = Notes(), [f"{table.region}_{table.view}_{column.key}" for _, column, _ in table.scored]
+    rows = [TableRow("paper", [printed(cell) for cell in row]) for row in table.rows]
+    for name, jobs in sweeps.items():
+        for group in alike((job, job.protocol) for job in jobs):
+            settings, protocol = sweep_rows(group), group[0].protocol
+            note = notes.number(f"{name}: mean ± sample deviation over seeds; {described(protocol, ALIKE)}.")
+            for row, cells in zip(settings, figures(settings, names), strict=True):
+                theirs = "".join(f" ({table.options[part]})" for part in row.label.split(", ") if part in table.options)
+                label = f"{OURS}{row.label}{theirs}{f', {row.seeds} seeds' if row.seeds else ''} [{note}]"
+                pairs = zip(names, cells, strict=True)
+                scores = [cell if cell.text else _missing(score, protocol, notes) for score, cell in pairs]
+                rows.append(TableRow("ours", [Cell(label), *scores]))
+    headings = [Heading("setting", figures=False), *(Heading(column.heading) for column in table.columns[1:])]
+    remarks = [_source(table), *([APART] if sweeps else []), LEGEND]
+    return Table(table.name, f"{table.place}: {table.title}", headings, rows, remarks, notes)
 
 
-def sweep_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> list[Table]:
-    """Return, for each protocol of a sweep's tests, mean and standard deviation over seeds beside the paper's rows.
-
-    The list is empty if no tested job is a row of the paper's table.
-    """
-    tested = [job for job in jobs if job.protocol]
-    if not any(_option(job.label, table) for job in tested):
-        return []
-    groups = alike((job, job.protocol) for job in tested)
-    return [_ablations_beside(table, group, name) for group in groups.values()]
-
-
-def _ablations_beside(table: PublishedTable, jobs: Sequence[Job], name: str) -> Table:
-    protocol, notes = jobs[0].protocol, Notes()
-    printed = {row[0].text: [shown(cell) for cell in row] for row in table.rows}
-    order = [*printed, ""]
-    our_rows = sorted(rows(jobs), key=lambda row: order.index(_option(row["ablation"], table)))
-    reasons = protocol.get("missing") or {}
-    body = []
-    for row, scores in zip(our_rows, figures(our_rows, COLUMNS), strict=True):
-        published = printed.get(_option(row["ablation"], table), [Cell(ABSENT)] * len(table.columns))
-        counts = [Cell(ABSENT if row[key] is None else str(row[key])) for key in ("seeds", "scenes")]
-        cells = [Cell(row["ablation"]), *published, *counts, *_mean_times(jobs, row["ablation"])]
-        for column, cell in zip(COLUMNS, scores, strict=True):
-            score = column.rpartition("_")[2]
-            reason = f"{score}: {reasons.get(score, 'not measured in all jobs of this row')}"
-            cells.append(cell if cell.text else notes.missing(reason))
-        body.append(TableRow("naive" if row["seeds"] is None else "ours", cells))
-    ours = {_option(row["ablation"], table) for row in our_rows}
-    absent = [Cell(ABSENT)] * (4 + len(COLUMNS))
-    body += [TableRow("paper", [Cell(ABSENT), *row, *absent]) for method, row in printed.items() if method not in ours]
-    headings = [Heading("setting", figures=False), Heading("row of the paper", "published", False)]
-    headings += [Heading(column.heading, "published") for column in table.columns[1:]]
-    group = f"ours: {protocol['data_set']}, {protocol['resolution']} pixels"
-    headings += [Heading(text, group) for text in ("seeds", "scenes", *COST, *map(metric, COLUMNS))]
-    remarks = [_source(table), f"Ours: {name}, mean ± sample deviation over seeds. {protocol_said(protocol)}"]
-    title = f"{table.place}: ablations beside ours on {protocol['data_set']}"
-    return Table(f"ablations_{name}", title, headings, body, [*remarks, APART, LEGEND], notes)
-
-
-def _mean_times(jobs: Sequence[Job], label: str) -> list[Cell]:
-    seconds = [job.test.get(MODEL, {}).get("seconds") or {} for job in jobs if job.label == label]
-    measured = [[parts[part] for parts in seconds if parts.get(part) is not None] for part in COST]
-    return [time_cell(sum(times) / len(times) if times else None) for times in measured]
-
-
-def _option(label: str, table: PublishedTable) -> str:
-    """Return the paper's row that corresponds to a row of ours; empty if there is none."""
-    return next((table.options[part] for part in label.split(", ") if part in table.options), "")
+def _missing(column: str, protocol: Protocol, notes: Notes) -> Cell:
+    metric = column.rpartition("_")[2]
+    return notes.missing(f"{metric}: {protocol.get('missing', {}).get(metric, 'not measured in all jobs of this row')}")
 
 
 def tables(tree: RunTree | None) -> list[Table]:
@@ -259,19 +221,16 @@ def tables(tree: RunTree | None) -> list[Table]:
         CompleteSplatError: there are no results.
     """
     if tree is None:
-        return [published_ablations(table) if table.options else beside(table, []) for table in published()]
+        return [ablations_beside(table, {}) if table.options else beside(table, []) for table in published()]
     if not (tree.scores or tree.modes or tree.warnings):
         raise CompleteSplatError(f"runs={tree.folder}: no {SCORES} and no {MODES} in it or below it; {HOW}")
-    made: list[Table] = []
+    options = {option for table in published() for option in table.options}
+    is_ablation = lambda job: options & set(job.label.split(", "))  # noqa: E731
+    jobs = {folder: [job for job in collect(folder) if job.protocol] for folder in tree.sweeps}
+    sweeps = {folder: tested for folder, tested in jobs.items() if any(map(is_ablation, tested))}
+    single = entries([run for run in tree.scores if run.folder.parent not in sweeps])
+    named = {str(folder.relative_to(tree.folder)): tested for folder, tested in sweeps.items()}
+    made = [ablations_beside(table, named) if table.options else beside(table, single) for table in published()]
     placed = [table for table in published() if not table.options]
-    (ablations,) = (table for table in published() if table.options)
-    names = {folder: str(folder.relative_to(tree.folder)) for folder in tree.sweeps}
-    compared = {folder: sweep_beside(ablations, collect(folder), name) for folder, name in names.items()}
-    single = entries([run for run in tree.scores if not compared.get(run.folder.parent)])
-    for table in published():
-        if table.options:
-            made += [ablation for group in compared.values() for ablation in group] or [published_ablations(table)]
-        else:
-            made.append(beside(table, single))
     elsewhere = [entry for entry in single if not any(belongs(table, entry) for table in placed)]
-    return [*made, *own_tables(elsewhere), *mode_tables(tree.modes)]
+    return [*made, *score_tables(elsewhere), *mode_tables(tree.modes)]

@@ -2,64 +2,89 @@
 
 import json
 import os
-import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, cast
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import ValueType
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
+from completesplat.results.machine import Machine
 
 SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
 ROWS = ("samplers.json", "controls.json", "depth.json", "views.json")
 """Files that `completesplat report NAME` writes beside its figure: settings and rows."""
 PROTOCOL = "protocol"  # the key of how results were measured, beside the entries of the predictors
-NEEDED = {SCORES: ("data_set", "resolution", "scenes"), MODES: ()}
-"""Entries that a protocol must have, by the name of the file of results."""
-REGIONS = ("full", "object")
+MODEL, UPPER_BOUND = "model", "upper_bound"
+"""Predictor of a run's model; and mark of a model that has seen the views that it is scored on."""
+SEED = "seed"
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
 
-
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read the mapping in a JSON file.
-
-    Raises:
-        ValueError: there is no such file, it is not JSON, or it holds something else.
-    """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path.name} is missing beside it") from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"it cannot be read as JSON ({' '.join(str(error).split())})") from None
-    if not isinstance(content, dict):
-        raise ValueError("it holds no mapping")
-    return content
+Scores = dict[str, float]  # scores of a predictor: `full_novel_psnr`, `seconds_inference`, `scenes`, `upper_bound`
 
 
-def mapping_or_empty(path: Path) -> dict[str, Any]:
+class Record(TypedDict, total=False):
+    """Entries of `run.json` that are read here."""
+
+    command: list[str]
+    overrides: list[str]
+    started: str
+    commit: str | None
+
+
+class Protocol(TypedDict, total=False):
+    """Entries of a statement of how results were measured on which code depends; others are only printed."""
+
+    name: str
+    method: str
+    data_set: str
+    resolution: int
+    scenes: int
+    missing: dict[str, str]
+    machine: Machine
+    checkpoint: dict[str, str]
+    data_fingerprint: str
+
+
+def read_mapping(path: Path) -> dict[str, object]:
     """Read the mapping in a JSON file; return an empty one if that fails, as when its writer was killed."""
     try:
-        return read_mapping(path)
-    except ValueError:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
         return {}
+    return content if isinstance(content, dict) else {}
+
+
+def read_record(folder: Path) -> Record:
+    """Read a folder's `run.json`; return an empty record if there is none."""
+    return cast(Record, read_mapping(folder / RECORD))
+
+
+def flat(entry: Mapping[str, object]) -> Scores:
+    """Return a predictor's numbers in `Evaluation.results` by the joined keys of all levels, without nulls."""
+    scores: Scores = {}
+    for key, value in entry.items():
+        if isinstance(value, Mapping):
+            scores |= {f"{key}_{name}": number for name, number in flat(value).items()}
+        elif isinstance(value, int | float):
+            scores[key] = value
+    return scores
 
 
 @dataclass(frozen=True)
 class Result:
-    """File of results: its folder, the folder's name, how it was measured, and its entries by predictor."""
+    """File of results: its folder, the folder's name, how it was measured, and its scores by predictor."""
 
     folder: Path
     name: str
-    protocol: dict[str, Any]
-    entries: dict[str, dict[str, Any]]
+    protocol: Protocol
+    entries: dict[str, Scores]
 
 
 @dataclass(frozen=True)
@@ -101,65 +126,53 @@ def find(folder: Path) -> RunTree:
 def _result(path: Path, root: Path) -> Result:
     """Read a file of results; raise ValueError with the reason if it is unusable."""
     content = read_mapping(path)
-    if path.name == MODES:
-        protocol, entries = read_mapping(path.with_name("protocol.json")), content
-    else:
-        test = content if PROTOCOL in content else content.get("test")
-        if not isinstance(test, dict) or PROTOCOL not in test:
-            raise ValueError(f"it does not say how it was measured; {HOW}")
-        protocol, entries = test[PROTOCOL], test
-        if content.get("upper_bound") and isinstance(test.get("model"), dict):  # stated by a fit about its model
-            entries = test | {"model": test["model"] | {"upper_bound": True}}
-    if not isinstance(protocol, dict):
-        raise ValueError("its protocol is no mapping")
-    if lacking := [key for key in NEEDED[path.name] if key not in protocol]:
-        raise ValueError(f"its protocol does not say {', '.join(lacking)}")
-    scored = {key: entry for key, entry in entries.items() if key != PROTOCOL and isinstance(entry, dict)}
-    if not scored or not all(map(_is_entry, scored.values())):
+    if not content:
+        raise ValueError("it cannot be read as a mapping in JSON")
+    test = content if path.name == MODES or PROTOCOL in content else content.get("test")
+    entries = {key: flat(entry) for key, entry in _mapping(test).items() if isinstance(entry, Mapping)}
+    entries.pop(PROTOCOL, None)
+    stated = read_mapping(path.with_name("protocol.json")) if path.name == MODES else _mapping(test).get(PROTOCOL)
+    protocol = _mapping(stated)
+    needed = () if path.name == MODES else ("data_set", "resolution", "scenes")
+    if not protocol or not all(key in protocol for key in needed):
+        raise ValueError(f"it does not say how it was measured; {HOW}")
+    if not entries:
         raise ValueError("it holds no scores by predictor")
-    return Result(path.parent, str(path.parent.relative_to(root)), protocol, scored)
+    return Result(path.parent, str(path.parent.relative_to(root)), cast(Protocol, protocol), entries)
 
 
-def _is_entry(entry: dict[str, Any]) -> bool:
-    """Return whether all regions hold views, and all views hold metrics."""
-    views = [entry.get(region, {}) for region in REGIONS]
-    parts = [part for view in views if isinstance(view, dict) for part in view.values()]
-    return all(isinstance(part, dict) for part in [*views, *parts, entry.get("seconds") or {}])
+def _mapping(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, Mapping) else {}
 
 
 def origin(path: Path, levels: int = 1) -> dict[str, str]:
     """Return command, date and commit from the `run.json` of a folder or of one of its `levels` parents."""
-    records = (mapping_or_empty(place / RECORD) for place in [path, *path.parents[:levels]])
-    record: dict[str, Any] = next(filter(None, records), {})
-    command = record.get("command")
-    values = {"command": typed(command) if isinstance(command, list) else ""}
-    return values | {key: str(record.get(key) or "") for key in ("started", "commit")}
+    record = next(filter(None, map(read_record, [path, *path.parents[:levels]])), Record())
+    values = {"started": record.get("started"), "commit": record.get("commit")}
+    return {"command": typed(record.get("command", []))} | {key: value or "" for key, value in values.items()}
 
 
-def typed(command: Sequence[Any]) -> str:
+def typed(command: Sequence[str]) -> str:
     """Return a command as it could be typed; its first part is the program and its verb."""
-    program, *arguments = map(str, command) if command else [""]
-    return " ".join([program, *map(shlex.quote, arguments)])
+    return " ".join([*command[:1], *map(shlex.quote, command[1:])])
 
 
 @dataclass(frozen=True)
 class Job:
-    """Job of a sweep: its folder's name (empty before its start), `run.json`, `metrics.json` (None until it is done).
+    """Job of a sweep: its folder's name (empty before its start), `run.json` and `metrics.json`.
 
-    `test` (`Evaluation.results` by predictor) and `protocol` are empty where nothing was tested.
+    `test` and `protocol` are empty where nothing was tested. `label` is the job's name among those of its sweep.
     """
 
     name: str
     overrides: dict[str, str] = field(default_factory=dict)
-    config: dict[str, Any] = field(default_factory=dict)
-    record: dict[str, Any] = field(default_factory=dict)
-    metrics: dict[str, Any] | None = None
-    test: dict[str, Any] = field(default_factory=dict)
-    protocol: dict[str, Any] = field(default_factory=dict)
-    label: str = ""  # name of the job among those of its sweep
-
-
-SEED = "seed"
+    config: Mapping[str, object] = field(default_factory=dict)
+    record: Record = field(default_factory=Record)
+    finished: bool = False
+    steps: int = 0
+    test: dict[str, Scores] = field(default_factory=dict)
+    protocol: Protocol = field(default_factory=Protocol)
+    label: str = ""
 
 
 def collect(*folders: Path) -> list[Job]:
@@ -184,50 +197,37 @@ def _joined(parts: Sequence[list[Job]]) -> list[Job]:
         for key, by_part in values.items()
         if max(map(len, by_part)) == 1 and len(set.union(*by_part)) > 1 and all("/" in v for v in set.union(*by_part))
     }
-    best: dict[Any, Job] = {}
-    for job in (job for jobs in parts for job in jobs):
+    best: dict[object, Job] = {}
+    for job in sorted((job for jobs in parts for job in jobs), key=lambda job: (job.finished, bool(job.record))):
         overrides = {key: value for key, value in job.overrides.items() if key not in local}
-        identity = frozenset(overrides.items()) or job.name
-        if identity not in best or _progress(job) > _progress(best[identity]):
-            best[identity] = replace(job, overrides=overrides)
+        best[frozenset(overrides.items()) or job.name] = replace(job, overrides=overrides)
     return list(best.values())
 
 
-def _progress(job: Job) -> tuple[bool, bool]:
-    return job.metrics is not None, bool(job.record)
-
-
 def _jobs(folder: Path) -> list[Job]:
-    folders = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    # `seed=10` comes after `seed=9`.
-    split = {path: re.split(r"(\d+)", path.name) for path in folders}
-    natural = {path: [int(part) if part.isdecimal() else part for part in parts] for path, parts in split.items()}
-    jobs = [_job(path) for path in sorted(folders, key=natural.__getitem__)]
+    jobs = [_job(path) for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
-    waiting = [Job("", overrides) for overrides in map(_pairs, planned(folder)) if overrides not in known]
+    waiting = [Job("", overrides) for overrides in map(_pairs, _planned(folder)) if overrides not in known]
     # `waiting` includes jobs that ended before they wrote a record, so as many folders without one are left out.
     silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
 
 
-def planned(folder: Path) -> list[list[str]]:
-    """Return the overrides of all jobs by number, as the product that hydra's sweeper makes.
+def _planned(folder: Path) -> list[list[str]]:
+    """Return the overrides of all jobs by number.
 
     The list is empty without the `multirun.yaml` that hydra writes when a sweep starts, or if that file does not
     determine the jobs: `glob(...)` depends on the config files.
     """
     if not (folder / PLAN).is_file():
         return []
-    arguments: Any = OmegaConf.to_container(OmegaConf.load(folder / PLAN).hydra.overrides.task)
-    overrides = OverridesParser.create().parse_overrides(arguments)
-    if any(o.is_sweep_override() and o.value_type == ValueType.GLOB_CHOICE_SWEEP for o in overrides):
+    arguments = list(OmegaConf.load(folder / PLAN).hydra.overrides.task)
+    try:
+        (jobs,) = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(arguments), None)
+    except HydraException:
         return []
-    values = {
-        o.get_key_element(): o.sweep_string_iterator() if o.is_discrete_sweep() else [o.get_value_element_as_str()]
-        for o in overrides
-    }
-    return [list(job) for job in product(*([f"{key}={value}" for value in choices] for key, choices in values.items()))]
+    return jobs
 
 
 def _pairs(overrides: Sequence[str]) -> dict[str, str]:
@@ -240,14 +240,14 @@ def _pairs(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def _job(folder: Path) -> Job:
-    record = mapping_or_empty(folder / RECORD)
+    record, metrics = read_record(folder), read_mapping(folder / SCORES)
     if not record:
         return Job(folder.name)
-    config: Any = OmegaConf.to_container(OmegaConf.load(folder / CONFIG))
-    metrics = mapping_or_empty(folder / SCORES) or None
-    test: dict[str, Any] = dict((metrics or {}).get("test", {}))
-    protocol = test.pop(PROTOCOL, {})
-    return Job(folder.name, _pairs(record["overrides"]), config, record, metrics, test, protocol)
+    config = cast(Mapping[str, object], OmegaConf.to_container(OmegaConf.load(folder / CONFIG)))
+    tested = _mapping(metrics.get("test"))
+    test = {name: flat(_mapping(entry)) for name, entry in tested.items() if name != PROTOCOL}
+    steps, protocol = cast(int, metrics.get("steps", 0)), cast(Protocol, _mapping(tested.get(PROTOCOL)))
+    return Job(folder.name, _pairs(record["overrides"]), config, record, bool(metrics), steps, test, protocol)
 
 
 def _labelled(jobs: Sequence[Job]) -> list[Job]:

@@ -1,13 +1,17 @@
 """Table type of all results, and its writers for Markdown, LaTeX, CSV and the terminal."""
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise, product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from completesplat.files import atomic_path, write_text
+from completesplat.results.runs import UPPER_BOUND, flat
+
+if TYPE_CHECKING:
+    from rich.table import Table as PrintedTable
 
 METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
 FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
@@ -17,9 +21,7 @@ GROUPS = {
     "object_novel": "object pixels, novel views",
     "full_reference": "reference view",
 }
-SSIM_NOTE = (
-    "SSIM: mean over all pixels, the picture mirrored at its border (skimage leaves 5 pixels out on every side)."
-)
+SSIM_NOTE = "SSIM: mean over all pixels, images mirrored at their border (skimage leaves 5 pixels out on every side)."
 """Note below tables with SSIM; the border has 37 % of the pixels of a 48 x 48 image, 15 % of a 128 x 128 one."""
 
 BEST, SECOND, UNMARKED = "best", "second", ""
@@ -128,6 +130,11 @@ class Table:
     remarks: list[str] = field(default_factory=list)
     notes: Notes = field(default_factory=Notes)
 
+    @property
+    def published(self) -> bool:
+        """Whether the table has the paper's figures only."""
+        return all(row.source == "paper" for row in self.rows)
+
     def groups(self) -> list[tuple[str, int]]:
         """Return the group headings and the number of columns of each; empty if there are none."""
         spans = [(name, len(list(members))) for name, members in groupby(heading.group for heading in self.headings)]
@@ -142,11 +149,11 @@ class Table:
         """Return the remarks, and the notes with their numbers."""
         return [*self.remarks, *(f"[{n}] {text}" for n, text in enumerate(self.notes.texts, 1))]
 
-    def __rich__(self) -> Any:
-        from rich.table import Table as Shown
+    def __rich__(self) -> "PrintedTable":
+        from rich.table import Table as PrintedTable
         from rich.text import Text
 
-        printed = Shown(title=self.title, title_justify="left")
+        printed = PrintedTable(title=self.title, title_justify="left")
         for heading in self.headings:
             printed.add_column(heading.joined("\n"), justify="right" if heading.figures else "left", overflow="fold")
         for row, ruled in self.ruled_rows():
@@ -154,7 +161,7 @@ class Table:
         return printed
 
 
-def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any]]) -> Table:
+def table(title: str, columns: Sequence[Column], records: Iterable[Mapping[str, object]]) -> Table:
     """Return a table with a row for each record; missing values stay empty."""
     rows = []
     for record in records:
@@ -163,23 +170,25 @@ def table(title: str, columns: Sequence[Column], records: Iterable[dict[str, Any
     return Table(title, title, [Heading(heading, figures=bool(form)) for heading, _, form in columns], rows)
 
 
-def by_name(entry: dict[str, Any]) -> dict[str, float]:
-    """Return a predictor's scores in `Evaluation.results` by `REGION_VIEW_METRIC`, without nulls."""
-    parts = [(region, part) for region, part in entry.items() if isinstance(part, dict)]
-    views = [(f"{region}_{view}", metrics) for region, part in parts for view, metrics in part.items()]
-    # The seconds of a sequence are numbers, not metrics by view.
-    named = [(name, metrics) for name, metrics in views if isinstance(metrics, dict)]
-    return {f"{name}_{metric}": x for name, metrics in named for metric, x in metrics.items() if x is not None}
+def records_table(title: str, records: Sequence[Mapping[str, object]]) -> Table:
+    """Return a table of records with the same keys, which are its headings; values that are no text are left out."""
+    kinds: dict[str, set[type]] = {}
+    for record in records:
+        for key, value in record.items():
+            kinds.setdefault(key, set()).add(type(value))
+    plain = {key: types for key, types in kinds.items() if types <= {type(None), str, bool, int, float}}
+    return table(
+        title, [(key.replace("_", "\n"), key, ".4g" if float in types else "") for key, types in plain.items()], records
+    )
 
 
-def _record(predictor: str, entry: dict[str, Any]) -> dict[str, Any]:
-    label = f"{predictor} (upper bound)" if entry.get("upper_bound") else predictor
-    return {"predictor": label} | by_name(entry)
-
-
-def evaluation_table(results: dict[str, Any]) -> Table:
+def evaluation_table(results: Mapping[str, Mapping[str, object]]) -> Table:
     """Return a row for each predictor of `Evaluation.results`, PSNR in dB; object pixels only if there are masks."""
-    records = [_record(predictor, entry) for predictor, entry in results.items()]
+    records: list[Mapping[str, object]] = []
+    for predictor, entry in results.items():
+        scores = flat(entry)
+        label = f"{predictor} (upper bound)" if scores.get(UPPER_BOUND) else predictor
+        records.append({"predictor": label, **scores})
     names = [*EVALUATED, *(name for name in EVALUATED_IF_POSSIBLE if name in records[0])]
     pairs = [(name, name.replace("object", "full")) for name in EVALUATED]
     if all(record.get(name) == record.get(whole) for record in records for name, whole in pairs):
@@ -188,7 +197,7 @@ def evaluation_table(results: dict[str, Any]) -> Table:
     for name in names:
         region, view, kind = name.split("_")
         columns.append((f"{LABELS[region]}\n{view}\n{METRICS[kind]}", name, FORMATS[kind]))
-    first = next(iter(results.values()))
+    first = records[0]
     result = table(f"{first['scenes']} scenes, {first['views']} novel views", columns, records)
     return replace(result, remarks=[SSIM_NOTE])
 
@@ -211,50 +220,44 @@ def escape(text: str) -> str:
     return text.translate(ESCAPES)
 
 
-def markdown_lines(table: Table) -> list[str]:
-    """Return the lines of the table alone."""
+def as_markdown(table: Table) -> str:
+    """Return a heading, the table, and a list of remarks and notes."""
     cells = [
         [MARKED_MARKDOWN[cell.mark].format(cell.text.replace("|", r"\|")) for cell in row.cells] for row in table.rows
     ]
     rule = ["---:" if heading.figures else "---" for heading in table.headings]
-    return [f"| {' | '.join(line)} |" for line in [[heading.joined() for heading in table.headings], rule, *cells]]
+    headings = [heading.joined() for heading in table.headings]
+    lines = [f"| {' | '.join(line)} |" for line in [headings, rule, *cells]]
+    return "\n".join([f"## {table.title}", "", *lines, "", *(f"- {line}" for line in table.below()), ""])
 
 
-def as_markdown(table: Table) -> str:
-    """Return a heading, the table, and a list of remarks and notes."""
-    below = [f"- {line}" for line in table.below()]
-    return "\n".join([f"## {table.title}", "", *markdown_lines(table), "", *below, ""])
-
-
-def latex_lines(table: Table) -> list[str]:
-    """Return the lines of the `tabular` alone, with booktabs' rules."""
+def as_latex(table: Table) -> str:
+    """Return a `table*` with booktabs' rules, shrunk to the text's width, with remarks and notes below."""
     columns = "".join("r" if heading.figures else "l" for heading in table.headings)
-    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
+    lines = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering"]
+    lines.append(rf"\caption{{{escape(table.title)}}}")
+    lines += [r"\resizebox{\textwidth}{!}{%", rf"\begin{{tabular}}{{{columns}}}", r"\toprule"]
     if groups := table.groups():
         above = (rf"\multicolumn{{{count}}}{{c}}{{{escape(name)}}}" for name, count in groups)
         lines.append(rf"{' & '.join(above)} \\")
     lines += [rf"{' & '.join(escape(heading.text) for heading in table.headings)} \\", r"\midrule"]
     for row, ruled in table.ruled_rows():
         lines.append(" & ".join(MARKED_LATEX[cell.mark] % escape(cell.text) for cell in row.cells) + r" \\")
-        if ruled:
-            lines.append(r"\midrule")
-    return [*lines, r"\bottomrule", r"\end{tabular}"]
+        lines += [r"\midrule"] if ruled else []
+    lines += [r"\bottomrule", r"\end{tabular}}", r"\par\smallskip\footnotesize\raggedright"]
+    return "\n".join([*lines, *(rf"{escape(line)}\par" for line in table.below()), r"\end{table*}", ""])
 
 
-def as_latex(table: Table) -> str:
-    """Return a `table*`, shrunk to the text's width (`graphicx`), with remarks and notes below."""
-    top = [r"% \usepackage{booktabs,graphicx}", r"\begin{table*}", r"\centering", rf"\caption{{{escape(table.title)}}}"]
-    *lines, end = latex_lines(table)
-    below = [rf"{escape(line)}\par" for line in table.below()]
-    shrunk = [r"\resizebox{\textwidth}{!}{%", *lines, f"{end}}}", r"\par\smallskip\footnotesize\raggedright"]
-    return "\n".join([*top, *shrunk, *below, r"\end{table*}", ""])
+def write_documents(tables: Sequence[Table], stem: Path) -> None:
+    """Write `STEM.md` and `STEM.tex`."""
+    write_text(stem.with_suffix(".md"), "\n".join(map(as_markdown, tables)))
+    write_text(stem.with_suffix(".tex"), "\n".join(map(as_latex, tables)))
 
 
 def write_tables(tables: Sequence[Table], out: Path) -> None:
     """Write `tables.md`, `tables.tex`, and `tables.csv` with a line for each cell."""
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / "tables.md", "\n".join(map(as_markdown, tables)))
-    write_text(out / "tables.tex", "\n".join(map(as_latex, tables)))
+    write_documents(tables, out / "tables")
     lines = [
         [each.name, each.title, row.source, row.cells[0].text, head.group, head.text, cell.text, cell.mark, cell.value]
         for each in tables
@@ -264,7 +267,7 @@ def write_tables(tables: Sequence[Table], out: Path) -> None:
     write_csv(out / "tables.csv", CSV_COLUMNS, lines)
 
 
-def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+def write_csv(path: Path, header: Sequence[str], lines: Iterable[Sequence[object]]) -> None:
     """Write a CSV file; None is an empty field, and numbers have all digits."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.diffusion.guidance import allowed_skip_weight, check_guidance_weight
 from completesplat.errors import CompleteSplatError
+from completesplat.export.images import SheetCell, strip
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
 from completesplat.scene import SceneBatch
-from completesplat.studies.figures import Strip, written_figure
+from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import SampleRenderer, farthest, mean_over_scenes, near, object_psnr
 
 Settings = Sequence[tuple[float, float]]  # skip and guidance weights
-Row = dict[str, float | bool | None]
+Row = dict[str, float | None]
 Tick = Callable[[str], None]
 Measure = Callable[[SceneBatch, float, float], Mapping[str, float | None]]
 
@@ -28,12 +28,8 @@ PAPER = ((1.0, 0.2), (0.5, 0.5), (0.0, 0.5))
 
 
 def grid(skip_weights: Sequence[float], guidance_weights: Sequence[float]) -> list[tuple[float, float]]:
-    """Return all pairs of (skip weight, guidance weight) and the paper's three; check that weights are in [0, 1]."""
-    pairs = {*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER}
-    for skip_weight, guidance_weight in pairs:
-        allowed_skip_weight(skip_weight)
-        check_guidance_weight(guidance_weight)
-    return sorted(pairs)
+    """Return all pairs of (skip weight, guidance weight) and the paper's three."""
+    return sorted({*product(map(float, skip_weights), map(float, guidance_weights)), *PAPER})
 
 
 def rows(
@@ -71,23 +67,24 @@ def over_settings(settings: Settings, scenes: Sequence[SceneBatch], measure: Mea
 
 def strips(
     renderer: SampleRenderer, settings: Settings, scene: SceneBatch, samples: int
-) -> tuple[list[list[Strip | None]], list[str]]:
+) -> list[list[SheetCell | None]]:
     """Return rows by skip weight and columns by guidance weight: one sample's reference view, several far views.
 
     The far view is the target whose direction differs most from the reference's. The first row is the truth.
     """
     far = 1 + farthest(scene.reference.cameras[0], scene.targets.cameras[0])
     skips, weights = (sorted(set(values)) for values in zip(*settings, strict=True))
-    true = scene.all_views().images[0]
-    rows: list[list[Strip | None]] = [[Strip(true[[0, far]], "truth: reference, far"), *[None] * (len(weights) - 1)]]
+    rows = [strip(scene.all_views().images[0, [0, far]], "truth: reference, far")]
     for skip in skips[::-1]:
-        rows.append([None] * len(weights))
-        for column, weight in enumerate(weights):
+        rows.append([])
+        for weight in weights:
+            cells: list[SheetCell | None] = [None] * (1 + samples)
             if (skip, weight) in settings:
                 images = renderer(scene, skip_weight=skip, guidance_weight=weight)
-                parts = torch.cat([images[:1, 0], images[:samples, far]])
-                rows[-1][column] = Strip(parts, f"guidance {weight:g}", (skip, weight) in PAPER)
-    return rows, ["", *(f"skip {skip:g}" for skip in skips[::-1])]
+                label = f"{'paper: ' if (skip, weight) in PAPER else ''}skip {skip:g}, guidance {weight:g}"
+                cells = strip(torch.cat([images[:1, 0], images[:samples, far]]), label, 1 + samples)
+            rows[-1] += cells
+    return rows
 
 
 PANELS = {"reference_psnr": "Reference view: PSNR, dB", "near_object_psnr": "Object in near views: PSNR, dB"}
@@ -139,25 +136,22 @@ def masked_strips(
     boxes: Sequence[Sequence[float]],
     views: int,
     guidance_weight: float,
-) -> tuple[list[list[Strip | None]], list[str]]:
-    """Return named rows for each scene: the truth, then its completions without skips.
+) -> list[list[SheetCell | None]]:
+    """Return rows for each scene: the truth, then its completions without skips.
 
     The columns are the input (complete for the truth), the reference view, and other views evenly spread over the
     targets. The scenes use the boxes in turn.
     """
-    rows: list[list[Strip | None]] = []
-    names = []
+    rows: list[list[SheetCell | None]] = []
     for scene, box in zip(scenes, cycle(boxes), strict=False):
         visible = box_visibility(box, scene.reference.images.shape[-1]).to(scene.reference.images)
         images = renderer(scene, visible=visible[None], guidance_weight=guidance_weight)
         count = images.shape[1] - 1
-        others = [1 + i * count // views for i in range(min(views, count))]
+        shown = [0, *(1 + i * count // views for i in range(min(views, count)))]
         true = scene.all_views().images[0]
-        rows.append([Strip(true[:1], "input"), Strip(true[:1], "reference view"), Strip(true[others], "other views")])
-        names.append(f"{scene.names[0]}\ntruth")
+        rows.append([SheetCell(true[0], scene.names[0]), *strip(true[shown], "truth: reference view, others")])
         for sample, drawn in enumerate(images):
             # Grey, because the image itself may be black.
-            seen = Strip(true[:1] * visible + 0.5 * (1 - visible), "what is seen") if sample == 0 else None
-            rows.append([seen, Strip(drawn[:1]), Strip(drawn[others])])
-            names.append(f"sample {sample}")
-    return rows, names
+            seen = SheetCell(true[0] * visible + 0.5 * (1 - visible), "what is seen") if sample == 0 else None
+            rows.append([seen, *strip(drawn[shown], f"sample {sample}")])
+    return rows

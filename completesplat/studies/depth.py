@@ -6,11 +6,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.export.images import NOTHING, color_depth, color_normals, ramp, surface_depth
+from completesplat.export.images import (
+    NOTHING,
+    SheetCell,
+    color_depth,
+    color_normals,
+    ramp,
+    strip,
+    surface_depth,
+)
 from completesplat.geometry.surfaces import normals_from_depth
 from completesplat.scene import SceneBatch
 from completesplat.studies.controls import Row, Settings, Tick, over_settings
-from completesplat.studies.figures import Strip
 from completesplat.studies.samples import SampleRenderer, farthest, near
 
 
@@ -66,7 +73,7 @@ def _mean(values: Float[Tensor, "..."]) -> float | None:
 
 def strips(
     renderer: SampleRenderer, scenes: Sequence[SceneBatch], skip_weight: float, guidance_weight: float, shown: int
-) -> list[list[Strip]]:
+) -> list[list[SheetCell | None]]:
     """Return a row for each scene: the truth, some samples in the far view, and where all samples disagree.
 
     The far view is the target whose direction differs most from the reference's. The truth is the input and the far
@@ -81,11 +88,11 @@ def strips(
         depth, images = surface_depth(rendering), renderer.over_background(rendering)[:, far]
         depths, (nearest, deepest) = color_depth(depth[:shown, far])
         normals = color_normals(normals_from_depth(depth[:shown, far], true.cameras[0, far]))
-        row = [Strip(true.images[0, [0, far]], "input, far view")]
-        for sample, pictures in enumerate(zip(images[:shown], depths, normals, strict=True)):
-            row.append(Strip(torch.stack(pictures), f"sample {sample}: depth {nearest:.2f} to {deepest:.2f}"))
-        maps, end = color_deviation(deviation(depth[:, [0, far]]))
-        rows.append([*row, Strip(maps, f"deviation 0 to {end:.2g}")])
+        row = strip(true.images[0, [0, far]], f"{scene.names[0]}: input, far view")
+        for sample, maps in enumerate(zip(images[:shown], depths, normals, strict=True)):
+            row += strip(torch.stack(maps), f"sample {sample}: depth {nearest:.2f} to {deepest:.2f}")
+        differences, end = color_deviation(deviation(depth[:, [0, far]]))
+        rows.append([*row, *strip(differences, f"deviation 0 to {end:.2g}")])
     return rows
 
 

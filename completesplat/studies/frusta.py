@@ -1,11 +1,17 @@
 """Drawings of a sequence's cameras, and a cross that must keep its place in the scene in all images."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
-from jaxtyping import Float
-from PIL import Image, ImageDraw
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from completesplat.data.loading.training_statistics import world_up
@@ -17,15 +23,13 @@ ARM = 0.3
 # Root mean squares. The horizon follows from image axes that turn at least this much (radians). Cameras look at one
 # thing if their optical axes spread at least this much and miss their common point by at most this share of its depth.
 LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
-# Number of places for the cross along an axis; and share of an image at its borders where the cross counts as unseen.
-DEPTHS, BORDER = 16, 0.1
 # Share of an arm's length; lines nearer to a camera's plane are not drawn.
 NEAREST = 0.05
 
 
 @dataclass(frozen=True)
 class Cross:
-    """Three arms from one place, and a level square around it; rows of `arms`: right, up and ahead."""
+    """Three arms from one place; rows of `arms`: right, up and ahead."""
 
     center: Float[Tensor, "3"]
     arms: Float[Tensor, "3 3"]
@@ -34,21 +38,16 @@ class Cross:
         """Return the two ends of each arm in the world; the first is the centre."""
         return torch.stack([self.center.expand(3, 3), self.center + self.arms], dim=1)
 
-    def square(self) -> Float[Tensor, "4 2 3"]:
-        """Return the two ends of each side of the square in the world."""
-        right, _, ahead = self.arms
-        corners = self.center + torch.stack([right + ahead, right - ahead, -right - ahead, -right + ahead])
-        return torch.stack([corners, corners.roll(-1, 0)], dim=1)
-
 
 def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
     """Place a cross where the optical axes of cameras [view] meet, if they meet in front of all cameras.
 
-    Otherwise place it on the axis of the first, the middle or the last camera, where most cameras see it. Of equally
-    good places take the nearest, beyond the middle of the first camera's depth range in terms of 1 / depth.
+    Otherwise place it on the axis of the middle camera, in the middle of the depth range in terms of 1 / depth.
     """
-    met = _common_point(cameras)
-    center = _most_seen_point(cameras, depth_range) if met is None else met
+    center = _common_point(cameras)
+    if center is None:
+        middle = (len(cameras.centers) - 1) // 2
+        center = cameras.centers[middle] + 2 / (1 / depth_range).sum() * cameras.world_to_camera[middle, 2, :3]
     depth = transform_points(cameras.world_to_camera[0], center[None])[0, 2].abs()
     length = ARM * depth * cameras.image_size[1] / 2 / cameras.intrinsics[0, 0, 0]
     return Cross(center, length * level_axes(cameras))
@@ -98,112 +97,17 @@ def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
     return point if met else None
 
 
-def _most_seen_point(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Float[Tensor, "3"]:
-    near, far = depth_range.double().tolist()
-    depths = torch.logspace(math.log10(2 / (1 / near + 1 / far)), math.log10(far), DEPTHS).to(cameras.intrinsics)
-    count = len(cameras.centers)
-    chosen = [0, count // 2, count - 1]
-    origins, forward = cameras.centers[chosen], cameras.world_to_camera[chosen, 2, :3]
-    # Points are ordered by depth, so the first of the best is the nearest.
-    points = (origins + depths[:, None, None] * forward).flatten(0, 1)
-    pixels, depth = project(cameras, points)
-    height, width = cameras.image_size
-    shares = pixels / torch.tensor([width, height]).to(pixels)
-    seen = ((shares - 0.5).abs() < 0.5 - BORDER).all(dim=-1) & (depth > near)
-    return points[seen.sum(dim=0).argmax()]
-
-
-FINE = 4  # factor by which drawings are made larger before they are reduced
-MARGIN = 0.08
 FRUSTUM = 0.14
-# The depth range is drawn up to this multiple of the extent of everything else; an arrow replaces the rest.
+# The depth range is drawn up to this multiple of the extent of everything else.
 REACH = 2.5
 MOST_FRUSTA = 25
 CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
-FIRST, RANGE, PATH = (0, 0, 0), (170, 170, 170), (200, 200, 200)
 EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (5, 6)]
+VIEWS = {"from above": (0, 2), "from the side": (2, 1)}
+"""Axes (of right, up and ahead) to the right and to the top of each drawing."""
 
 
-@dataclass(frozen=True)
-class Drawings:
-    """Sequence prepared for two drawings with one scale.
-
-    Rows of `axes` are the first camera's right, up and ahead, levelled. `frusta` are apex, corners of the image at some
-    depth, and a tick at its upper edge. `depth_range` has the ends of the first camera's range as drawn (`cut`: far is
-    beyond). `middle` (along the axes) and `span` (scene units) cover everything that is drawn.
-    """
-
-    axes: Float[Tensor, "3 3"]
-    centers: Float[Tensor, "view 3"]
-    frusta: Float[Tensor, "view 7 3"]
-    depth_range: Float[Tensor, "2 3"]
-    cut: bool
-    cross: Cross
-    middle: Float[Tensor, "3"]
-    span: float
-
-    def from_above(self, side: int) -> Image.Image:
-        """Draw a square image whose right is the first camera's right and whose top is ahead."""
-        return self._draw(side, self.axes[[0, 2]], self.middle[[0, 2]])
-
-    def from_the_side(self, side: int) -> Image.Image:
-        """Draw a square image seen from the first camera's right, with ahead to the right."""
-        return self._draw(side, self.axes[[2, 1]], self.middle[[2, 1]])
-
-    def scale_bar(self) -> float:
-        """Return a round length of about a quarter of the drawings, in scene units."""
-        power: float = 10 ** math.floor(math.log10(self.span / 3))
-        return max(step * power for step in (1, 2, 5) if step * power <= self.span / 3)
-
-    def _draw(self, side: int, plane: Float[Tensor, "2 3"], middle: Float[Tensor, "2"]) -> Image.Image:
-        picture = Image.new("RGB", (FINE * side, FINE * side), "white")
-        pen = _Pen(ImageDraw.Draw(picture), plane, middle, FINE * side, self.span)
-        pen.line(self.centers, PATH, 1)
-        count = len(self.centers)
-        every = max(1, math.ceil(count / MOST_FRUSTA))
-        for index in [*range(count - 1, 0, -1), 0]:
-            color, width = (time_color(index / (count - 1)), 1) if index else (FIRST, 2)
-            if index % every == 0 or index == count - 1:
-                for start, end in EDGES:
-                    pen.line(self.frusta[index, [start, end]], color, width)
-            pen.draw.circle(pen.pixels(self.centers[[index]])[0], FINE * (2 if index else 4), color)
-        pen.line(self.depth_range, RANGE, 3)
-        pen.ends(self.depth_range, RANGE, self.cut)
-        for arm, color in zip(self.cross.ends(), CROSS_COLORS, strict=True):
-            pen.line(arm, color, 2)
-        pen.scale_bar(self.scale_bar())
-        return picture.reduce(FINE)
-
-
-def drawings(sequence: PosedSequence, cross: Cross) -> Drawings:
-    """Lay out the cameras of a sequence, its first camera's depth range and a cross."""
-    cameras = sequence.cameras
-    axes, centers = level_axes(cameras), cameras.centers
-    near, far = sequence.depth_ranges[0].tolist()
-    reach = REACH * max(near, _extent(centers @ axes.mT), (cross.center - centers[0]).norm().item())
-    depths = torch.tensor([near, min(far, reach)]).to(centers)
-    depth_range = centers[0] + depths[:, None] * cameras.world_to_camera[0, 2, :3]
-    content = torch.cat([centers, depth_range, cross.ends().flatten(0, 1)])
-    frusta = _frusta(cameras, FRUSTUM * _extent(content @ axes.mT))
-    along = torch.cat([content, frusta.flatten(0, 1)]) @ axes.mT
-    middle = (along.amin(dim=0) + along.amax(dim=0)) / 2
-    return Drawings(axes, centers, frusta, depth_range, far > reach, cross, middle, _extent(along))
-
-
-def time_color(share: float) -> tuple[int, int, int]:
-    """Return a colour from dark blue at the beginning of a sequence (0) over red to orange at its end (1)."""
-    from matplotlib import colormaps
-
-    red, green, blue, _ = colormaps["plasma"](0.85 * share, bytes=True)
-    return int(red), int(green), int(blue)
-
-
-def _extent(points: Float[Tensor, "_ 3"]) -> float:
-    extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
-    return extent
-
-
-def _frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
+def frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
     """Return apex, corners of the image at this depth, and a tick upwards from the middle of its upper edge."""
     height, width = cameras.image_size
     pixels = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0), (width / 2, -height / 5)]
@@ -211,42 +115,59 @@ def _frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
     return torch.cat([cameras.centers[:, None], unproject(cameras, places, depths)], dim=1)
 
 
-@dataclass(frozen=True)
-class _Pen:
-    """Pen that draws world points on a plane; widths are in pixels of the reduced image."""
+def drawn_range(sequence: PosedSequence, cross: Cross) -> tuple[Float[Tensor, "2 3"], bool]:
+    """Return the ends of the first camera's depth range, and whether far is beyond the drawings."""
+    cameras, centers = sequence.cameras, sequence.cameras.centers
+    near, far = sequence.depth_ranges[0].tolist()
+    reach = REACH * max(near, _extent(centers), (cross.center - centers[0]).norm().item())
+    depths = torch.tensor([near, min(far, reach)]).to(centers)
+    return centers[0] + depths[:, None] * cameras.world_to_camera[0, 2, :3], far > reach
 
-    draw: ImageDraw.ImageDraw
-    plane: Float[Tensor, "2 3"]
-    middle: Float[Tensor, "2"]
-    side: int
-    span: float
 
-    def line(self, points: Float[Tensor, "_ 3"], color: tuple[int, int, int], width: int) -> None:
-        self.draw.line(self.pixels(points), color, FINE * width)
+def drawings(sequence: PosedSequence, cross: Cross, side: int) -> dict[str, UInt8[np.ndarray, "side side 3"]]:
+    """Draw cameras, depth range and cross in the units of the scene, as seen in each of `VIEWS`.
 
-    def ends(self, interval: Float[Tensor, "2 3"], color: tuple[int, int, int], arrow: bool) -> None:
-        """Draw a bar across the near end, and at the far end another, or an arrow if the range continues."""
-        (x0, y0), (x1, y1) = self.pixels(interval)
-        length = math.hypot(x1 - x0, y1 - y0)
-        if length < 1:  # it points at the viewer
-            return
-        x, y = 7 * FINE * (x1 - x0) / length, 7 * FINE * (y1 - y0) / length
-        first, last = ([(a - y, b + x), (a + y, b - x)] for a, b in ((x0, y0), (x1, y1)))
-        self.draw.line(first, color, 3 * FINE)
-        if arrow:
-            self.draw.polygon([*last, (x1 + 1.5 * x, y1 + 1.5 * y)], color)
-        else:
-            self.draw.line(last, color, 3 * FINE)
+    Right, up and ahead are the first camera's, levelled. Colours of cameras tell the time.
+    """
+    axes, centers = level_axes(sequence.cameras), sequence.cameras.centers
+    depth_range, cut = drawn_range(sequence, cross)
+    content = torch.cat([centers, depth_range, cross.ends().flatten(0, 1)])
+    pyramids = frusta(sequence.cameras, FRUSTUM * _extent(content))
+    count = len(centers)
+    chosen = [*range(count - 1, 0, -max(1, math.ceil(count / MOST_FRUSTA))), 0]
+    images = {}
+    for view, plane in VIEWS.items():
+        figure = Figure(figsize=(side / 100, side / 100), dpi=100, layout="constrained")
+        panel = figure.subplots()
+        line = partial(_line, panel, axes[list(plane)])
+        line(centers, "0.8", 1)
+        for index in chosen:
+            color = colormaps["plasma"](0.85 * index / (count - 1)) if index else "k"
+            for edge in EDGES:
+                line(pyramids[index, list(edge)], color, 1)
+            line(centers[[index]], color, 1, "." if index else "o")
+        line(depth_range, "0.67", 3, "" if cut else "|")
+        for arm, color in zip(cross.ends(), CROSS_COLORS, strict=True):
+            line(arm, [value / 255 for value in color], 2)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.tick_params(labelsize=6)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()  # type: ignore[no-untyped-call]
+        images[view] = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
+    return images
 
-    def scale_bar(self, length: float) -> None:
-        """Draw a bar of this length (scene units) in the lower left corner."""
-        left, bottom = 4 * FINE, self.side - 4 * FINE
-        right = left + length / self.span * self.side * (1 - 2 * MARGIN)
-        self.draw.line([(left, bottom), (right, bottom)], FIRST, FINE)
-        for x in (left, right):
-            self.draw.line([(x, bottom - 3 * FINE), (x, bottom + 3 * FINE)], FIRST, FINE)
 
-    def pixels(self, points: Float[Tensor, "n 3"]) -> list[tuple[float, float]]:
-        unit = self.side * (1 - 2 * MARGIN) / self.span
-        right, up = (unit * (points @ self.plane.mT - self.middle)).unbind(dim=-1)
-        return [(self.side / 2 + x, self.side / 2 - y) for x, y in zip(right.tolist(), up.tolist(), strict=True)]
+def _line(
+    panel: Axes,
+    plane: Float[Tensor, "2 3"],
+    points: Float[Tensor, "_ 3"],
+    color: str | Sequence[float],
+    width: float,
+    marker: str = "",
+) -> None:
+    panel.plot(*(plane @ points.mT).cpu(), color=color, linewidth=width, marker=marker)
+
+
+def _extent(points: Float[Tensor, "_ 3"]) -> float:
+    extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
+    return extent

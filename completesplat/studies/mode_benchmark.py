@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,32 +12,29 @@ from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.hidden_modes import HiddenModes, HiddenModeScenes
 from completesplat.errors import CompleteSplatError, DataError
-from completesplat.export.images import to_bytes
+from completesplat.export.images import SheetCell, image_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.mode_coverage import (
-    EDGES,
     REJECTED,
     HiddenModeScores,
-    bin_sums,
     classify,
-    curve,
     draw_modes,
     mean_of,
     mean_scores,
     scores,
-    spread_and_error,
 )
 from completesplat.metrics.proper_scores import energy_score
 from completesplat.scene import SceneBatch
-from completesplat.studies.figures import written_figure
 from completesplat.studies.samples import autoreconstructor_of
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.stage import Stage
 
 Renders = Float[Tensor, "sample view 3 height width"]
 Predictor = Callable[[SceneBatch, SceneBatch, int], Renders]
 """Function from a scene, another scene (batches of one) and a seed to renders of all targets in [0, 1]."""
 
 
-def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
+def predictors(module: Stage, samples: int, batch: int) -> dict[str, Predictor]:
     """Return `model` as it is tested, and simpler predictors, which show where modes are lost.
 
     A variational autoreconstructor adds `posterior_mean`; `posterior_samples`, with latents drawn from the posterior of
@@ -49,7 +45,7 @@ def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
     """
 
     def model(scene: SceneBatch, other: SceneBatch, seed: int) -> Renders:
-        if not module.draws_samples:
+        if not isinstance(module, LatentDiffusion):
             image = _render(module, module.reconstruct(scene, seed=seed), scene)
             return image.expand(samples, *image.shape[1:])
         gaussians = module.reconstruct(scene, seed=seed, samples=samples, batch=batch)
@@ -74,7 +70,7 @@ def predictors(module: Any, samples: int, batch: int) -> dict[str, Predictor]:
 class _Ladder:
     """Predictors that render an autoreconstructor's output for different latents."""
 
-    module: Any
+    module: Stage
     model: VariationalAutoReconstructor
     samples: int
     batch: int
@@ -106,7 +102,7 @@ class _Ladder:
         return _render(self.module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)
 
 
-def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
+def _render(module: Stage, gaussians: Gaussians, scene: SceneBatch) -> Renders:
     images: Renders = module.render_from(gaussians, scene.targets.cameras[0]).over(module.background).clamp(0, 1)
     return images
 
@@ -114,28 +110,18 @@ def _render(module: Any, gaussians: Gaussians, scene: SceneBatch) -> Renders:
 REGIONS = ("hidden", "visible")
 
 
-@dataclass(frozen=True)
-class Shown:
-    """Scene for the figure, with samples in the view that shows the modes best, and their classes."""
-
-    scene: HiddenModes
-    samples: Float[Tensor, "sample 3 height width"]
-    classes: tuple[int, ...]
-
-
 @dataclass
 class Measured:
-    """Measurements so far: scores by method and scene, sums of the calibration by method and region.
+    """Measurements so far: scores by method and scene.
 
     `energies` are the energy scores in views that show the modes, of the pixels that the reference hides and of the
-    others; `classes` are those of all samples, by method and the modes' probabilities.
+    others; `classes` are those of all samples, by method and the modes' probabilities; `rows` are those of the figure.
     """
 
     scores: dict[str, list[HiddenModeScores]] = field(default_factory=dict)
     energies: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    sums: dict[str, dict[str, Tensor]] = field(default_factory=dict)
     classes: dict[str, dict[tuple[float, ...], list[Tensor]]] = field(default_factory=dict)
-    shown: list[Shown] = field(default_factory=list)
+    rows: list[list[SheetCell]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
     def add(self, method: str, images: Renders, scene: HiddenModes) -> None:
@@ -151,18 +137,15 @@ class Measured:
                 true = in_region(truth[None], region)[0].flatten()
                 energies[name].append(energy_score(in_region(images, region).flatten(1), true))
 
-    def add_calibration(self, method: str, renders: Renders, scene: HiddenModes) -> None:
-        """Add the calibration of renders of all targets."""
-        variance, error = spread_and_error(renders, scene.scene.targets.images[0])
-        sums = self.sums.setdefault(method, {})
-        for name, region in zip(REGIONS, (scene.unseen, ~scene.unseen), strict=True):
-            sums[name] = sums.get(name, 0) + bin_sums(variance, error, region)
-
     def show(self, images: Renders, scene: HiddenModes, count: int) -> None:
-        """Keep images and classes of some samples."""
+        """Keep the input, every mode, and some samples with their modes, in the view that shows the modes best."""
         pixels, modes = in_region(images[:count], scene.region), in_region(scene.truths, scene.region)
-        classes = classify(pixels, modes, scene.probabilities)
-        self.shown.append(Shown(scene, images[:count, 0], tuple(classes.tolist())))
+        labels = [f"{name} (true)" if mode == scene.true_mode else name for mode, name in enumerate(scene.modes)]
+        classes = classify(pixels, modes, scene.probabilities).tolist()
+        labels += ["rejected" if mode == REJECTED else scene.modes[mode] for mode in classes]
+        cells = [SheetCell(scene.scene.reference.images[0], scene.scene.names[0])]
+        cells += [SheetCell(*cell) for cell in zip([*scene.truths[:, 0], *images[:count, 0]], labels, strict=True)]
+        self.rows.append(cells)
 
     def results(self, samples: int) -> dict[str, dict[str, float]]:
         """Return means over the scenes by method."""
@@ -174,28 +157,28 @@ class Measured:
             for method, scene_scores in self.scores.items()
         }
 
-    def shares(self) -> dict[str, list[dict[str, Any]]]:
+    def shares(self) -> dict[str, list[dict[str, object]]]:
         """Return by method the modes' shares of samples, over all scenes whose modes have the same probabilities.
 
         `total_variation` is between the probabilities and these shares (of samples that are not rejected); chance adds
         little to it, because there are many samples. If kinds of scenes differ in their probabilities, it reveals a
         model that has learned how often modes occur, but not when.
         """
-        rows: dict[str, list[dict[str, Any]]] = {}
+        rows: dict[str, list[dict[str, object]]] = {}
         for method, kinds in self.classes.items():
             for probabilities, each in kinds.items():
                 classes, p = torch.cat(each), torch.tensor(probabilities)
                 counts = torch.stack([(classes == mode).sum() for mode in range(len(p))])
                 shares = counts / counts.sum().clamp(min=1)
-                row = {"probabilities": p.tolist(), "scenes": len(each), "shares": shares.tolist()}
-                row["rejected"] = (classes == REJECTED).float().mean().item()
-                row["total_variation"] = (0.5 * (shares - p).abs().sum()).item() if counts.any() else 1.0
+                row = {
+                    "probabilities": p.tolist(),
+                    "scenes": len(each),
+                    "shares": shares.tolist(),
+                    "rejected": (classes == REJECTED).float().mean().item(),
+                    "total_variation": (0.5 * (shares - p).abs().sum()).item() if counts.any() else 1.0,
+                }
                 rows.setdefault(method, []).append(row)
         return rows
-
-    def calibration(self) -> dict[str, dict[str, Any]]:
-        """Return calibration curves by method and region."""
-        return {method: {region: curve(sums) for region, sums in parts.items()} for method, parts in self.sums.items()}
 
 
 def in_region(
@@ -230,7 +213,6 @@ def measure(
             renders = predict(scene.scene, scenes[index - 1].scene, seed + index)
             mode_views = renders[:, list(scene.views)]
             measured.add(method, mode_views, scene)
-            measured.add_calibration(method, renders, scene)
             if method == "model" and index < shown_scenes:
                 measured.show(mode_views, scene, shown_samples)
         measured.names.append(scene.scene.names[0])
@@ -251,82 +233,8 @@ def usable(scenes: HiddenModeScenes, count: int | None) -> tuple[list[HiddenMode
     return selected, skipped
 
 
-SIDE, GAP, CHARTS = 1.0, 0.06, 10.0
-"""Side of an image, space between images and width of the charts, in inches."""
-BEST = {"coverage": 1, "total_variation": 0, "sharpness": 0, "rejected": 0}
-COLORS = {"hidden": "C3", "visible": "C0"}
-STYLES = ("o-", "s--", "^:", "v-.", "d-")
-LOWEST = EDGES[0].item() / 2  # where variances and errors below the first edge are drawn
-
-
-def draw(
-    shown: Sequence[Shown],
-    results: Mapping[str, Mapping[str, float]],
-    calibration: Mapping[str, Mapping[str, Any]],
-    samples: int,
-    path: Path,
-) -> None:
-    """Write a PNG: a row of images for each scene, and beside them the scores and the calibration by method."""
-    count = 1 + len(shown[0].scene.modes) + len(shown[0].samples)
-    height = max(5.4, (SIDE + 0.3) * len(shown) + 0.8)
-    width = (SIDE + GAP) * count + 0.3 + CHARTS
-    split, top = 1 - CHARTS / width, 1 - 0.7 / height
-    bottom = max(0.1, height - 0.7 - (SIDE + 0.3) * len(shown)) / height
-    places = {"left": 0.3 / width, "right": split, "top": top, "bottom": bottom}
-    first = next(iter(results.values()))
-    title = f"Hidden modes: {first['scenes']} scenes, {first['samples']} samples each"
-    title += ". Input; then from behind: every mode, the true one in green; samples with the mode found"
-    # Laid out by hand, because matplotlib's constrained layout takes seconds for this many panels.
-    with written_figure(path, title, (width, height), layout=None) as figure:
-        grid = figure.add_gridspec(len(shown), count, **places, wspace=GAP / SIDE, hspace=0.3 / SIDE)
-        _draw_pictures(grid.subplots(squeeze=False), shown)
-        charts = {"left": split + 0.6 / width, "right": 1 - 0.2 / width, "top": top, "bottom": 1.4 / height}
-        panels: Any = figure.add_gridspec(1, 2, **charts, wspace=0.22).subplots()
-        bars, curves = panels
-        _draw_bars(bars, results)
-        _draw_calibration(curves, calibration, samples)
-
-
-def _draw_pictures(rows: Any, shown: Sequence[Shown]) -> None:
-    for panels, row in zip(rows, shown, strict=True):
-        scene = row.scene
-        panels[0].set_ylabel(scene.scene.names[0], fontsize=7)
-        labels = [("input", "k")]
-        labels += [(name, "g" if mode == scene.true_mode else "k") for mode, name in enumerate(scene.modes)]
-        labels += [("rejected", "0.5") if n == REJECTED else (scene.modes[n], "C1") for n in row.classes]
-        images = [scene.scene.reference.images[0], *scene.truths[:, 0], *row.samples]
-        for panel, image, (label, color) in zip(panels, images, labels, strict=True):
-            panel.imshow(to_bytes(image), interpolation="nearest")
-            panel.set(xticks=[], yticks=[])
-            panel.set_title(label, fontsize=8, color=color, pad=2)
-            panel.spines[:].set(color=color, linewidth=0.6 if color == "k" else 2)
-
-
-def _draw_bars(panel: Any, results: Mapping[str, Mapping[str, float]]) -> None:
-    width = 0.8 / len(results)
-    for index, (method, entry) in enumerate(results.items()):
-        places = [place + (index + 0.5) * width - 0.4 for place in range(len(BEST))]
-        bars = panel.bar(places, [entry[key] for key in BEST], width, label=method.replace("_", " "), color=f"C{index}")
-        panel.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-    labels = [f"{key.replace('_', ' ')}\n(best: {best})" for key, best in BEST.items()]
-    panel.set_xticks(range(len(BEST)), labels, fontsize=8)
-    panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
-    panel.margins(y=0.12)
-    panel.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
-
-
-def _draw_calibration(panel: Any, calibration: Mapping[str, Mapping[str, Any]], samples: int) -> None:
-    for style, (method, by_region) in zip(STYLES, calibration.items(), strict=False):
-        for region in REGIONS:
-            bins = by_region[region]["bins"]
-            if bins:
-                points = [(max(row["variance"], LOWEST), max(row["squared_error"], LOWEST)) for row in bins]
-                label = f"{method.replace('_', ' ')}, {region}"
-                panel.plot(*zip(*points, strict=True), style, color=COLORS[region], markersize=4, label=label)
-    ends = [LOWEST, 0.3]
-    ideal = [(1 + 1 / samples) * end for end in ends]
-    panel.plot(ends, ideal, color="0.6", zorder=0, label="calibrated: error = (1 + 1/S) variance")
-    panel.set(xscale="log", yscale="log", xlabel="variance of the samples", ylabel="squared error of their mean")
-    panel.set_title(f"Pixels by variance; below {EDGES[0].item():.0e}: at the left edge", fontsize=9)
-    panel.grid(alpha=0.3)
-    panel.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)
+def draw(measured: Measured, samples: int, path: Path) -> None:
+    """Write a PNG with a row for each scene of `Measured.rows`."""
+    title = f"Hidden modes: {len(measured.names)} scenes, {samples} samples each. Input; then from behind: every mode, "
+    headings = [""] * max(map(len, measured.rows))
+    write_png(path, image_sheet(headings, measured.rows, f"{title}samples with their modes"))

@@ -11,12 +11,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
+from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.errors import DataError
+from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.geometry.cameras import Cameras
 from completesplat.metrics.images import PSNR_LIMIT
 from completesplat.rasterizers import Rasterizer, Rendering
-from completesplat.scene import SceneBatch
+from completesplat.scene import SceneBatch, Views
+from completesplat.training.latent_diffusion import LatentDiffusion
+from completesplat.training.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -40,22 +44,40 @@ class SampleRenderer:
         """Composite a rendering over the background and clip it to [0, 1]."""
         return rendering.over(self.background).clamp(0, 1)
 
-    @torch.no_grad()
     def render(self, scene: SceneBatch, **settings: Any) -> Rendering:
         """Render colour, depth and opacity [sample view] of one scene (a batch of one); settings are `generate`'s."""
+        return self.rasterize(self.generate(scene, **settings), scene)
+
+    def generate(self, scene: SceneBatch, **settings: Any) -> Gaussians:
+        """Draw samples of one scene."""
         inputs = scene.reference.images, scene.reference.cameras, scene.depth_range
-        gaussians = self.model.generate(*inputs, samples=self.samples, seed=self.seed, **settings)
+        return self.model.generate(*inputs, samples=self.samples, seed=self.seed, **settings)
+
+    @torch.no_grad()
+    def rasterize(self, gaussians: Gaussians, scene: SceneBatch) -> Rendering:
+        """Render the samples of one scene in the reference view and all targets."""
         cameras = scene.all_views().cameras.map(lambda tensor: tensor.expand(self.samples, *tensor.shape[1:]))
         return self.rasterizer(gaussians, cameras)
 
 
-def autoreconstructor_of(module: Any) -> VariationalAutoReconstructor | None:
+def autoreconstructor_of(module: Stage) -> VariationalAutoReconstructor | None:
     """Return the variational autoreconstructor of either stage; None for another model."""
-    network = module.completesplat.autoreconstructor if module.draws_samples else getattr(module, "model", None)
+    if isinstance(module, LatentDiffusion):
+        network: object = module.completesplat.autoreconstructor
+    else:
+        network = getattr(module, "model", None)
     return network if isinstance(network, VariationalAutoReconstructor) else None
 
 
-def first_scenes(data: Any, count: int) -> list[SceneBatch]:
+def reconstructed(network: VariationalAutoReconstructor, scene: SceneBatch, views: Views | None) -> Gaussians:
+    """Return the Gaussians of the posterior's mode, from the reference image and some views of a scene."""
+    posterior, features = network.posterior(scene.reference.images, views, scene.depth_range)
+    splatter_image = network.reconstructor(posterior.mode(), features)
+    gaussians: Gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
+    return gaussians
+
+
+def first_scenes(data: SceneDataModule, count: int) -> list[SceneBatch]:
     """Return the first test scenes of a data module, each as a batch of one."""
     data.setup("test")
     all_scenes = (batch[i : i + 1] for batch in data.test_dataloader() for i in range(len(batch.names)))

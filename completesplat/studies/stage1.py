@@ -15,7 +15,8 @@ from completesplat.geometry.cameras import pixel_centers, project, unproject
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch, Views
 from completesplat.studies.figures import written_figure
-from completesplat.studies.samples import autoreconstructor_of, mean_over_scenes, object_psnr
+from completesplat.studies.samples import autoreconstructor_of, mean_over_scenes, object_psnr, reconstructed
+from completesplat.training.stage import Stage
 
 CLOSE = 0.3
 """Share of the thickness; a layer nearer to the back than this counts as on it."""
@@ -23,7 +24,7 @@ CLOSE = 0.3
 
 @torch.no_grad()
 def rows_of_views(
-    module: Any, counts: Sequence[int], scenes: Sequence[SceneBatch], tick: Callable[[str], None]
+    module: Stage, counts: Sequence[int], scenes: Sequence[SceneBatch], tick: Callable[[str], None]
 ) -> list[dict[str, float | None]]:
     """Return a row for each number of views, the reference included: mean PSNR (dB) over scenes (batches of one).
 
@@ -35,7 +36,7 @@ def rows_of_views(
     """
     network = autoreconstructor_of(module)
     if network is None or not network.sees_views:
-        raise CompleteSplatError("this model reconstructs from one picture: it was not trained with posterior=views")
+        raise CompleteSplatError("this model reconstructs from one image: it was not trained with posterior=views")
     most = min(scene.targets[:, ::2].images.shape[1] for scene in scenes)
     if max(counts) > most:
         raise CompleteSplatError(f"counts: {max(counts)} views, and half of the targets are {most}")
@@ -47,13 +48,13 @@ def rows_of_views(
     return results
 
 
-def _measure(module: Any, own: VariationalAutoReconstructor, scene: SceneBatch, count: int) -> dict[str, float | None]:
+def _measure(
+    module: Stage, network: VariationalAutoReconstructor, scene: SceneBatch, count: int
+) -> dict[str, float | None]:
     candidates, scored = scene.targets[:, ::2], scene.targets[:, 1::2]
     chosen = torch.arange(1, count) * candidates.images.shape[1] // count  # evenly in the data's order, as in an orbit
     views = replace(scene, targets=candidates[:, chosen]).all_views()
-    posterior, features = own.posterior(scene.reference.images, views, scene.depth_range)
-    splatter_image = own.reconstructor(posterior.mode(), features)
-    gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
+    gaussians = reconstructed(network, scene, views)
     images = module.render_from(gaussians, scored.cameras[0]).over(module.background).clamp(0, 1)
     true = scored.images[0]
     return {"psnr": psnr(images[0], true).mean().item(), "object_psnr": object_psnr(images, true, scored.masks[0])}
@@ -72,7 +73,7 @@ def plot_views(rows: Sequence[Mapping[str, Any]], path: Path, title: str) -> Non
 
 @torch.no_grad()
 def rows_of_layers(
-    module: Any, scenes: Sequence[SceneBatch], tick: Callable[[str], None]
+    module: Stage, scenes: Sequence[SceneBatch], tick: Callable[[str], None]
 ) -> list[dict[str, float | str]]:
     """Return a row for the object's true back and each layer: means over the object's pixels of all scenes.
 
@@ -86,18 +87,13 @@ def rows_of_layers(
     """
     network = autoreconstructor_of(module)
     if network is None:
-        raise CompleteSplatError(
-            "this model has no layers of its own: take a run of the autoreconstructor, or of stage 2"
-        )
+        raise CompleteSplatError("this model has no layers: take a run of the autoreconstructor, or of stage 2")
     measured = []
     for number, scene in enumerate(scenes):
         tick(f"scene {number + 1} of {len(scenes)}")
         if scene.reference.depths is None:
             raise DataError("the data have no true depth", str(scene.names[0]))
-        views = scene.all_views() if network.sees_views else None
-        posterior, features = network.posterior(scene.reference.images, views, scene.depth_range)
-        splatter_image = network.reconstructor(posterior.mode(), features)
-        gaussians = splatter_image.gaussians(scene.reference.cameras, scene.depth_range)
+        gaussians = reconstructed(network, scene, scene.all_views() if network.sees_views else None)
         size = scene.reference.images.shape[-2:]
         front = scene.reference.depths[0, 0]
         thickness, known = true_thickness(scene[0].reference, scene[0].targets)

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from completesplat.data.sequences import PosedSequence
+from completesplat.results.tables import Cell, Heading, Table, TableRow, show, table
 from completesplat.studies.figures import written_figure
 
 # Key in the results, label, format.
@@ -24,6 +23,7 @@ MEASURES = [
     ("path_extent", "largest distance of two cameras, scene units", ".3g"),
     ("largest_angle_degrees", "largest angle between two views, degrees", ".1f"),
 ]
+PARTS = ("min", "median", "max")
 BINS = 30
 CHUNK = 256
 
@@ -55,21 +55,15 @@ def statistics(sequences: Mapping[str, Iterable[PosedSequence]]) -> dict[str, An
 def show_statistics(results: dict[str, Any]) -> None:
     """Print the splits side by side."""
     splits = results["splits"]
-    counts = Table("split", title="Sequences and frames", title_justify="left")
-    ranges = Table("", title="Smallest, median and largest", title_justify="left")
-    counts.columns[0].no_wrap = True
-    for heading in ("sequences", "frames"):
-        counts.add_column(heading, justify="right", no_wrap=True)
-    for split, summary in splits.items():
-        counts.add_row(split, f"{summary['sequences']:,}", f"{summary['frames']:,}")
-        for heading in (f"{split}\nmin", "\nmedian", "\nmax"):
-            ranges.add_column(heading, justify="right", no_wrap=True)
+    columns = [("split", "split", ""), ("sequences", "sequences", ",d"), ("frames", "frames", ",d")]
+    headings = [Heading(part, split) for split in splits for part in PARTS]
+    rows = []
     for key, label, form in MEASURES:
-        values = [summary[key][part] for summary in splits.values() for part in ("min", "median", "max")]
-        ranges.add_row(label, *("-" if value is None else format(value, form) for value in values))
-    console = Console(width=None if Console().is_terminal else 120, markup=False)
-    console.print(counts)
-    console.print(ranges)
+        values = [summary[key][part] for summary in splits.values() for part in PARTS]
+        rows.append(TableRow("", [Cell(label), *(Cell("-" if x is None else format(x, form)) for x in values)]))
+    ranges = Table("ranges", "Smallest, median and largest", [Heading("", figures=False), *headings], rows)
+    counts: list[dict[str, object]] = [{"split": split, **summary} for split, summary in splits.items()]
+    show(table("Sequences and frames", columns, counts), ranges)
 
 
 def _measure(sequence: PosedSequence) -> Row:

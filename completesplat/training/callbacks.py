@@ -1,14 +1,14 @@
 """Training callbacks: seeds of steps, skipped steps, averaged weights, the progress bar."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar, WeightAveraging
+from lightning.pytorch.utilities.types import STEP_OUTPUT
 from rich import get_console
 from rich.progress import TaskID
 from torch import Tensor
@@ -18,7 +18,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError
 from completesplat.settings.schema import Positive, Share
-from completesplat.training.sharding import own_part, whole
+from completesplat.training.sharding import local_part, whole
 
 BAD_STEPS = "train/bad_steps"
 
@@ -34,7 +34,7 @@ class StepSeeds(Callback):
     def __init__(self, seed: int) -> None:
         self.seed = seed
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         torch.manual_seed(step_seed(self.seed, trainer.current_epoch, batch_idx, trainer.global_rank))
 
 
@@ -47,9 +47,9 @@ class BadSteps(Callback):
     """Callback that skips optimizer steps whose loss, or norm of all gradients, is not finite.
 
     A skipped step does not change weights, their averages or the optimizer's state. It counts as a step of the run, so
-    the schedule and the order of the data go on. All processes skip the same steps. The bar and the loggers get the
+    the schedule and the order of the data continue. All processes skip the same steps. Progress bar and loggers get the
     number of skipped steps as `train/bad_steps`. With `trainer.precision=16-mixed` it includes the first steps, which
-    search for the loss's scale.
+    search for the scale of the loss.
 
     Args:
         most_bad_steps: `DivergenceError` ends the run after this many skipped steps in a row, or if it skips all steps.
@@ -68,7 +68,7 @@ class BadSteps(Callback):
         self.total, self.in_a_row = state_dict["total"], state_dict["in_a_row"]
 
     def on_before_backward(self, trainer: Trainer, pl_module: LightningModule, loss: Tensor) -> None:
-        self.losses.append(loss.detach())  # several if gradients are accumulated
+        self.losses.append(loss.detach())  # several losses if gradients are accumulated
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
@@ -95,10 +95,10 @@ class BadSteps(Callback):
 
 def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
     """Describe a bad step: its number, and the loss term and first layer that are not finite."""
-    logged = {name.removeprefix("train/"): x.item() for name, x in trainer.callback_metrics.items() if "train/" in name}
-    terms = [f"{name} is {value}" for name, value in logged.items() if not np.isfinite(value)]
+    logged = {name.removeprefix("train/"): x for name, x in trainer.callback_metrics.items() if "train/" in name}
+    terms = [f"{name} is {value.item()}" for name, value in logged.items() if not value.isfinite()]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
-    layers = [n for n, p in module.named_parameters() if p.grad is not None and not own_part(p.grad).isfinite().all()]
+    layers = [n for n, p in module.named_parameters() if p.grad is not None and not local_part(p.grad).isfinite().all()]
     results = gathered((terms, layers))
     term = next((f"loss term {terms[0]}" for terms, _ in results if terms), "the last losses are finite")
     layer = next((f"that of {layers[0]} is the first" for _, layers in results if layers), "their norm is too large")
@@ -116,17 +116,16 @@ class ExponentialMovingAverage(WeightAveraging):
     """
 
     def __init__(self, decay: Share) -> None:
-        averages: Callable[[float], Any] = get_ema_multi_avg_fn
-        average = averages(decay)
+        average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
 
         def update(averaged: list[Tensor], weights: list[Tensor], steps: Tensor | int) -> None:
-            average([own_part(value) for value in averaged], [own_part(value) for value in weights], steps)
+            average([local_part(value) for value in averaged], [local_part(value) for value in weights], steps)
 
         super().__init__(multi_avg_fn=update)
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:
-        """Use the average in the place of the weights, as in validation."""
+        """Replace the weights by the average, as in validation."""
         self._swap_models(module)
         try:
             yield
@@ -134,7 +133,7 @@ class ExponentialMovingAverage(WeightAveraging):
             self._swap_models(module)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: STEP_OUTPUT, batch: object, batch_idx: int
     ) -> None:
         """Update the average, except after a skipped step."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
@@ -142,7 +141,7 @@ class ExponentialMovingAverage(WeightAveraging):
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Wait for `on_fit_end`: the checkpoint that is written now must hold the weights too, to resume the run."""
+        """Wait for `on_fit_end`, because the checkpoint that is written now must also hold the weights themselves."""
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_end(trainer, pl_module)
@@ -151,7 +150,7 @@ class ExponentialMovingAverage(WeightAveraging):
 class Progress(RichProgressBar):
     """Lightning's progress bar over the optimizer steps of the whole run, so that it shows the run's remaining time.
 
-    Without a terminal, it logs a line after every validation. A line at the start tells the validation interval.
+    Without a terminal, it logs a line after every validation. A line at the start shows the validation interval.
     """
 
     @property
@@ -177,13 +176,13 @@ class Progress(RichProgressBar):
             current = self.trainer.global_step
         super()._update(progress_bar_id, current, visible, hard)
 
-    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+    def get_metrics(
+        self, trainer: Trainer, pl_module: LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
         """Return the figures at the end of the bar."""
         metrics = super().get_metrics(trainer, pl_module)
-        metrics.pop("v_num", None)
-        if not metrics.get(BAD_STEPS):
-            metrics.pop(BAD_STEPS, None)
-        return {"step": _steps(trainer), **metrics}
+        hidden = {"v_num"} if metrics.get(BAD_STEPS) else {"v_num", BAD_STEPS}
+        return {"step": _steps(trainer), **{name: value for name, value in metrics.items() if name not in hidden}}
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_validation_end(trainer, pl_module)

@@ -4,7 +4,7 @@ import hashlib
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from copy import deepcopy
 from pathlib import Path
@@ -23,8 +23,8 @@ from completesplat.files import atomic_path, make_folder
 from completesplat.settings.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
-from completesplat.training.sharding import own_part, remove_unused_shards
-from completesplat.training.stopping import agreed, end_training
+from completesplat.training.sharding import local_part, remove_unused_shards
+from completesplat.training.stopping import agreed_signal, end_training
 from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
 
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
@@ -41,14 +41,14 @@ class CheckpointFiles(TorchCheckpointIO):
     """
 
     def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any = None
+        self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: object = None
     ) -> None:
         """Replace the file at this path; if the disk refuses, raise DiskError and keep the old file."""
         with _replaced(Path(path), bytes_of(checkpoint)) as unfinished:
             torch.save(checkpoint, unfinished)
             _add_checksum(unfinished)
 
-    def load_checkpoint(self, path: str | os.PathLike[str], *options: Any, **more: Any) -> dict[str, Any]:
+    def load_checkpoint(self, path: str | os.PathLike[str], *options: object, **more: object) -> dict[str, Any]:
         """Load a checkpoint with `read_checkpoint`, on the CPU."""
         return read_checkpoint(Path(path))
 
@@ -62,15 +62,15 @@ class Checkpoints(Checkpoint):
 
     Loggers get the rows of a step and of its validation after the last callback of the step. The file is therefore
     written before the next batch, with the loops' state at the end of the step (also at the end of training, which
-    Lightning takes for the end of an epoch), so that a resumed run lacks no row. The file also holds the figures that
+    Lightning counts as the end of an epoch), so that a resumed run lacks no row. The file also holds the figures that
     were logged so far, because the end of a run reports them.
 
     During training, signals are only recorded. After the step in which any process got one, all processes save and end
     with `Interrupted`.
 
     Args:
-        every_n_train_steps, every_minutes: optimizer steps (at least 1) or minutes between checkpoints; None: ignored.
-        keep_every: optimizer steps between milestones (at least 1); None: no milestones.
+        every_n_train_steps, every_minutes: optimizer steps or minutes between checkpoints; None: ignored.
+        keep_every: optimizer steps between milestones; None: no milestones.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Checkpoints(Checkpoint):
         self.every_minutes = every_minutes
         self.keep_every = keep_every
         self.due = False
-        self.asked: int | None = None
+        self.signal: int | None = None
         self.end_of_step: dict[str, Any] | None = None
         self.figures: dict[str, Tensor] = {}
 
@@ -98,29 +98,28 @@ class Checkpoints(Checkpoint):
         for run_logger in trainer.loggers:
             if isinstance(run_logger, ContinuedCSVLogger):
                 run_logger.experiment.goes_on_from = trainer.global_step
-        begun = None if trainer.ckpt_path is None else Path(trainer.ckpt_path)
-        last = self.folder / LAST
         if trainer.is_global_zero:
             make_folder(self.folder)  # only here: a run whose folder is removed must not go on
-        if trainer.is_global_zero and begun is not None and begun != last and begun.parent == self.folder:
-            link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
+            begun, last = Path(trainer.ckpt_path or ""), self.folder / LAST
+            if begun != last and begun.parent == self.folder:
+                link(begun, last)  # replace a damaged file, which must not become `previous.ckpt`
         keep_signals(True)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         # Several batches share an optimizer step if gradients are accumulated; checkpoints lack accumulated gradients.
         stepped, self.step = trainer.global_step != self.step, trainer.global_step
         if stepped:
             self.end_of_step = {"epoch": trainer.current_epoch, "fit_loop": deepcopy(trainer.fit_loop.state_dict())}
-            self.asked = agreed(trainer)
-            self.due = self._is_milestone() or self._is_due(trainer) or self.asked is not None
+            self.signal = agreed_signal(trainer)
+            self.due = self._is_milestone() or self._is_due(trainer) or self.signal is not None
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         if self.due:
             self._save(trainer, pl_module)
-        if self.asked is not None:
-            end_training(trainer, self.asked)
+        if self.signal is not None:
+            end_training(trainer, self.signal)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step != self.saved_step:
@@ -129,8 +128,8 @@ class Checkpoints(Checkpoint):
             (self.folder / PREVIOUS).unlink(missing_ok=True)
             remove_unused_shards(self.folder)
         keep_signals(False)
-        if (asked := agreed(trainer)) is not None:
-            end_training(trainer, asked)
+        if (number := agreed_signal(trainer)) is not None:
+            end_training(trainer, number)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         keep_signals(False)
@@ -156,7 +155,7 @@ class Checkpoints(Checkpoint):
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        local = not_finite({name: own_part(value) for name, value in module.state_dict().items()})
+        local = not_finite({name: local_part(value) for name, value in module.state_dict().items()})
         if (name := next(filter(None, gathered(local)), None)) is not None:
             message = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
             raise DivergenceError(f"step {trainer.global_step}: {message}")
@@ -185,11 +184,11 @@ def link(source: Path, target: Path) -> None:
 
 
 def _replaced(path: Path, size: int = 0) -> AbstractContextManager[Path]:
-    """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave only one."""
+    """Write a file atomically; its unfinished file has a fixed name, so that repeated kills leave one at most."""
     return atomic_path(path, f".{path.name}.unfinished", size)
 
 
-def bytes_of(contents: Any) -> int:
+def bytes_of(contents: object) -> int:
     """Return the bytes of all tensors in nested containers, the least size of a file that holds them."""
     if isinstance(contents, Tensor):
         return contents.nbytes
@@ -215,24 +214,18 @@ def newest_whole(last: Path) -> Path | None:
     Raises:
         WeightsError: all of them are damaged.
     """
-    if not last.is_file():
-        return None
-    refusals: list[WeightsError] = []
-    for path in _newest_first(last):
-        try:
-            check_whole(path)
-        except WeightsError as error:
-            refusals.append(error)
-            continue
-        if refusals:
-            logger.warning("%s; going on from %s", refusals[0], path)
-        return path
-    raise refusals[0]
-
-
-def _newest_first(last: Path) -> Iterator[Path]:
-    yield last
-    if (previous := last.with_name(PREVIOUS)).is_file():
-        yield previous
     steps = {path: path.stem.partition("=")[2] for path in last.parent.glob("step=*.ckpt")}
-    yield from sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
+    milestones = sorted((path for path, step in steps.items() if step.isdecimal()), key=lambda p: -int(steps[p]))
+    refusal: WeightsError | None = None
+    for path in (last, last.with_name(PREVIOUS), *milestones) if last.is_file() else ():
+        try:
+            if path.is_file():
+                check_whole(path)
+                if refusal is not None:
+                    logger.warning("%s; going on from %s", refusal, path)
+                return path
+        except WeightsError as error:
+            refusal = refusal or error
+    if refusal is not None:
+        raise refusal
+    return None

@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,7 +21,6 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import gathered, is_first, processes
 from completesplat.data.loading.latent_cache import (
     CHECKSUMS,
-    Array,
     ArrayWriter,
     CachedSequence,
     LatentCache,
@@ -36,14 +34,17 @@ from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.loading.view_selection import spread_around
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import require_space
-from completesplat.data.sequences import PosedSequence, SequenceSource, spread_places
+from completesplat.data.sequences import PosedSequence, spread_places
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.scene import SceneBatch
 from completesplat.tensors import stack
 from completesplat.weights import sha256_of
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16}
-Rows = dict[str, Shaped[np.ndarray, "picture _ _ _"]]
+Rows = dict[str, Shaped[np.ndarray, "image _ _ _"]]
+Sums = Float[np.ndarray, "3 channel"]
+Reference = tuple[PosedSequence, int]
+"""A sequence, and the place of the image to encode."""
 
 logger = logging.getLogger(__name__)
 
@@ -63,38 +64,23 @@ def posterior_fingerprint(autoreconstructor: VariationalAutoReconstructor) -> st
     return fingerprint(encoder if views is None else nn.ModuleList([encoder, views]))
 
 
-def check_cache(
-    store: LatentCache,
-    autoreconstructor: VariationalAutoReconstructor,
-    source: SequenceSource,
-    conditioning: nn.Module | None = None,
-) -> None:
-    """Raise an error for a stale cache. (The data module compares image sizes and all other data options.)
-
-    Args:
-        conditioning: needs its stored features if it is frozen, else stored images; None is not checked.
-
-    Raises:
-        WeightsError: the cache was made with another autoreconstructor or conditioning.
-        DataError: the cache is of other data, or its latents have another shape than this autoreconstructor's.
-    """
-    if store.origin.encoder != posterior_fingerprint(autoreconstructor):
-        raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
-    store.must_be_of(source)
-    device = next(autoreconstructor.parameters()).device
-    blank = torch.zeros(1, 3, store.origin.image_size, store.origin.image_size, device=device)
-    with torch.no_grad():
-        shape = tuple(autoreconstructor.encoder(blank)[0].mean.shape[1:])
-    if shape != store.latent_shape:
-        raise DataError(f"latents of {store.latent_shape}, the autoreconstructor's are {shape}", str(store.folder))
-    if conditioning is not None and store.origin.conditioning != features_fingerprint(conditioning):
-        held = "pictures" if store.holds_pictures else "features of another conditioning"
-        raise WeightsError(f"{store.folder}: holds {held}; encode the training set again with this run's conditioning")
-
-
 def features_fingerprint(conditioning: nn.Module | None) -> str | None:
     """Return the fingerprint of a frozen conditioning, whose features are stored; else None."""
     return fingerprint(conditioning) if conditioning is not None and conditioning.frozen else None
+
+
+def check_cache(store: LatentCache, autoreconstructor: VariationalAutoReconstructor, conditioning: nn.Module) -> None:
+    """Raise WeightsError if a cache was made with other networks. (The data module compares data and their settings.)
+
+    Args:
+        conditioning: needs its stored features if it is frozen, else stored images.
+    """
+    if store.origin.encoder != posterior_fingerprint(autoreconstructor):
+        raise WeightsError(f"{store.folder}: made with another autoreconstructor; encode the training set again")
+    if store.origin.conditioning != features_fingerprint(conditioning):
+        content = "images" if store.origin.conditioning is None else "features of another conditioning"
+        advice = "encode the training set again with this run's conditioning"
+        raise WeightsError(f"{store.folder}: holds {content}; {advice}")
 
 
 @torch.no_grad()
@@ -112,38 +98,27 @@ def encoded(
     posterior, _ = autoreconstructor.posterior(images, views, scenes.depth_range)
     outputs = {"mean": posterior.mean, "log_variance": posterior.log_variance}
     if conditioning is not None:
-        outputs["condition"] = conditioning(images)
-    stored = {name: value.to(precision).cpu().numpy() for name, value in outputs.items()}
-    pictures = (images * 255).round().to(torch.uint8).cpu().numpy()
-    return {"condition": pictures, **stored} if conditioning is None else stored
+        outputs["condition"] = conditioning.eval()(images)
+    rows = {name: value.to(precision).cpu().numpy() for name, value in outputs.items()}
+    if conditioning is not None:
+        return rows
+    return {"condition": (images * 255).round().to(torch.uint8).cpu().numpy(), **rows}
 
 
-class Moments:
-    """Sums over all encoded elements of each channel, in float64, for mean and standard deviation of latents."""
+def moment_sums(
+    mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
+) -> Float[np.ndarray, "3 channel"]:
+    """Return count and sums of h and h^2 over all encoded elements of each channel, in float64, without samples."""
+    mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
+    total, squares = mean.sum((0, 2, 3)), (np.square(mean) + variance).sum((0, 2, 3))
+    return np.stack([np.full_like(total, mean[:, 0].size), total, squares])
 
-    def __init__(self) -> None:
-        self.count, self.total, self.squares = 0, 0.0, 0.0
 
-    def add(
-        self, mean: Float[np.ndarray, "row channel _ _"], log_variance: Float[np.ndarray, "row channel _ _"]
-    ) -> None:
-        """Add more rows."""
-        mean, variance = mean.astype(np.float64), np.exp(log_variance.astype(np.float64))
-        self.count += mean[:, 0].size
-        self.total = self.total + mean.sum((0, 2, 3))
-        self.squares = self.squares + (np.square(mean) + variance).sum((0, 2, 3))
-
-    def join(self, other: "Moments") -> None:
-        """Add the sums of other rows."""
-        self.count += other.count
-        self.total = self.total + other.total
-        self.squares = self.squares + other.squares
-
-    def results(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return mean and standard deviation; Var[h] = E[mean^2] + E[variance] - E[mean]^2 needs no samples."""
-        mean = np.asarray(self.total) / self.count
-        std = np.sqrt(np.asarray(self.squares) / self.count - np.square(mean))
-        return tuple(mean.tolist()), tuple(std.tolist())
+def moments(sums: Float[np.ndarray, "3 channel"]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return mean and standard deviation of each channel; Var[h] = E[mean^2] + E[variance] - E[mean]^2."""
+    count, total, squares = sums
+    mean = total / count
+    return tuple(mean.tolist()), tuple(np.sqrt(squares / count - np.square(mean)).tolist())
 
 
 def encode_training_set(
@@ -160,14 +135,13 @@ def encode_training_set(
 ) -> LatentCache:
     """Encode every frame of every sequence of a packed training set, without augmentation.
 
-    A finished store of the same encodings is not changed. An interrupted run leaves no readable store. Several
-    processes share the batches, and the first one writes the same store as a single process would.
+    A finished store is not changed; an interrupted run leaves no readable one. Several processes share the batches.
 
     Args:
         frames: the largest number of frames of a sequence, evenly spaced; None: all.
         views: number of other views, evenly spread over the sequence, for a posterior that sees views.
-        precision: "float32", or "float16" for half the space, with relative errors of 2^-11 at most in means (the
-            first of the diffusion's timesteps adds noise of 0.029 to latents of unit variance) and 0.8% in variances.
+        precision: "float32", or "float16" for half the space, with relative errors of at most 2^-11 in means (the
+            diffusion's first timestep adds noise of 0.029 to latents of unit variance) and 0.8% in variances.
         conditioning: frozen network from images to features, which are stored; None: the images are stored.
 
     Raises:
@@ -177,24 +151,25 @@ def encode_training_set(
     source = _packed(data)
     origin = _origin(autoreconstructor, data, conditioning, frames, views, precision)
     if is_latent_cache(out):
-        store = LatentCache(out)
-        if store.origin != origin:
+        if (store := LatentCache(out)).origin != origin:
             raise DataError("already holds another store: choose another folder, or remove this one", str(out))
         logger.info("%s already holds these encodings", out)
         return store
     out.mkdir(parents=True, exist_ok=True)
-    features = None if conditioning is None else conditioning.to(device).eval()
-    frozen = autoreconstructor.to(device).eval()
+    frozen, features = autoreconstructor.to(device).eval(), None if conditioning is None else conditioning.to(device)
     encode = partial(
         encoded, autoreconstructor=frozen, conditioning=features, precision=PRECISIONS[precision], device=device
     )
     load = partial(_loaded, SceneStore(source, source.names, cache=False), views)
-    blank = encode(stack([load(next(_references(source, 1, [], False))).scene]))
+    blank = encode(stack([load(next(_references(source, 1, [], False)))]))
     _check_space(source, frames, sum(rows.nbytes for rows in blank.values()), out)
     sequences: list[CachedSequence] = []
-    progress = progress and is_first()
     batches = _encoded_batches(_references(source, frames, sequences, progress), load, encode, batch_size)
-    _write_store(out, origin, blank, batches, sequences)
+    if is_first():
+        _write_store(out, origin, blank, batches, sequences)
+    else:
+        deque(batches, maxlen=0)
+    gathered(None)  # the others wait for the manifest
     return LatentCache(out)
 
 
@@ -206,19 +181,12 @@ def _packed(data: SceneDataModule) -> PackedSource:
     return source
 
 
-class FrameToEncode(NamedTuple):
-    """Scene whose reference is to be encoded, and the number of its frame."""
-
-    scene: SceneBatch
-    number: int
-
-
 def _references(
     source: PackedSource, frames: int | None, sequences: list[CachedSequence], progress: bool
-) -> Iterator[tuple[PosedSequence, int]]:
-    """Yield sequence and place of all references, by row; append each of their sequences to `sequences`."""
+) -> Iterator[Reference]:
+    """Yield all references, by row; append each of their sequences to `sequences`."""
     rows = 0
-    for name in track(source.names, "encoding sequences", disable=not progress):
+    for name in track(source.names, "encoding sequences", disable=not (progress and is_first())):
         sequence = source.read(name)
         places = spread_places(len(sequence.frames), frames)
         sequences.append(CachedSequence(name, len(sequence.frames), rows, tuple(places)))
@@ -226,40 +194,36 @@ def _references(
         yield from ((sequence, place) for place in places)
 
 
-def _loaded(store: SceneStore, views: int, reference: tuple[PosedSequence, int]) -> FrameToEncode:
+def _loaded(store: SceneStore, views: int, reference: Reference) -> SceneBatch:
     sequence, place = reference
-    scene = store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
-    return FrameToEncode(scene, sequence.frames[place])
+    return store.scene(sequence, place, spread_around(len(sequence.frames), place, views))
 
 
 def _encoded_batches(
-    references: Iterator[tuple[PosedSequence, int]],
-    load: Callable[[tuple[PosedSequence, int]], FrameToEncode],
+    references: Iterator[Reference],
+    load: Callable[[Reference], SceneBatch],
     encode: Callable[[SceneBatch], Rows],
     batch_size: int,
-) -> Iterator[tuple[Rows, Moments]]:
-    """Yield the rows and moments of all batches, in order; all processes must iterate, because each encodes a share.
+) -> Iterator[tuple[Rows, Sums]]:
+    """Yield the rows and moment sums of all batches, in order; all processes must iterate: each encodes a share.
 
-    Moments are computed before rows are sent, because their order in memory then changes, and with it the rounding.
+    The sums are computed before rows are sent, because their order in memory then changes, and with it the rounding.
     """
     rank, count = processes()
     while group := list(islice(references, count * batch_size)):
-        local = group[rank * batch_size : (rank + 1) * batch_size]
-        result: tuple[Rows, Moments] | DataError | None = None
-        if local:
+        result: tuple[Rows, Sums] | DataError | None = None
+        if local := group[rank * batch_size : (rank + 1) * batch_size]:
             try:
-                batch = list(map(load, local))
-                rows, moments = encode(stack([frame.scene for frame in batch])), Moments()
-                _refuse_not_finite(rows, batch)
-                moments.add(rows["mean"], rows["log_variance"])
-                result = rows, moments
+                rows = encode(stack(list(map(load, local))))
+                _refuse_not_finite(rows, local)
+                result = rows, moment_sums(rows["mean"], rows["log_variance"])
             except DataError as error:  # all processes raise it below
                 result = error
-        for encoded_there in gathered(result):
-            if isinstance(encoded_there, DataError):
-                raise encoded_there
-            if encoded_there is not None:
-                yield encoded_there
+        for rank_result in gathered(result):
+            if isinstance(rank_result, DataError):
+                raise rank_result
+            if rank_result is not None:
+                yield rank_result
 
 
 def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int, out: Path) -> None:
@@ -271,33 +235,23 @@ def _check_space(source: PackedSource, frames: int | None, bytes_per_frame: int,
 
 
 def _write_store(
-    out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Moments]], sequences: Sequence[CachedSequence]
+    out: Path, origin: Origin, blank: Rows, batches: Iterator[tuple[Rows, Sums]], sequences: Sequence[CachedSequence]
 ) -> None:
-    """Write all processes' encodings in the first one; the others wait. `batches` completes `sequences`."""
-    if is_first():
-        arrays, moments = _write_arrays(out, blank, batches)
-        checksums = sha256_of(out / arrays[CHECKSUMS].file)
-        facts = (__version__, origin, *moments.results(), arrays, tuple(sequences), checksums)
-        write_manifest(out, LatentCacheManifest(*facts))
-    else:
-        deque(batches, maxlen=0)
-    gathered(None)
-
-
-def _write_arrays(out: Path, blank: Rows, batches: Iterator[tuple[Rows, Moments]]) -> tuple[dict[str, Array], Moments]:
-    """Write rows like those of `blank`; return what was written, and its moments."""
-    moments = Moments()
+    """Write rows like those of `blank`, and the manifest. `batches` completes `sequences`."""
+    total = np.zeros(())
     with ExitStack() as files:
         writers = {
             name: files.enter_context(ArrayWriter(out / f"{name}.npy", rows.shape[1:], rows.dtype.name))
             for name, rows in {**blank, CHECKSUMS: row_checksums(blank)}.items()
         }
-        for rows, batch_moments in batches:
-            moments.join(batch_moments)
+        for rows, sums in batches:
+            total = total + sums
             rows[CHECKSUMS] = row_checksums(rows)
             for name, writer in writers.items():
                 writer.append(rows[name])
-    return {name: writer.described() for name, writer in writers.items()}, moments
+    arrays = {name: writer.described() for name, writer in writers.items()}
+    checksums = sha256_of(out / arrays[CHECKSUMS].file)
+    write_manifest(out, LatentCacheManifest(__version__, origin, *moments(total), arrays, tuple(sequences), checksums))
 
 
 def _origin(
@@ -308,14 +262,8 @@ def _origin(
     views: int,
     precision: str,
 ) -> Origin:
-    if (
-        precision not in PRECISIONS
-        or (frames is not None and frames < 1)
-        or (autoreconstructor.sees_views and views < 1)
-    ):
-        raise CompleteSplatError(f"needs precision={' or '.join(PRECISIONS)}, frames and views of 1 or more")
     if conditioning is not None and not conditioning.frozen:
-        raise CompleteSplatError("a conditioning that is trained needs pictures, not features: leave conditioning out")
+        raise CompleteSplatError("a conditioning that is trained needs images, not features: leave conditioning out")
     return Origin(
         posterior_fingerprint(autoreconstructor),
         features_fingerprint(conditioning),
@@ -328,10 +276,10 @@ def _origin(
     )
 
 
-def _refuse_not_finite(rows: Rows, scenes: list[FrameToEncode]) -> None:
+def _refuse_not_finite(rows: Rows, references: Sequence[Reference]) -> None:
     for name, values in rows.items():
         finite = np.isfinite(values).all(axis=(1, 2, 3))
         if not finite.all():
-            bad = scenes[int(finite.argmin())]
+            sequence, place = references[int(finite.argmin())]
             limits = " in float16: try precision=float32" if values.dtype == np.float16 else ""
-            raise DataError(f"its {name} is not finite{limits}", None, str(bad.scene.names), bad.number)
+            raise DataError(f"its {name} is not finite{limits}", None, sequence.name, sequence.frames[place])

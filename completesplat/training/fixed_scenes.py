@@ -2,9 +2,10 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,8 @@ from lightning.pytorch.loggers import WandbLogger
 from PIL import Image
 from torch import Tensor
 
-from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.export.cleaning import storable, with_screen_space_dilation
-from completesplat.export.images import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.images import SheetCell, color_depth, image_sheet, write_png
 from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_text
@@ -28,8 +28,6 @@ from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
-from completesplat.training.latent_diffusion import LatentDiffusion
-from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.training.sharding import whole_networks
 from completesplat.training.stage import Stage
 
@@ -40,11 +38,11 @@ PERCENTILES = (10, 50, 90)
 class DrawsFixedScenes(Callback):
     """Base class of callbacks that draw the first scenes of the validation set, without an effect on training.
 
-    The model is in evaluation mode, with averaged weights if training keeps them.
+    The model is in evaluation mode, with averaged weights if training averages them.
 
     Args:
         folder, scenes: folder of the images, and the number of scenes in them.
-        every_n_steps: optimizer steps between drawings; there is one more at the end of training.
+        every_n_steps: optimizer steps between drawings; there is another one at the end of training.
         views: targets of a scene, evenly spread over all its targets; all, if these are fewer.
     """
 
@@ -56,7 +54,7 @@ class DrawsFixedScenes(Callback):
 
     @abstractmethod
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
-        """Write and log what the model makes of the scenes [view], which are on the CPU."""
+        """Write and log the model's results for the scenes [view], which are on the CPU."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.scenes: list[SceneBatch] = []
@@ -65,7 +63,7 @@ class DrawsFixedScenes(Callback):
             make_folder(self.folder)
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
         if trainer.global_step % self.every_n_steps == 0:
             self._draw_once(trainer, pl_module)
@@ -82,15 +80,15 @@ class DrawsFixedScenes(Callback):
             if not trainer.is_global_zero:
                 return
             if not self.scenes:
-                self.scenes = fixed_scenes(trainer.datamodule, self.count, self.views)  # type: ignore[attr-defined]
+                self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
             self.draw(trainer, module, self.scenes)
 
 
 @contextmanager
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Switch to evaluation, with averaged weights if there are any, and afterwards restore all, random numbers too.
+    """Switch to evaluation, with averaged weights if there are any, and restore everything, random numbers too.
 
-    All processes have to enter it, because networks that are divided over them are whole inside.
+    All processes have to enter it, because divided networks are whole inside.
     """
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
@@ -107,18 +105,15 @@ def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
                 part.training = mode
 
 
-def fixed_scenes(data: Any, count: int, views: int = 1) -> list[SceneBatch]:
-    """Return the first validation scenes, with some of their targets."""
-    scenes: list[SceneBatch] = []
-    for batch in data.val_dataloader():
-        for index in range(len(batch.names)):
-            scene = batch[index]
-            targets = len(scene.targets.images)
-            chosen = [i * targets // views for i in range(views)] if targets > views else list(range(targets))
-            scenes.append(replace(scene, targets=scene.targets[chosen]))
-        if len(scenes) >= count:
-            break
-    return scenes[:count]
+def fixed_scenes(batches: Iterable[SceneBatch], count: int, views: int = 1) -> list[SceneBatch]:
+    """Return the first scenes of the batches, with some of their targets."""
+    scenes = (batch[index] for batch in batches for index in range(len(batch.names)))
+    return [replace(scene, targets=scene.targets[_spread(scene, views)]) for scene in islice(scenes, count)]
+
+
+def _spread(scene: SceneBatch, views: int) -> list[int]:
+    targets = len(scene.targets.images)
+    return [i * targets // views for i in range(views)] if targets > views else list(range(targets))
 
 
 class Pictures(DrawsFixedScenes):
@@ -127,8 +122,7 @@ class Pictures(DrawsFixedScenes):
     `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/layers_000500.png` the layers of its
     Splatter Image (`layer_maps`), `folder/newest/` the scenes themselves (`write_newest`). All loggers get
     `gaussians/opacity_p10`, `_p50`, `_p90`, the same percentiles of all `distributions`, figures of the layers on the
-    object (`layer_figures`), and the latent's bits if the model has a posterior (`latent_bits`). Weights & Biases gets
-    the images and histograms too.
+    object (`layer_figures`), and the model's `latent_figures`. Weights & Biases gets the images and histograms too.
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
@@ -138,21 +132,18 @@ class Pictures(DrawsFixedScenes):
         batch = stack(scenes).to(module.device)
         with trainer.precision_plugin.forward_context():
             gaussians = module.reconstruct(batch, seed=0)
-            posterior = module(batch).posterior if isinstance(module, ReconstructionModule) else None
+            latents = module.latent_figures(batch)
         with torch.autocast(module.device.type, enabled=False):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
-        pictures = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
-        for kind, picture in pictures.items():
-            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
-        write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, up_of(module))
+        images = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
+        for kind, image in images.items():
+            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", image)
+        write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
 
         values = distributions(gaussians)
-        scalars = {f"gaussians/{name}": value for name, value in percentiles(values).items()}
-        scalars |= layer_figures(gaussians, batch)
-        if posterior is not None:
-            scalars |= latent_bits(posterior)
-        images = {"pictures": pictures["step"], "layers": pictures["layers"]}
-        log_drawings(trainer, scalars, images, {f"histograms/{name}": array for name, array in values.items()})
+        figures = percentiles(values) | layer_figures(gaussians, batch) | latents
+        named = {"pictures": images["step"], "layers": images["layers"]}
+        log_drawings(trainer, figures, named, {f"histograms/{name}": array for name, array in values.items()})
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
@@ -174,17 +165,9 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
     write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
 
 
-def up_of(module: Stage) -> Float[Tensor, "3"]:
-    """Return the up direction in the reference's frame: as measured on the training set, else the image's."""
-    if isinstance(module, LatentDiffusion):
-        return module.completesplat.up
-    measured = module.camera if isinstance(module, ReconstructionModule) else {}
-    return torch.tensor(measured.get("up", (0.0, -1.0, 0.0)))
-
-
 def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
     """Draw a sheet with a column for each panel and a row for each scene."""
-    return picture_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
+    return image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
 
 
 def scene_panels(
@@ -196,10 +179,10 @@ def scene_panels(
     """
     target = scenes.targets[:, :1]
 
-    def seen(part: Gaussians) -> Rendering:
+    def render(part: Gaussians) -> Rendering:
         return rasterizer(part, target.cameras)[:, 0]
 
-    whole = seen(gaussians)
+    whole = render(gaussians)
     image = whole.over(background).clamp(0, 1)
     error = (image - target.images[:, 0]).abs().mean(1, keepdim=True)
     panels = {
@@ -213,7 +196,7 @@ def scene_panels(
     pixels = scenes.reference.images.shape[-2] * scenes.reference.images.shape[-1]
     for layer in range(gaussians.count // pixels):
         part = gaussians[:, layer * pixels : (layer + 1) * pixels]
-        panels[f"layer {layer + 1}"] = seen(part).over(background)
+        panels[f"layer {layer + 1}"] = render(part).over(background)
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
 
 
@@ -262,33 +245,24 @@ def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]
 
 
 def percentiles(values: Mapping[str, Float[np.ndarray, " _"]]) -> dict[str, float]:
-    """Return the percentiles of each entry, named `name_p10` and so on."""
-    return {f"{name}_p{p}": float(np.percentile(array, p)) for name, array in values.items() for p in PERCENTILES}
-
-
-def latent_bits(posterior: Posterior) -> dict[str, float]:
-    """Return the latent's KL to the prior per scene: `latent/bits`, and `latent/bits_0`, ... for each channel.
-
-    `latent/active_channels` counts the active channels (`completesplat.autoreconstructor.posterior`).
-    """
-    bits = posterior.channel_bits().tolist()
-    channels = {f"latent/bits_{index}": value for index, value in enumerate(bits)}
-    return {"latent/bits": sum(bits), "latent/active_channels": float(posterior.active_channels()), **channels}
+    """Return the percentiles of each entry, named `gaussians/NAME_p10` and so on."""
+    pairs = product(values.items(), PERCENTILES)
+    return {f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for (name, array), p in pairs}
 
 
 def log_drawings(
     trainer: Trainer,
-    scalars: Mapping[str, float],
-    pictures: Mapping[str, Image.Image],
-    histograms: Mapping[str, Float[np.ndarray, " _"]] | None = None,
+    figures: dict[str, float],
+    images: Mapping[str, Image.Image],
+    histograms: Mapping[str, Float[np.ndarray, " _"]],
 ) -> None:
-    """Log numbers to all loggers, and images and histograms to Weights & Biases."""
-    step = trainer.global_step - 1  # as Lightning counts: a row has the number of optimizer steps before its own
+    """Log figures to all loggers, and images and histograms to Weights & Biases."""
+    step = trainer.global_step - 1  # Lightning's step of a row is the number of optimizer steps before it
     for logger in trainer.loggers:
-        logger.log_metrics(dict(scalars), step=step)
+        logger.log_metrics(figures, step=step)
         if isinstance(logger, WandbLogger):
             import wandb
 
-            media: Any = {name: wandb.Histogram(values.tolist()) for name, values in (histograms or {}).items()}
-            media |= {name: wandb.Image(picture) for name, picture in pictures.items()}
+            media: dict[str, Any] = {name: wandb.Histogram(values.tolist()) for name, values in histograms.items()}
+            media |= {name: wandb.Image(image) for name, image in images.items()}
             logger.log_metrics(media, step=step)

@@ -1,6 +1,7 @@
 """Stage 2: latent diffusion over the frozen autoreconstructor's latents (paper, Section 3.3)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -10,7 +11,6 @@ from torch import Tensor
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.data.loading.distributed import gathered
 from completesplat.data.loading.latent_cache import LatentCache
-from completesplat.diffusion.guidance import allowed_skip_weight, check_guidance_weight
 from completesplat.diffusion.objective import target
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
@@ -32,19 +32,18 @@ class LatentDiffusion(Stage):
 
     Args:
         completesplat: the whole generator, its autoreconstructor still without weights.
-        autoreconstructor_checkpoint: a checkpoint of stage 1 to start from.
-        checkpoint: of this stage, to start from instead (for masked diffusion): all weights, averaged ones if it has
-            them, and what was measured.
-        unconditional_probability: how often phi_ref is zeroed, for guidance (0.2 in the paper).
+        autoreconstructor_checkpoint: checkpoint of stage 1 to start from.
+        checkpoint: checkpoint of this stage to start from instead (for masked diffusion): all weights, the averaged
+            ones if it has them, and all measured values.
+        unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
         skip_weight, guidance_weight: settings of the samples drawn in validation and test.
-        scale_batches: training batches on which the latents' mean and deviation are measured.
-        noise_draws: times that a latent is taken in a step, each time with a noise and a noise level of its own: more
-            steps of the denoiser for one of the encoders.
+        scale_batches: training batches on which the latents' mean and standard deviation are measured.
+        noise_draws: uses of each latent in a step, each with another noise and noise level: more steps of the denoiser
+            for one of the encoders.
         channels_last, compile: of the denoiser, see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
 
     Raises:
-        CompleteSplatError: a weight of the samples outside of [0, 1].
         WeightsError: a checkpoint is unusable, or both are given.
     """
 
@@ -70,8 +69,7 @@ class LatentDiffusion(Stage):
         self.autoreconstructor_checkpoint = autoreconstructor_checkpoint
         self.checkpoint = checkpoint
         self.unconditional_probability = unconditional_probability
-        check_guidance_weight(guidance_weight)
-        self.skip_weight = allowed_skip_weight(skip_weight)
+        self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
         self.noise_draws = noise_draws
@@ -84,8 +82,18 @@ class LatentDiffusion(Stage):
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         prepare_network(completesplat.denoiser, channels_last, compile)
 
+    @property
+    def up(self) -> Float[Tensor, "3"]:
+        """Return the direction up in the reference camera's frame, as measured on the training set."""
+        return self.completesplat.up
+
+    def save_weights(self, folder: Path) -> None:
+        """Write the generator with facts about its training images."""
+        self.completesplat.architecture["training"] = self.data.training_facts()
+        self.completesplat.save_pretrained(folder)
+
     def on_fit_start(self) -> None:
-        """Measure on the training set the latents' scale, and the camera of a typical photograph.
+        """Measure the latents' scale and the typical camera on the training set.
 
         Raises:
             WeightsError: frozen parts have no weights.
@@ -93,24 +101,27 @@ class LatentDiffusion(Stage):
         """
         if self.checkpoint is None and self.trainer.ckpt_path is None:
             self._refuse_random_parts()
-        parts = self.completesplat
-        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
-        if data.latent_cache is not None:
-            check_cache(data.cached_latents, parts.autoreconstructor, data.source("train"), parts.conditioning)
+        parts, data = self.completesplat, self.data
+        cache = None if data.latent_cache is None else data.cached_latents
+        if cache is not None:
+            check_cache(cache, parts.autoreconstructor, parts.conditioning)
         elif parts.autoreconstructor.sees_views and data.targets < 1:
             raise CompleteSplatError("latents of the reference alone hold nothing hidden: set data.targets (to 5, say)")
-        if (parts.latent_std != 1).any():  # a continued run keeps what it measured
+        if (parts.latent_std != 1).any():  # a resumed run keeps its measured values
             return
-        self._measure_latents(data.train_dataloader(), data.cached_latents if data.latent_cache is not None else None)
+        self._measure_latents(data.train_dataloader(), cache)
         camera = data.typical_camera()
         parts.fov_degrees.fill_(camera.fov_degrees)
         parts.depth_range.copy_(torch.tensor(camera.depth_range))
         parts.up.copy_(torch.tensor(camera.up))
 
     def _refuse_random_parts(self) -> None:
-        """Without a checkpoint of this stage, each frozen part needs one of its own."""
+        """Raise WeightsError if a frozen part has no checkpoint."""
         if self.autoreconstructor_checkpoint is None:
-            raise WeightsError("stage 2 needs stage 1: give model.autoreconstructor_checkpoint=FILE")
+            raise WeightsError(
+                "stage 2 needs weights: give model.autoreconstructor_checkpoint=FILE of stage 1, or "
+                "model.checkpoint=FILE of an earlier part of stage 2"
+            )
         conditioning = self.completesplat.conditioning
         if conditioning.frozen and conditioning.pretrained is None:
             raise WeightsError(
@@ -119,39 +130,39 @@ class LatentDiffusion(Stage):
             )
 
     @torch.no_grad()
-    def _measure_latents(self, loader: Any, cache: LatentCache | None) -> None:
-        """Measure mean and deviation of each of the latent's channels, with which the denoiser's are standardised.
+    def _measure_latents(self, loader: Iterable[SceneBatch | CachedScene], cache: LatentCache | None) -> None:
+        """Measure mean and standard deviation of each latent channel, with which the denoiser's are standardised.
 
-        The paper does not say how its latents are scaled; what is measured is stored with the weights. A cache
-        knows exact values.
+        The paper does not state how it scales latents; the values are stored with the weights. A cache has exact ones.
         """
         drawn = []
         for _, batch in zip(range(self.scale_batches), loader, strict=False):
             latent, condition = self.inputs(batch.to(self.device))
             if latent.shape[-2:] != condition.shape[-2:]:
+                sizes = ["x".join(map(str, images.shape[-2:])) for images in (latent, condition)]
                 raise CompleteSplatError(
-                    f"latents are {_size(latent)} and the conditioning's features {_size(condition)} in size: "
+                    f"latents are {sizes[0]} and the conditioning's features {sizes[1]} in size: "
                     "conditioning.channels and autoreconstructor.encoder.channels must have as many levels"
                 )
             drawn.append(latent.double().cpu())
-        own = torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)
-        latents = torch.cat(gathered(own))
-        mean, deviation = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
-        if not (deviation > 0).all():
-            raise CompleteSplatError("the latents do not vary: no training pictures, or an encoder that ignores them")
-        moments = (mean.tolist(), deviation.tolist()) if cache is None else (cache.mean, cache.std)
+        latents = torch.cat(gathered(torch.cat(drawn) if drawn else torch.zeros(1, 1, 1, 1)))
+        mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3), correction=0)
+        if not (std > 0).all():
+            raise CompleteSplatError("the latents do not vary: no training images, or an encoder that ignores them")
+        moments = (mean.tolist(), std.tolist()) if cache is None else (cache.mean, cache.std)
         self.completesplat.set_latent_moments(*moments)
-        names = ("mean", "std")
-        values = {f"latents/{n}_{i}": x for n, each in zip(names, moments, strict=True) for i, x in enumerate(each)}
+        values = {
+            f"latents/{n}_{i}": x for n, xs in zip(("mean", "std"), moments, strict=True) for i, x in enumerate(xs)
+        }
         for logger in self.trainer.loggers:
             logger.log_metrics(values, step=self.trainer.global_step)
 
     def inputs(
         self, batch: SceneBatch | CachedScene
     ) -> tuple[Float[Tensor, "batch channel height width"], Float[Tensor, "batch features _ _"]]:
-        """A draw of the scaled latents, and phi_ref.
+        """Return a draw of the scaled latents, and phi_ref.
 
-        What was encoded beforehand has pictures for a conditioning that is trained, features of one that is frozen.
+        Encoded scenes have images for a conditioning that is trained, and features for one that is frozen.
         """
         parts = self.completesplat
         if isinstance(batch, SceneBatch):
@@ -163,11 +174,10 @@ class LatentDiffusion(Stage):
 
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
-        latent, conditioning = self.inputs(batch)
-        latent, conditioning = (x.repeat(self.noise_draws, 1, 1, 1) for x in (latent, conditioning))
-        kept = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
-        conditioning = conditioning * kept[:, None, None, None]
-        noise = torch.randn(latent.shape, device=self.device)  # like the latent's, it would depend on its memory layout
+        latent, conditioning = (x.repeat(self.noise_draws, 1, 1, 1) for x in self.inputs(batch))
+        conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
+        conditioning = conditioning * conditioned[:, None, None, None]
+        noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout
         timestep = parts.sampler.draw_timesteps(len(latent), self.device)
         noisy = parts.sampler.add_noise(latent, noise, timestep)
         predicted = parts.denoiser(
@@ -182,21 +192,20 @@ class LatentDiffusion(Stage):
     def log_loss(self, errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"]) -> None:
         """Log the mean of the samples' losses, and that of each quarter of the timesteps that is among them."""
         self.log_step({"train/loss": errors.mean()}, batch_size=len(errors))
-        trainer: Any = self.trainer
-        if (self.global_step + 1) % trainer.log_every_n_steps == 0:
-            found = zip(*gathered((errors.cpu(), timestep.cpu())), strict=True)
-            errors, timestep = (torch.cat(parts) for parts in found)
+        if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
+            ranks = zip(*gathered((errors.cpu(), timestep.cpu())), strict=True)
+            errors, timestep = (torch.cat(parts) for parts in ranks)
             values = losses_by_timestep(errors, timestep, self.completesplat.sampler.training_timesteps)
             # Lightning would repeat the loss of a quarter in the rows of later steps that have no sample in it.
             for logger in self.loggers:
                 logger.log_metrics(values, step=self.global_step)
 
     def draw(self, scenes: SceneBatch, seeds: Sequence[int], samples: int) -> Gaussians:
-        """See `Stage`: what is drawn for an image depends on no other image."""
+        """See `Stage`; the samples of an image depend on no other image."""
         return self.reconstruct(scenes, seeds, samples=samples)
 
     def reconstruct(self, scenes: SceneBatch, seed: int | Sequence[int], **settings: Any) -> Gaussians:
-        """One sample for each reference image, or as many as `settings` (of `CompleteSplat.generate`) say."""
+        """Draw one sample for each reference image, or several by `settings` of `CompleteSplat.generate`."""
         return self.completesplat.generate(
             scenes.reference.images,
             scenes.reference.cameras,
@@ -212,10 +221,6 @@ class LatentDiffusion(Stage):
 def losses_by_timestep(
     errors: Float[Tensor, " batch"], timestep: Int64[Tensor, " batch"], timesteps: int
 ) -> dict[str, float]:
-    """Mean loss of the samples in each of four equal ranges of timesteps; ranges without samples are left out."""
+    """Return the mean loss of the samples in each of four equal ranges of timesteps that has samples."""
     buckets = timestep.clamp(max=timesteps - 1) * LOSS_BUCKETS // timesteps
     return {f"train/loss_t{i}": errors[buckets == i].mean().item() for i in sorted(set(buckets.tolist()))}
-
-
-def _size(images: Tensor) -> str:
-    return "x".join(map(str, images.shape[-2:]))

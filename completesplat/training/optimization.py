@@ -36,11 +36,10 @@ def muon(
     matrices = {"params": [p for p in tensors if p.ndim > 1], "lr": lr, "use_muon": True}
     others = {"params": [p for p in tensors if p.ndim < 2], "lr": adam_lr, "betas": adam_betas, "use_muon": False}
     groups = [group for group in (matrices, others) if group["params"]]
-    optimizer: Any = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
+    optimizer: Optimizer = Muon(groups, momentum=momentum, ns_steps=newton_schulz_steps)
     if tensors[0].device.type == "cpu" and not torch.cpu._is_avx512_bf16_supported():
-        optimizer._orthogonalize = _orthogonal_in_float32
-    result: Optimizer = optimizer
-    return result
+        optimizer._orthogonalize = _orthogonal_in_float32  # type: ignore[attr-defined]
+    return optimizer
 
 
 def _orthogonal_in_float32(group: Mapping[str, Any], updates: Sequence[Tensor]) -> list[Tensor]:

@@ -1,6 +1,8 @@
 """Stage 1: a reconstruction model trained from posed images alone (paper, Section 3.2)."""
 
+import logging
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -8,14 +10,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction
-from completesplat.errors import CompleteSplatError
+from completesplat.baselines.splatter_image.files import write_trained
+from completesplat.baselines.splatter_image.model import PublishedSplatterImage
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.gaussians import Gaussians
+from completesplat.generator import OneAnswer
 from completesplat.losses import Prediction, WeightedSum
 from completesplat.metrics.images import psnr
 from completesplat.scene import SceneBatch
 from completesplat.training.stage import Stage, prepare_network
 from completesplat.weights import CAMERA
 from completesplat.weights.checkpoint_reading import load_part
+
+logger = logging.getLogger(__name__)
 
 
 class ReconstructionModule(Stage):
@@ -24,9 +31,9 @@ class ReconstructionModule(Stage):
     Args:
         model: images -> `Reconstruction`: the Variational AutoReconstructor or a baseline.
         loss: weighted terms by name.
-        checkpoint: of an earlier stage, whose weights this one starts from.
-        masked: the model sees the visible part of the reference picture only (`data.box_masks`), and is to complete it;
-            it is compared with whole pictures. The paper leaves this as future work.
+        checkpoint: checkpoint of an earlier stage, whose weights this one starts from.
+        masked: the model sees only the visible part of the reference image (`data.box_masks`) and learns to complete
+            it; renders are compared with whole images. The paper leaves this as future work.
         channels_last, compile: see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
     """
@@ -47,27 +54,55 @@ class ReconstructionModule(Stage):
         self.model = model
         self.loss = loss
         self.masked = masked
+        self.camera: dict[str, float | list[float]] = {}
         if checkpoint is not None:
             load_part(model, checkpoint, prefix="model.")
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         prepare_network(model, channels_last, compile)
 
-    def on_fit_start(self) -> None:
-        """Refuse a latent cache, since this stage trains what would encode it, and too few views for the posterior.
+    @property
+    def up(self) -> Float[Tensor, "3"]:
+        """Return the direction up in the reference camera's frame, as measured on the training set."""
+        return torch.tensor(self.camera["up"]) if self.camera else super().up
 
-        The camera of a typical photograph is measured for those whose camera is not known (`OneAnswer`).
+    def save_weights(self, folder: Path) -> None:
+        """Write the network with the typical camera; published weights in the format of their authors.
+
+        A network that weights may not name is left out, with a warning.
         """
-        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+        if isinstance(self.model, PublishedSplatterImage):
+            return write_trained(folder, self.model.file, self.model.state_dict())
+        assert self.config is not None
+        architecture = {"network": self.config["model"]["model"], "image_size": self.data.image_size}
+        try:
+            model = OneAnswer.with_trained(architecture, self.model.state_dict(), self.camera)
+        except WeightsError as error:
+            return logger.warning("no weights are written to %s: %s", folder, error)
+        model.architecture["training"] = self.data.training_facts()
+        model.save_pretrained(folder)
+
+    def on_fit_start(self) -> None:
+        """Measure the camera of a typical photo, for photos of unknown cameras (`OneAnswer`).
+
+        Raises:
+            CompleteSplatError: there is a latent cache, which is for stage 2, the posterior gets too few views, or
+                published weights get images of another size.
+        """
+        if self.trainer.datamodule is None:  # type: ignore[attr-defined]  # a benchmark trains on one batch
+            return
+        data = self.data
         if self.sees_views and data.targets < 2:
             raise CompleteSplatError(
                 "posterior=views needs targets to see and others to predict: data.targets of 2 or more"
             )
-        if getattr(data, "latent_cache", None) is not None:
+        if data.latent_cache is not None:
             raise CompleteSplatError(
                 "data.latent_cache is for latent diffusion (model=latent_diffusion): set it to null"
             )
-        measured = {} if data is None else data.typical_camera()._asdict()  # a benchmark trains on one batch
-        self.camera = {name: torch.tensor(value).tolist() for name, value in measured.items()}
+        if isinstance(self.model, PublishedSplatterImage) and data.image_size != self.model.image_size:
+            message = f"{self.model.file.name} needs {self.model.image_size}"
+            raise CompleteSplatError(f"data.image_size={data.image_size}: {message}")
+        self.camera = {name: torch.tensor(value).tolist() for name, value in data.typical_camera()._asdict().items()}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the training set's typical camera."""
@@ -76,7 +111,7 @@ class ReconstructionModule(Stage):
 
     @property
     def method(self) -> str:
-        """The reconstruction model's class."""
+        """Return the class of the reconstruction model."""
         return type(self.model).__name__
 
     @property
@@ -84,11 +119,23 @@ class ReconstructionModule(Stage):
         """Whether the model's posterior sees other views than the reference; baselines have none."""
         return getattr(self.model, "sees_views", False)
 
+    def latent_figures(self, scenes: SceneBatch) -> dict[str, float]:
+        """Return the latent's KL to the prior per scene: `latent/bits`, and `latent/bits_0`, ... for each channel.
+
+        `latent/active_channels` counts the active channels (`completesplat.autoreconstructor.posterior`).
+        """
+        posterior = self(scenes).posterior
+        if posterior is None:
+            return {}
+        bits = posterior.channel_bits().tolist()
+        channels = {f"latent/bits_{index}": value for index, value in enumerate(bits)}
+        return {"latent/bits": sum(bits), "latent/active_channels": float(posterior.active_channels()), **channels}
+
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
-        """Splatter Images, and posteriors if the model has any.
+        """Return Splatter Images, and posteriors if the model has any.
 
         Args:
-            others: so many of the targets are seen by the posterior besides the reference picture.
+            others: number of targets that the posterior sees besides the reference image.
         """
         images = scenes.reference.images * scenes.visible if self.masked else scenes.reference.images
         images = images.contiguous(memory_format=self.memory_format)
@@ -97,7 +144,7 @@ class ReconstructionModule(Stage):
         return reconstruction
 
     def training_step(self, scenes: SceneBatch, index: int) -> Float[Tensor, ""]:
-        """A posterior that sees views is given a random number of the targets, more often many than few, never all."""
+        """Return the loss. A posterior that sees views gets a random number of targets, mostly many, never all."""
         targets = scenes.targets.images.shape[1]
         others = int(torch.randint(1, targets, (2,)).max()) if self.sees_views else 0
         reconstruction = self(scenes, others)
@@ -105,17 +152,17 @@ class ReconstructionModule(Stage):
             gaussians = reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
             prediction = Prediction(self.render(gaussians, scenes), gaussians, reconstruction.posterior)
             total, values = self.loss(prediction, scenes.all_views(), self.global_step)
-            shown, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
-            quality = psnr(shown.flatten(0, 1), truth.flatten(0, 1)).mean()
+            images, truth = prediction.images.detach().clamp(0, 1), scenes.all_views().images
+            quality = psnr(images.flatten(0, 1), truth.flatten(0, 1)).mean()
         logged = {f"train/{name}": value for name, value in values.items()}
         self.log_step({"train/loss": total.detach(), "train/psnr": quality, **logged}, batch_size=len(scenes.names))
         return total
 
     def validation_step(self, scenes: SceneBatch, index: int) -> None:
-        """From the reference picture alone; and, with a posterior that sees views, as that encodes every other target.
+        """Score the reference image alone; if the posterior sees views, also with every other target encoded.
 
-        The second, `val/psnr_posterior`, is of the targets between, which it has not seen: what a perfect stage 2 could
-        reach. `val/posterior_gain` is how much more that is than the reference picture alone gives for these targets.
+        `val/psnr_posterior` scores the targets between, which the posterior has not seen: the best that stage 2 could
+        reach. `val/posterior_gain` is its gain over the reference image alone for these targets.
         """
         super().validation_step(scenes, index)
         if not self.sees_views or scenes.targets.images.shape[1] < 2:
@@ -126,10 +173,10 @@ class ReconstructionModule(Stage):
         gaussians = splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)
         values = self.novel_psnr(gaussians, others)
         gain = values - self.novel_psnr(self.reconstruct(scenes), others)
-        found = {"val/psnr_posterior": values.mean(), "val/posterior_gain": gain.mean()}
-        self.log_dict(found, prog_bar=True, batch_size=len(values))
+        figures = {"val/psnr_posterior": values.mean(), "val/posterior_gain": gain.mean()}
+        self.log_dict(figures, prog_bar=True, batch_size=len(values))
 
     def reconstruct(self, scenes: SceneBatch, seed: int = 0) -> Gaussians:
-        """Gaussians from the posterior's mode: nothing is drawn, so the seed has no effect."""
+        """Return Gaussians from the posterior's mode; nothing is drawn, so the seed has no effect."""
         reconstruction: Reconstruction = self(scenes)
         return reconstruction.splatter_image.gaussians(scenes.reference.cameras, scenes.depth_range)

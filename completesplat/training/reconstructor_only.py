@@ -1,5 +1,6 @@
-"""Supplement's "Reconstructor-only without the Encoder": codes of images are optimised, not predicted."""
+"""Supplement, "Reconstructor-only without the Encoder": codes of images are optimised, not predicted."""
 
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -35,9 +36,9 @@ class ReconstructorOnly(ReconstructionModule):
         self.code_rate = code_rate
 
     def setup(self, stage: str) -> None:
-        """Make room for a code for each training image, unless a checkpoint brought codes."""
+        """Allocate a code for each training image, unless a checkpoint has codes."""
         if stage == "fit" and not len(self.model.codes):
-            source = self.trainer.datamodule.source("train")  # type: ignore[attr-defined]
+            source = self.data.source("train")
             self.model.make_room(sum(_frames(source, name) for name in source.names))
 
     def on_fit_start(self) -> None:
@@ -45,6 +46,9 @@ class ReconstructorOnly(ReconstructionModule):
         super().on_fit_start()
         if self.trainer.world_size > 1:
             raise CompleteSplatError("model=reconstructor_only trains in one process: set trainer.devices=1")
+
+    def save_weights(self, folder: Path) -> None:
+        """Write none, because a photo has no code."""
 
     def forward(self, scenes: SceneBatch, others: int = 0) -> Reconstruction:
         """Reconstruct training images from their codes; in evaluation, reconstruct any image from a new code."""

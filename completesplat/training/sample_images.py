@@ -9,7 +9,7 @@ from lightning import Trainer
 from PIL import Image
 from torch import Tensor
 
-from completesplat.export.images import SheetCell, color_depth, picture_sheet, write_png
+from completesplat.export.images import SheetCell, color_depth, image_sheet, write_png
 from completesplat.gaussians import Gaussians
 from completesplat.metrics.images import psnr
 from completesplat.metrics.scoring import diversity
@@ -22,7 +22,7 @@ from completesplat.training.stage import Stage
 
 
 class Samples(DrawsFixedScenes):
-    """Callback that draws samples of each scene from its reference and its targets; see `DrawsFixedScenes`.
+    """Callback that draws samples of each scene from its reference and target views; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has rows for each scene: true images (the input first), each sample, and the depth of the
     first sample. `folder/strip_000500.png` shows how the first sample is denoised: the scenes of the clean latent's
@@ -51,33 +51,33 @@ class Samples(DrawsFixedScenes):
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
         assert isinstance(module, LatentDiffusion)
         drawn = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
-        pictures = {"step": samples_sheet(drawn), "strip": strip_sheet(drawn)}
-        for kind, picture in pictures.items():
-            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", picture)
+        images = {"step": samples_sheet(drawn), "strip": strip_sheet(drawn)}
+        for kind, image in images.items():
+            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", image)
         scores = [scene.scores() for scene in drawn]
-        scalars = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
-        log_drawings(trainer, scalars, {"samples": pictures["step"], "denoising": pictures["strip"]})
+        figures = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        log_drawings(trainer, figures, {"samples": images["step"], "denoising": images["strip"]}, {})
 
     def _draw_scene(self, trainer: Trainer, module: LatentDiffusion, scene: SceneBatch) -> "SceneDrawings":
         views = scene.all_views()
         steps: dict[int, tuple[int, Gaussians]] = {}
         calls = evenly_spaced(len(module.completesplat.sampler.set_up().timesteps), self.strip)
 
-        def keep(call: int, timestep: int, estimates: Gaussians) -> None:
+        def store(call: int, timestep: int, estimates: Gaussians) -> None:
             if call in calls:
                 # Samples that do not fit into memory together come in parts, the first sample in the first part.
                 steps.setdefault(call, (timestep, estimates[:1]))
 
         with trainer.precision_plugin.forward_context():
-            gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=keep)
+            gaussians = module.reconstruct(scene, seed=0, samples=self.samples, on_step=store)
         pair = [0, 1 + (len(views.images[0]) - 1) // 2]  # the reference, and the middle one of the targets
         cameras = views.cameras[0]
-        seen = module.render_from(gaussians, cameras)
+        rendering = module.render_from(gaussians, cameras)
         denoising = [module.render_from(part, cameras[pair]).over(module.background)[0] for _, part in steps.values()]
         return SceneDrawings(
             views.images[0],
-            seen.over(module.background).clamp(0, 1),
-            seen.expected_depth()[:1],
+            rendering.over(module.background).clamp(0, 1),
+            rendering.expected_depth()[:1],
             [timestep for timestep, _ in steps.values()],
             torch.stack([views.images[0, pair], *denoising]).clamp(0, 1),
         )
@@ -115,7 +115,7 @@ def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
         samples = [labelled(f"sample {i + 1}", images) for i, images in enumerate(scene.samples)]
         rows += [labelled("true", scene.true), *samples, labelled("depth of 1", color_depth(scene.depth[0])[0])]
     most = max(map(len, rows))
-    return picture_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
+    return image_sheet(["input's view", *(f"target {i + 1}" for i in range(most - 1))], rows)
 
 
 def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
@@ -124,10 +124,10 @@ def strip_sheet(drawn: list[SceneDrawings]) -> Image.Image:
     rows = [
         labelled(name, images) for scene in drawn for name, images in zip(views, scene.strip.unbind(1), strict=True)
     ]
-    return picture_sheet(["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)], rows)
+    return image_sheet(["true", *(f"timestep {timestep}" for timestep in drawn[0].timesteps)], rows)
 
 
-def labelled(name: str, images: Float[Tensor, "picture 3 height width"]) -> list[SheetCell | None]:
+def labelled(name: str, images: Float[Tensor, "image 3 height width"]) -> list[SheetCell | None]:
     """Return a row of a sheet, with its name above the first image. Values that are not finite are black."""
     first, *others = images.nan_to_num()
     return [SheetCell(first, name), *map(SheetCell, others)]

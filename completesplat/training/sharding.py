@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning import LightningModule
@@ -41,14 +41,14 @@ class FullyShardedStrategy(DDPStrategy):
 
     def configure_ddp(self) -> None:
         """Divide the networks instead of wrapping the module."""
-        module: Any = self.lightning_module
+        module = cast(Stage, self.lightning_module)
         _refuse_undivided(module)
         mesh = init_device_mesh(self.root_device.type, (self.world_size,))
         self.whole: list[tuple[nn.Module, str, nn.Module]] = []
-        for each in (module, *_averages(module)):
-            for place in module.networks:
-                network = each.get_submodule(place)
-                self.whole.append((each, place, _without_weights(network)))
+        for root in (module, *_averages(module)):
+            for name in module.networks:
+                network = root.get_submodule(name)
+                self.whole.append((root, name, _without_weights(network)))
                 # Networks are always divided outside of their passes, also after those of validation.
                 fully_shard(network, mesh=mesh, reshard_after_forward=True)
 
@@ -60,10 +60,10 @@ class FullyShardedStrategy(DDPStrategy):
                 entries |= {name: _divided_as(trained[index], value) for name, value in entries.items()}
         super().load_optimizer_state_dict(checkpoint)
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], filepath: str | Path, storage_options: Any = None) -> None:
+    def save_checkpoint(self, checkpoint: dict[str, Any], filepath: str | Path, storage_options: object = None) -> None:
         """Write each process's share, then the rest in the first one; raise DiskError if the disk refuses."""
         path, divided = Path(filepath), dict[str, Tensor]()
-        contents = _taken_apart(checkpoint, "", divided)
+        contents = _without_divided(checkpoint, "", divided)
         folder = path.parent / self.broadcast(f"{secrets.token_hex(6)}{SHARDS_SUFFIX}")
         if self.is_global_zero:
             remove_unused_shards(path.parent)
@@ -100,11 +100,11 @@ class FullyShardedStrategy(DDPStrategy):
 
     def teardown(self) -> None:
         """Give every process the whole networks, which are saved and tested next."""
-        for module, place, network in getattr(self, "whole", []):
-            divided = module.get_submodule(place)
-            weights = {name: whole(value) for name, value in divided.state_dict().items()}
+        for root, name, network in getattr(self, "whole", []):
+            divided = root.get_submodule(name)
+            weights = {key: whole(value) for key, value in divided.state_dict().items()}
             network.load_state_dict(weights, assign=True)
-            module.set_submodule(place, network.train(divided.training))
+            root.set_submodule(name, network.train(divided.training))
         self.whole = []
         super().teardown()
 
@@ -114,14 +114,14 @@ def whole(value: Tensor) -> Tensor:
     return value.full_tensor() if isinstance(value, DTensor) else value
 
 
-def own_part(value: Any) -> Any:
+def local_part(value: object) -> Any:
     """Return this process's part of a tensor that may be divided over processes, without a copy."""
     return value.to_local() if isinstance(value, DTensor) else value
 
 
 @contextmanager
 def whole_networks(module: nn.Module) -> Iterator[None]:
-    """Make divided networks whole inside, so that a process can compute alone. All have to enter and leave."""
+    """Make divided networks whole inside, so that a process can compute alone; all have to enter and leave."""
     networks = [part for part in module.modules() if isinstance(part, FSDPModule)]
     for network in networks:
         network.set_reshard_after_forward(False)
@@ -143,14 +143,14 @@ def remove_unused_shards(folder: Path) -> None:
 
 
 def _averages(module: LightningModule) -> list[nn.Module]:
-    callbacks: list[Any] = module.trainer.callbacks  # type: ignore[attr-defined]
-    averages: list[Any] = [callback._average_model for callback in callbacks if isinstance(callback, WeightAveraging)]
-    return [average.module for average in averages]
+    callbacks: list[object] = module.trainer.callbacks  # type: ignore[attr-defined]
+    averages = [callback._average_model for callback in callbacks if isinstance(callback, WeightAveraging)]
+    return [average.module for average in averages if average is not None]
 
 
 def _refuse_undivided(module: Stage) -> None:
     """Raise CompleteSplatError if a trained parameter is in none of the networks, or is not contiguous."""
-    inside = {parameter for place in module.networks for parameter in module.get_submodule(place).parameters()}
+    inside = {parameter for network in module.networks for parameter in module.get_submodule(network).parameters()}
     for name, parameter in module.named_parameters():
         if parameter.requires_grad and parameter not in inside:
             raise CompleteSplatError(f"trainer=fsdp: {name} of {type(module).__name__} is not divided: use trainer=ddp")
@@ -167,7 +167,7 @@ def _without_weights(network: nn.Module) -> nn.Module:
     return deepcopy(network, empty)
 
 
-def _divided_as(parameter: Tensor, value: Any) -> Any:
+def _divided_as(parameter: Tensor, value: object) -> object:
     """Divide a value of a parameter's optimizer state like the parameter, if it has its shape."""
     if not isinstance(parameter, DTensor) or not isinstance(value, Tensor) or value.shape != parameter.shape:
         return value
@@ -175,13 +175,13 @@ def _divided_as(parameter: Tensor, value: Any) -> Any:
     return distribute_tensor(value.to(parameter.device), mesh, placements, src_data_rank=None)
 
 
-def _taken_apart(contents: Any, name: str, divided: dict[str, Tensor]) -> Any:
+def _without_divided(contents: Any, name: str, divided: dict[str, Tensor]) -> Any:
     """Replace divided tensors in nested containers by names, and store them in `divided` by these names."""
     if isinstance(contents, DTensor):
         divided[name] = contents
         return DIVIDED + name
     if isinstance(contents, Mapping):
-        return {key: _taken_apart(value, f"{name}.{key}".lstrip("."), divided) for key, value in contents.items()}
+        return {key: _without_divided(value, f"{name}.{key}".lstrip("."), divided) for key, value in contents.items()}
     if isinstance(contents, list | tuple):
-        return type(contents)(_taken_apart(value, f"{name}.{i}", divided) for i, value in enumerate(contents))
+        return type(contents)(_without_divided(value, f"{name}.{i}", divided) for i, value in enumerate(contents))
     return contents

@@ -23,7 +23,7 @@ from completesplat import signals
 from completesplat.signals import Interrupted
 
 LOOK_SECONDS, GRACE_SECONDS = 0.5, 5.0
-"""Interval of a process's checks of those that it started, and their time to end by themselves."""
+"""Interval at which a process checks its child processes, and their time to end by themselves."""
 
 logger = logging.getLogger(__name__)
 
@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 def stopped_together() -> Iterator[None]:
     """Leave signals to `completesplat.signals`, and let processes that trainers or `Fabric` start end with this one.
 
-    Lightning's own handlers wait for other processes in the middle of a step, for ever if these are gone. They end
-    `fit` and `test` with exit status 0, and its observer kills the first process if another one has got a signal.
+    Lightning's handlers wait for other processes in the middle of a step, for ever if these are gone. They end `fit`
+    and `test` with exit status 0, and its observer kills the first process if another one got a signal.
     """
     started: list[subprocess.Popen[bytes]] = []
     observers: list[_Observer] = []
@@ -94,7 +94,7 @@ class _Observer(_ChildProcessObserver):
     def _run(self) -> bool:
         codes = [process.poll() for process in self._child_processes]
         theirs = {code - 128 if code > 0 else -code for code in codes if code} & set(signals.ENDING)
-        local = set() if signals.are_kept() else self._own() & set(signals.ENDING)
+        local = set() if signals.are_kept() else self._received_here() & set(signals.ENDING)
         if signals.received() is not None:
             return True
         if not theirs | local:
@@ -110,15 +110,15 @@ class _Observer(_ChildProcessObserver):
             os._exit(128 + number)
         return True
 
-    def _own(self) -> set[int]:
+    def _received_here(self) -> set[int]:
         try:
             return set(self._signals.recv(64))
         except BlockingIOError:
             return set()
 
 
-def agreed(trainer: Trainer) -> int | None:
-    """Return the signal that a process of the run has got, if any has. All processes have to call this."""
+def agreed_signal(trainer: Trainer) -> int | None:
+    """Return the signal that a process of the run received, if any did; all processes have to call this."""
     local = torch.tensor(signals.received() or 0, device=trainer.strategy.root_device)
     return int(trainer.strategy.reduce(local, reduce_op="max")) or None
 
@@ -131,7 +131,7 @@ def end_training(trainer: Trainer, number: int) -> None:
     signals.end(number)
 
 
-def _requeue(trainer: Any, number: int) -> None:
+def _requeue(trainer: Trainer, number: int) -> None:
     environment = trainer._accelerator_connector.cluster_environment
     if not isinstance(environment, SLURMEnvironment) or not environment.auto_requeue:
         return

@@ -2,13 +2,13 @@
 
 import time
 from pathlib import Path
-from typing import Any
 
 import torch
 from lightning import Callback, LightningModule, Trainer
 from lightning.pytorch.profilers import Profiler
 
 from completesplat.data.loading.distributed import mean_of_processes
+from completesplat.scene import CachedScene, SceneBatch
 from completesplat.training.stage import now
 
 FETCHING = "[_TrainingEpochLoop].train_dataloader_next"
@@ -21,8 +21,8 @@ class Throughput(Callback):
 
     `speed/scenes_per_second` (of all processes) and `speed/data_wait`, the share of the time in which training waited
     for data, cover the steps since the last row; for memory see `memory`. All are means over the processes. The clock
-    stops during validation, while checkpoints are written, and from a row to the next batch. The latter excludes the
-    drawing of images if its interval is a multiple of the trainer's, and this callback comes first.
+    stops during validation, while checkpoints are written, and from a row to the next batch. Drawing of images is
+    therefore not counted if its interval is a multiple of the trainer's and this callback comes first.
     """
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
@@ -48,7 +48,12 @@ class Throughput(Callback):
             self.paused += now() - self.pause
 
     def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: object,
+        batch: SceneBatch | CachedScene,
+        batch_idx: int,
     ) -> None:
         self.scenes += len(batch.names)
         stepped, self.step = trainer.global_step != self.step, trainer.global_step

@@ -12,6 +12,7 @@ import pickletools
 import re
 import zipfile
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,7 +52,7 @@ class Step(NamedTuple):
 
     name: str
     argument: Any = None
-    inputs: tuple[Any, ...] = ()
+    inputs: tuple["Step", ...] = ()
 
 
 def read_tensor_file(path: Path, mmap: bool = False) -> Any:
@@ -91,7 +92,7 @@ def _check_steps(pickle: bytes) -> None:
     """Raise TensorFileError for a pickle with a step that may make more than the file holds."""
     stack: list[Step] = []
     marks: list[int] = []
-    memo: dict[Any, Step] = {}
+    memo: dict[object, Step] = {}
     for opcode, argument, _ in pickletools.genops(pickle):
         name, before = opcode.name, opcode.stack_before
         if name == "MARK":
@@ -187,10 +188,9 @@ def shards_of(path: Path) -> dict[str, Any]:
     if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
         return {}
     try:
-        shards: dict[str, Any] = read_tensor_file(path, mmap=True).get(SHARDS, {})
+        return dict(read_tensor_file(path, mmap=True).get(SHARDS, {}))
     except Exception:
         return {}
-    return shards
 
 
 def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
@@ -198,26 +198,26 @@ def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
     if (shards := contents.pop(SHARDS, None)) is None:
         return contents
     from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # slow to import
+    from torch.distributed.checkpoint.metadata import TensorStorageMetadata
     from torch.distributed.checkpoint.state_dict_loader import load
 
     folder = path.parent / Path(shards["folder"]).name
     reader = HuggingFaceStorageReader(str(folder))
-    entries: dict[str, Any] = reader.read_metadata().state_dict_metadata
+    entries: dict[str, TensorStorageMetadata] = reader.read_metadata().state_dict_metadata  # type: ignore[assignment]
     needed = sum(entry.size.numel() * entry.properties.dtype.itemsize for entry in entries.values())
     if needed > sum(file.stat().st_size for file in folder.iterdir()):
         raise WeightsError(f"{path}: not a readable checkpoint (its tensors are larger than the files in {folder})")
     tensors = {name: torch.empty(entry.size, dtype=entry.properties.dtype) for name, entry in entries.items()}
     load(tensors, storage_reader=reader, no_dist=True)  # safetensors, so this runs no code of the files
 
-    def filled(value: Any) -> Any:
+    def filled(value: Any) -> object:
         if isinstance(value, str) and value.startswith(DIVIDED):
             return tensors[value.removeprefix(DIVIDED)]
         if isinstance(value, dict):
             return {key: filled(part) for key, part in value.items()}
         return type(value)(map(filled, value)) if isinstance(value, list | tuple) else value
 
-    whole: dict[str, Any] = filled(contents)
-    return whole
+    return {key: filled(part) for key, part in contents.items()}
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -243,9 +243,18 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
     return contents
 
 
-def not_finite(weights: Mapping[str, Any]) -> str | None:
+def not_finite(weights: Mapping[str, object]) -> str | None:
     """Return the name of the first tensor that holds NaN or infinities, if there is one."""
     return next((n for n, x in weights.items() if isinstance(x, Tensor) and not x.isfinite().all()), None)
+
+
+def mismatch(network: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> str | None:
+    """Describe the first difference between a network's tensors and a file's, in sizes or names, if there is one."""
+    sizes = {name: (list(weights[name].shape), list(x.shape)) for name, x in network.items() if name in weights}
+    different = (f"{name} is {there} there and {here} here" for name, (there, here) in sizes.items() if there != here)
+    missing = (f"{name} is missing there" for name in network if name not in weights)
+    needless = (f"{name} has no place here" for name in weights if name not in network)
+    return next(chain(different, missing, needless), None)
 
 
 def load_part(module: nn.Module, path: str | Path, prefix: str) -> None:

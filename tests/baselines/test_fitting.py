@@ -9,17 +9,17 @@ from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
 from completesplat.losses import WeightedSum
 from completesplat.losses.mse import MeanSquaredError
 from completesplat.metrics.images import psnr
-from completesplat.rasterizers.tiled import TiledRasterizer
+from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import Views
 
 SIZE, VIEWS = 16, 6
 DEPTH_RANGE = torch.tensor([[1.5, 2.5], [1.0, 3.0]])
-FEW = FittingSettings(count=100, steps=60, views=2, position_rate=30.0, other_rates=10.0)
+FEW = FittingSettings(count=100, steps=40, views=2, position_rate=30.0, other_rates=10.0)
 MSE = WeightedSum({"mse": {"weight": 1.0, "term": MeanSquaredError()}})
 
 
 def render(gaussians: Gaussians, cameras: Cameras) -> torch.Tensor:
-    return TiledRasterizer()(gaussians, cameras).over(0.5)
+    return ReferenceRasterizer()(gaussians, cameras).over(0.5)
 
 
 def fit(views: Views, seed: int, settings: FittingSettings = FEW) -> Gaussians:

@@ -120,8 +120,8 @@ NET = "network_with_offset"
 CHANGED = {
     "missing": ({f"{NET}.out.bias": None}, f"{NET}.out.bias is missing there"),
     "more": ({"cam_embedding_map.weight": torch.zeros(2)}, "cam_embedding_map.weight has no place here"),
-    "size": ({f"{NET}.out.bias": torch.zeros(15)}, r"out.bias is \[15\] of torch.float32 there and \[24\]"),
-    "kind": ({f"{NET}.out.bias": torch.zeros(24).double()}, r"out.bias is \[24\] of torch.float64 there"),
+    "size": ({f"{NET}.out.bias": torch.zeros(15)}, r"out.bias is \[15\] there and \[24\] here"),
+    "kind": ({f"{NET}.out.bias": torch.zeros(24).double()}, "out.bias is of torch.float64"),
     "filter": ({f"{NET}.encoder.enc.8x8_down.conv0.resample_filter": torch.ones(1, 1, 2, 2)}, "resample_filter has"),
     "harmonics": ({"v_to_sh_transform": torch.eye(3)[None]}, "v_to_sh_transform has other values"),
     "rays": ({"ray_dirs": torch.ones(1, 3, 16, 16)}, "ray_dirs are not those of a camera"),

@@ -106,10 +106,9 @@ def test_it_composes_with_ablations(ablation):
     assert module.model.parameterization.layers == 1
 
 
-@pytest.mark.parametrize("experiment", ["co3d_var_stage1", "re10k_var_stage2"])
-def test_experiments_on_real_data_take_the_full_size(experiment):
+def test_experiments_on_real_data_take_the_full_size():
     needed = ["data.root=x", "model.checkpoint=null"]
-    config = compose_config("fit", f"experiment={experiment}", "model=splatter_image", *needed)
+    config = compose_config("fit", "experiment=paper_var_stage2", "model=splatter_image", *needed)
     assert config.model.model.channels == [128, 256, 256, 256]
     assert [config.data.image_size >> level for level in config.model.model.attention_levels] == [16]
 

@@ -95,16 +95,16 @@ def test_errors_are_those_of_single_places(measured):
 def test_one_sparse_splatter_image_can_be_learned_by_heart():
     vae, image = tiny_vae(), sparse_image()
     vae.measure([image])
-    optimizer = torch.optim.Adam(vae.parameters(), lr=6e-3)
+    optimizer = torch.optim.Adam(vae.parameters(), lr=1e-2)
     losses = []
-    for _ in range(130):
+    for _ in range(90):
         losses.append(torch.stack(list(vae.errors(vae(image).splatter_image, image).values())).mean())
         optimizer.zero_grad()
         losses[-1].backward()
         optimizer.step()
-    assert losses[-1] < 0.2 * losses[0]
+    assert losses[-1] < 0.3 * losses[0]
     opacities = vae.eval()(image).splatter_image.split()["opacity"].sigmoid().squeeze(2)
-    assert opacities[~occupied(image)].mean() < 0.1 < 0.3 < opacities[occupied(image)].mean()
+    assert opacities[~occupied(image)].mean() < 0.15 < 0.25 < opacities[occupied(image)].mean()
 
 
 def test_skips_are_refused():

@@ -47,7 +47,7 @@ def test_two_processes_write_what_one_writes(command, pipeline, packed_toys, tmp
     ("stage", "setting", "message"),
     [
         ("diffusion", "frames=2", "not of stage 1"),
-        ("var", "conditioning=learned", "needs pictures"),
+        ("var", "conditioning=learned", "needs images"),
         ("var", "precision=float8", "precision=float8: choose one of float32, float16"),
         ("var", "overrides=[]", "run `completesplat data prepare` first"),
     ],

@@ -5,6 +5,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,7 +14,6 @@ from omegaconf import OmegaConf
 from PIL import Image
 from support import SMALL, compose_config, strict_json
 
-from completesplat.commands.fit import export_weights
 from completesplat.commands.trained import Trained
 from completesplat.commands.view import settings_of
 from completesplat.errors import CompleteSplatError, WeightsError
@@ -46,19 +46,19 @@ def scenes(folder: Path) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("run", "samples"), [("var", 1), ("splatter", 1), ("diffusion", 2)], indirect=["run"])
-def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(command, pipeline, tmp_path, run, samples):
+def test_a_runs_folder_and_its_checkpoint_give_the_same_scenes(command, pipeline, tmp_path, run, samples):
     photograph = pipeline.photograph()
     found = []
-    for weights in (run, run / "weights", run / "checkpoints/last.ckpt"):
+    for weights in (run, run / "checkpoints/last.ckpt"):
         out = tmp_path / str(len(found))
         finished = command("predict", f"image={photograph}", f"weights={weights}", "samples=2", f"out={out}", *FEW)
         assert finished.status == 0, finished.err
-        assert ("one answer for each picture" in finished.out) == (samples == 1)
+        assert ("one answer for each image" in finished.out) == (samples == 1)
         found.append(scenes(out / photograph.stem))
         assert strict_json(out / photograph.stem / "scene.json")["settings"]["samples"] == samples
         assert settings_of(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
     assert len(found[0]) == samples
-    assert found[0] == found[1] == found[2]
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)
@@ -126,21 +126,6 @@ def test_a_run_of_fitted_scenes_leaves_them_and_says_so_when_a_photograph_is_giv
     assert f"{run / 'scenes'}" in refused.err
 
 
-def test_the_viewer_shows_the_one_answer(command, pipeline, tmp_path):
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    given = [
-        pipeline.photograph(),
-        f"weights={pipeline.var}",
-        "samples=2",
-        "export=page.html",
-        f"out={tmp_path / 'out'}",
-    ]
-    shown = command("view", *map(str, given))
-    assert shown.status == 0, shown.err
-    assert "one answer for each picture" in shown.out
-    assert (tmp_path / "page.html").is_file()
-
-
 @pytest.fixture
 def strangers(pipeline, tmp_path):
     """A copy of stage 1's run without weights."""
@@ -148,7 +133,7 @@ def strangers(pipeline, tmp_path):
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("place", ["model.model", "model.model.encoder", "model.model.encoder.channels", "model"])
+@pytest.mark.parametrize("place", ["model.model.encoder.channels", "model"])
 def test_a_checkpoint_names_nothing_but_parts_of_a_model(strangers, tmp_path, monkeypatch, place):
     (tmp_path / "trap.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\nclass Trap: pass\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -184,10 +169,11 @@ def test_weights_of_one_answer_name_nothing_foreign(pipeline, tmp_path):
             CompleteSplat.from_pretrained(tmp_path / "weights")
 
 
-def test_a_network_of_the_users_own_is_trained_and_not_exported(tmp_path, caplog):
+def test_a_network_of_the_users_own_is_trained_and_not_exported(tmp_path, caplog, monkeypatch):
     config = compose_config("fit", "experiment=toy_var", *SMALL, "out=RUN")
     module = instantiate(config.model, _convert_="all")
-    config.model.model._target_, module.camera = "mine.Network", {}
-    export_weights(config, module, None, tmp_path / "weights")
+    monkeypatch.setattr(type(module), "data", SimpleNamespace(image_size=32))
+    module.config = {"model": {"model": {"_target_": "mine.Network"}}}
+    module.save_weights(tmp_path / "weights")
     assert not (tmp_path / "weights").exists()
     assert "mine.Network" in caplog.text

@@ -24,16 +24,17 @@ def test_a_job_returns_the_figure_that_is_asked_for_and_names_those_that_it_has(
             optimized(name, tmp_path)
 
 
-def test_what_a_training_returns_is_what_it_wrote(command, toy_root, tmp_path):
-    settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]
-    finished = command("fit", *settings, "optimized_metric=val/psnr_novl", "out=RUN")
+def test_a_finished_run_returns_what_it_wrote(command, pipeline):
+    settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "ckpt_path=last", f"out={pipeline.var}"]
+    finished = command("fit", *settings, "optimized_metric=val/psnr_novl")
     assert (finished.status, finished.err.count("\n")) == (2, 1)
     assert finished.err.startswith("error: optimized_metric=val/psnr_novl: no figure in ")
     assert "val/psnr_novel" in finished.err
-    again = command("fit", *settings, "optimized_metric=val/psnr_novel", "ckpt_path=last", "out=RUN")
+    again = command("fit", *settings, "optimized_metric=val/psnr_novel")
     assert (again.status, "finished before, not repeated" in again.out) == (0, True)
 
 
+@pytest.mark.slow
 def test_optuna_finds_the_better_of_two_settings(command, toy_root, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
     settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "callbacks.pictures=null", "test=false"]

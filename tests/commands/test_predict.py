@@ -94,7 +94,7 @@ def test_the_seed_decides_the_bytes_and_each_control_changes_every_scene(predict
     assert len({scene for scenes in made for scene in scenes}) == 2 * len(made)
 
 
-BOX = "box=[0.5,0,1,1]"
+SHIPPED = "box=[0.5,0,1,1]"
 
 
 def test_what_a_box_hides_has_no_influence(predict, tmp_path):
@@ -108,7 +108,7 @@ def test_what_a_box_hides_has_no_influence(predict, tmp_path):
         image = tmp_path / name / "picture.png"
         image.parent.mkdir()
         Image.fromarray(pixels).save(image)
-        found.append(predict(BOX, "video=[]", image=image, out=f"{name}/out"))
+        found.append(predict(SHIPPED, "video=[]", image=image, out=f"{name}/out"))
     assert files(found[0]) == files(found[1])
     scene = strict_json(found[0] / "scene.json")["settings"]
     assert (scene["box"], scene["mask"], scene["skip_weight"]) == ([0.5, 0, 1, 1], None, 0)
@@ -118,7 +118,7 @@ def test_a_mask_hides_what_a_box_hides(predict, tmp_path):
     pixels = np.zeros((32, 32), np.uint8)
     pixels[:, 16:] = 255
     Image.fromarray(pixels).save(tmp_path / "mask.png")
-    hidden = (BOX, f"mask={tmp_path / 'mask.png'}", "skip_weight=0")
+    hidden = (SHIPPED, f"mask={tmp_path / 'mask.png'}", "skip_weight=0")
     box, mask, nothing = (splats(predict(setting, "video=[]", out=str(n))) for n, setting in enumerate(hidden))
     assert box == mask
     assert not set(mask) & set(nothing)

@@ -11,12 +11,12 @@ from published_weights import write_published
 from support import LIMIT, SMALL, compose_config, strict_json
 
 from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
+from completesplat.baselines.splatter_image.model import PublishedOneAnswer
 from completesplat.commands.trained import Trained
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.export.ply import read_ply
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
-from completesplat.published import PublishedGenerator
 
 
 def cut_out(path, size=(60, 40)):
@@ -29,7 +29,7 @@ def cut_out(path, size=(60, 40)):
 
 def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(tmp_path):
     image = cut_out(tmp_path / "a.png")
-    of_objects = PublishedGenerator(str(write_published(tmp_path / "objects", "objaverse", size=40)))
+    of_objects = PublishedOneAnswer(str(write_published(tmp_path / "objects", "objaverse", size=40)))
     photograph = of_objects.read(image)
     assert (photograph.fov_degrees, photograph.fov_source) == (pytest.approx(49.1343, abs=1e-3), "default")
     orange = photograph.image[2] < 0.5
@@ -39,7 +39,7 @@ def test_a_cut_out_object_lies_on_what_the_weights_know_as_large_as_in_training(
     assert abs(rows.float().mean() - 19.5) <= 1
     assert abs(columns.float().mean() - 19.5) <= 1
     assert photograph.image[:, 0, 0].tolist() == [1, 1, 1]
-    of_captures = PublishedGenerator(str(write_published(tmp_path / "captures", "hydrants", size=40)))
+    of_captures = PublishedOneAnswer(str(write_published(tmp_path / "captures", "hydrants", size=40)))
     seen = of_captures.read(image, 60)
     assert (seen.fov_degrees, seen.fov_source) == (60, "given")
     assert seen.image[:, 0, 0].tolist() == [0, 0, 0]  # the central square, its left border cuts the object
@@ -55,8 +55,8 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     given = [f"image={image}", f"weights={weights}", f"out={tmp_path / 'out'}", "frames=2", "samples=4"]
     finished = command("predict", *given)
     assert finished.status == 0, finished.err
-    assert "one answer for each picture and draws no samples" in finished.out
-    assert "give pictures that are transparent or white around one, or background=remove" in finished.out
+    assert "one answer for each image and draws no samples" in finished.out
+    assert "give images that are transparent or white around one, or background=remove" in finished.out
     folder = tmp_path / "out/a"
     assert {path.name for path in folder.iterdir()} == {"sample_00.ply", "orbit_00.mp4", "sheet.png", "scene.json"}
     settings = strict_json(folder / "scene.json")["settings"]
@@ -64,12 +64,12 @@ def test_predict_gives_one_scene_in_the_colours_that_the_camera_sees(command, tm
     assert not {"sampler", "steps"} & settings.keys()
     assert settings["samples"] == 1
     model = CompleteSplat.from_pretrained(weights)
-    assert isinstance(model, PublishedGenerator)
+    assert isinstance(model, PublishedOneAnswer)
     scene = model(image)[0]
     assert type(scene) is Gaussians  # which every rasterizer takes
     torch.testing.assert_close(read_ply(folder / "sample_00.ply").colors, scene.colors, atol=1e-5, rtol=0)
     for settings, said in (
-        (["fov=40"], "as of 49 degrees"),
+        (["fov=40"], "image as of 49 degrees"),
         (["sampler=dpm20"], "these weights draw no samples: leave out sampler"),
     ):
         refused = command("predict", *given, *settings)
@@ -150,7 +150,7 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
     given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
     given += [f"data.root={toy_root}", "data.background=0", "callbacks.pictures=null", "test=false"]
     refused = command("fit", *given, "data.image_size=64", "out=OTHER")
-    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth wants 32\n")
+    assert (refused.status, refused.err) == (2, "error: data.image_size=64: model_hydrants.pth needs 32\n")
     trained = command("fit", *given, "optimizer.lr=1e-3", "out=RUN")
     assert trained.status == 0, trained.err
     assert {path.name for path in (tmp_path / "RUN/weights").iterdir()} == {

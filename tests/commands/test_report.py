@@ -7,6 +7,7 @@ import pytest
 from support import refused, strict_json
 
 from completesplat.studies import samplers as samplers_study
+from completesplat.studies.samplers import SamplerRow
 from completesplat.studies.samples import SampleRenderer
 
 
@@ -26,7 +27,7 @@ def weights_of(rows):
 
 
 def test_samplers_are_measured_from_the_same_noise(report, tmp_path):
-    said, results = report("samplers", "steps={ddim: [2], dpm: [4], unipc: [3]}")
+    message, results = report("samplers", "steps={ddim: [2], dpm: [4], unipc: [3]}")
     rows = results["rows"]
     steps = [(row["sampler"], row["steps"], row["calls"]) for row in rows]
     assert steps == [("ddim", 50, 50), ("ddim", 2, 2), ("dpm", 4, 4), ("unipc", 3, 3)]
@@ -34,12 +35,13 @@ def test_samplers_are_measured_from_the_same_noise(report, tmp_path):
     assert rows[0]["agreement"] == 100  # the limit: with itself
     assert all(10 < row["agreement"] < 100 for row in rows[1:])
     assert imageio.imread(tmp_path / "out/samplers.png").ndim == 3
-    assert f"steps: {results['fewest']['calls']} (" in said
-    assert said.splitlines()[-1] == str(tmp_path / "out")
+    assert f"steps: {results['fewest']['calls']} (" in message
+    assert message.splitlines()[-1] == str(tmp_path / "out")
 
 
 def test_flow_matching_is_measured_with_its_own_samplers(monkeypatch):
-    monkeypatch.setattr(samplers_study, "_row", lambda *measured: {})
+    scored = lambda renderer, scenes, name, count, *_: SamplerRow(name, count, *[0] * 6)  # noqa: E731
+    monkeypatch.setattr(samplers_study, "_row", scored)
 
     def configured(name: str) -> dict:
         return {"scheduler": {"_target_": f"diffusers.{name}"}, "name": name}
@@ -53,60 +55,56 @@ def test_flow_matching_is_measured_with_its_own_samplers(monkeypatch):
     object.__setattr__(renderer, "model", model)
     steps = {"ddim": [2], "flow": [50, 5]}
     rows = samplers_study.rows(renderer, samplers, steps, [], {}, print)
-    assert [(row["sampler"], row["steps"]) for row in rows] == [("flow", 50), ("flow", 5)]
+    assert [(row.sampler, row.steps) for row in rows] == [("flow", 50), ("flow", 5)]
     assert chosen == [samplers["flow"]] * 2
 
 
-@pytest.mark.parametrize("degrees", [100, 0], ids=["a view is near", "no view is near"])
-def test_controls_hold_the_papers_settings(report, tmp_path, degrees):
-    said, results = report("controls", "skip_weights=[0]", "guidance_weights=[0]", f"near_degrees={degrees}")
+def test_controls_hold_the_papers_settings(report, tmp_path):
+    message, results = report("controls", "skip_weights=[0]", "guidance_weights=[0]", "near_degrees=100")
     rows = results["rows"]
     assert weights_of(rows) == [(0, 0, False), (0, 0.5, True), (0.5, 0.5, True), (1, 0.2, True)]
     assert all(row["diversity"] > 0 for row in rows)
-    assert all(row["near_object_psnr"] > 0 if degrees else row["near_object_psnr"] is None for row in rows)
+    assert all(row["near_object_psnr"] > 0 for row in rows)
     for name in ("controls.png", "controls_grid.png"):
         assert imageio.imread(tmp_path / "out" / name).ndim == 3
-    assert "Faithfulness" in said
+    assert "Faithfulness" in message
 
 
 def test_completions_of_masked_inputs_are_drawn(report, tmp_path):
-    heights = []
-    for samples in (2, 3):
-        report("masked", f"samples={samples}", "views=2")
-        heights.append(imageio.imread(tmp_path / "out/masked.png").shape[0])
-    assert heights[0] < heights[1]
+    report("masked", "views=2")
+    height, width = imageio.imread(tmp_path / "out/masked.png").shape[:2]
+    assert height > 3 * 144  # the truth and two samples
+    assert width > 4 * 128
 
 
 def test_depth_is_measured_with_the_papers_settings_and_one_is_drawn(report, tmp_path):
-    said, results = report("depth", "far_degrees=45")
+    message, results = report("depth", "far_degrees=45")
     assert weights_of(results["rows"]) == [(0, 0.5, True), (0.5, 0.5, True), (1, 0.2, True)]
     assert all(row["reference_deviation"] > 0 and 0 < row["reference_measured"] <= 1 for row in results["rows"])
     assert results["settings"] == {"scenes": 1, "samples": 2, "seed": 0, "far_degrees": 45}
     assert imageio.imread(tmp_path / "out/depth.png").ndim == 3
-    assert "Deviation of depth" in said
+    assert "Deviation of depth" in message
 
 
 @pytest.mark.parametrize(
-    ("task", "setting", "said"),
+    ("task", "setting", "message"),
     [
         ("samplers", "samples=1", "samples=1: must be at least 2"),
         ("samplers", "+steps.nonsense=[5]", "steps.nonsense: no such sampler"),
         ("controls", "guidance_weights=0.5", "guidance_weights=0.5: must be a list, such as guidance_weights=[0.5]"),
-        ("controls", "skip_weights=[0,2]", "skip_weight=2: must lie between 0 and 1"),
         ("masked", "boxes=[[0,0,0,1]]", "is no [x0,y0,x1,y1]"),
-        ("depth", "far_degrees=-1", "far_degrees=-1: must lie between 0 and 180"),
         ("samplers", "seed=0", "nowhere.ckpt: no such checkpoint"),
     ],
 )
-def test_what_has_no_meaning_is_refused_before_the_model_is_opened(task, setting, said):
-    assert said in refused("report", f"report_task={task}", "ckpt=nowhere.ckpt", setting)
+def test_impossible_settings_are_refused_before_the_model_is_opened(task, setting, message):
+    assert message in refused("report", f"report_task={task}", "ckpt=nowhere.ckpt", setting)
 
 
-def test_what_the_model_or_its_data_cannot_do_is_refused(pipeline):
-    for run, setting, said in (
+def test_settings_that_the_model_or_its_data_cannot_follow_are_refused(pipeline):
+    for run, setting, message in (
         (pipeline.diffusion, "scenes=9", "there are 1 test scenes, not scenes=9"),
         (pipeline.diffusion, "steps.ddim=[30]", "steps=30: DDIM's must divide 1000"),
         (pipeline.var, "samples=2", "a diffusion model is needed"),
     ):
         given = ["report_task=samplers", f"ckpt={run / 'checkpoints/last.ckpt'}", "scenes=1", "samples=2"]
-        assert said in refused("report", *given, setting)
+        assert message in refused("report", *given, setting)

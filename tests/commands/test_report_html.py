@@ -11,7 +11,7 @@ from report_pages import FRAMES, HOSTILE, SAMPLES, Page, grey, write_results
 from support import compose_config, refused
 
 from completesplat.commands.jobs import start
-from completesplat.results.html_page import strip
+from completesplat.results.html_page import frame_strip
 
 
 @pytest.fixture(scope="module")
@@ -55,15 +55,15 @@ def test_the_page_asks_for_nothing_nor_do_its_own_styles_and_scripts(page, raw):
         assert not re.search(r"https?:|url\(|@import|fetch|import\(", own)
 
 
-def test_every_run_and_what_it_did_is_there_and_names_are_text_whatever_they_hold(page):
+def test_every_run_is_there_and_hostile_names_are_text(page):
     assert len(page.all("details", class_="run")) == 3
-    for said in ("21.12", "0.875", "17.25", "completesplat fit 'a=b c'", "c0ffee", "2026-11-21", "Table 2"):
-        assert said in page.text, said
+    for message in ("21.12", "0.875", "17.25", "completesplat fit 'a=b c'", "c0ffee", "2026-11-21", "Table 2"):
+        assert message in page.text, message
     assert page.text.count(HOSTILE) >= 4  # the run, its settings, its method in a table, and its figures
     assert any(HOSTILE in (image["alt"] or "") for image in page.all("img"))
 
 
-def test_every_picture_says_what_it_is_and_wide_ones_are_made_smaller(page):
+def test_every_image_has_a_description_and_wide_ones_are_reduced(page):
     assert all(image["alt"] for image in page.all("img"))
     assert all(box["aria-label"] for box in page.all("div", class_="scroll"))
     (figure,) = [image for image in page.all("img") if "hidden_modes" in (image["alt"] or "")]
@@ -82,11 +82,11 @@ def test_every_sample_turns_as_its_video_does_and_a_short_video_gives_all_its_fr
         for frame in range(6):
             middle = drawn.getpixel((frame * side + side // 2, side // 2))
             assert middle == pytest.approx(255 * grey(sample, frame * FRAMES // 6), abs=6)
-    whole, frames = strip(results / "predictions/x/orbit_00.mp4", 48)
+    whole, frames = frame_strip(results / "predictions/x/orbit_00.mp4", 48)
     assert (frames, whole.width) == (FRAMES, FRAMES * whole.height)
 
 
-def test_what_does_not_fit_is_left_out_and_counted(results, tmp_path):
+def test_images_beyond_the_limits_are_left_out_and_counted(results, tmp_path):
     page = Page(written(results, tmp_path, "most.pictures=2", "most.samples=1", "most.runs=2"))
     assert "3 more in" in page.text
     assert "2 more samples left out" in page.text
@@ -106,7 +106,7 @@ def test_a_full_page_says_so(tmp_path):
     assert "the page is full" in page.text
 
 
-def test_what_cannot_be_read_is_named(command, tmp_path):
+def test_unreadable_files_are_named(command, tmp_path):
     (tmp_path / "runs/x").mkdir(parents=True)
     for name in ("x/scene.json", "x/orbit_00.mp4", "x/sheet.png", "metrics.json"):
         (tmp_path / "runs" / name).write_text("{")
@@ -118,6 +118,6 @@ def test_what_cannot_be_read_is_named(command, tmp_path):
 
 
 def test_folders_without_anything_and_a_limit_of_nothing_are_refused(tmp_path):
-    for folder, said in (("nowhere", "no such folder"), ("", "nothing to show")):
-        assert re.match(f"runs=.*{said}", refused("report", "report_task=html", f"runs={tmp_path / folder}"))
+    for folder, message in (("nowhere", "no such folder"), ("", "nothing to show")):
+        assert re.match(f"runs=.*{message}", refused("report", "report_task=html", f"runs={tmp_path / folder}"))
     assert refused("report", "report_task=html", "runs=x", "most.frames=0") == "most.frames=0: must be at least 1"

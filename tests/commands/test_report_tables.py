@@ -2,11 +2,6 @@
 
 import json
 
-import pytest
-
-from completesplat.commands.report import tables
-from completesplat.errors import CompleteSplatError
-
 PROTOCOL = {"data_set": "toy_objects", "resolution": 64, "scenes": 2}
 
 
@@ -30,9 +25,3 @@ def test_runs_are_found_and_what_is_broken_is_named(command, tmp_path):
     assert "toy_objects, scores, 64 pixels" in finished.out
     assert "21.12" in (tmp_path / "out/tables.md").read_text()
     assert str(tmp_path / "runs/bad/metrics.json") in finished.out + finished.err
-
-
-def test_a_folder_without_results_is_refused(tmp_path):
-    for folder, said in (("nowhere", "no such folder"), ("", "completesplat test")):
-        with pytest.raises(CompleteSplatError, match=f"^runs=.*{said}"):
-            tables(str(tmp_path / folder), tmp_path / "out")

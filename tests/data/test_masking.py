@@ -8,7 +8,7 @@ from PIL import Image
 from completesplat.data.images.photograph import outside_of_box, outside_of_mask, read_photograph
 from completesplat.errors import CompleteSplatError, ImageError
 
-BOX = (0.25, 0.5, 0.75, 1.0)
+SHIPPED = (0.25, 0.5, 0.75, 1.0)
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def pictures(tmp_path):
         side = min(width, height)
         left, top = (width - side) // 2, (height - side) // 2
         inside = np.zeros((height, width), dtype=bool)
-        x0, y0, x1, y1 = (round(edge * side) for edge in BOX)
+        x0, y0, x1, y1 = (round(edge * side) for edge in SHIPPED)
         inside[top + y0 : top + y1, left + x0 : left + x1] = True
         second[~inside] = first[~inside]
         paths = tuple(tmp_path / f"{name}.png" for name in ("first", "second", "mask"))
@@ -36,7 +36,7 @@ def pictures(tmp_path):
 @pytest.mark.parametrize("size", [(32, 32), (64, 64), (100, 80), (61, 97), (20, 24)])
 def test_no_visible_pixel_holds_anything_hidden(pictures, size, form):
     first, second, mask = pictures(*size)
-    visible = outside_of_box(first, BOX, 32) if form == "box" else outside_of_mask(first, mask, 32)
+    visible = outside_of_box(first, SHIPPED, 32) if form == "box" else outside_of_mask(first, mask, 32)
     images = [read_photograph(path, 32).image for path in (first, second)]
     assert torch.equal(images[0] * visible, images[1] * visible)
     assert not torch.equal(images[0], images[1])
@@ -48,9 +48,9 @@ def test_a_picture_of_the_right_size_is_hidden_to_the_pixel_and_others_three_pix
     expected[:, 16:, 8:24] = 0
     grown[:, 13:, 5:27] = 0
     first, _, mask = pictures(32, 32)
-    assert torch.equal(outside_of_box(first, BOX, 32), expected)
+    assert torch.equal(outside_of_box(first, SHIPPED, 32), expected)
     assert torch.equal(outside_of_mask(first, mask, 32), expected)
-    assert torch.equal(outside_of_box(pictures(640, 640)[0], BOX, 32), grown)
+    assert torch.equal(outside_of_box(pictures(640, 640)[0], SHIPPED, 32), grown)
 
 
 def test_boxes_and_masks_that_are_none_are_refused(pictures, tmp_path):

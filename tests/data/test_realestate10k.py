@@ -180,6 +180,6 @@ def test_a_model_trains_on_it(both):
     assert any(not torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("experiment", ["co3d_diffusion", "re10k_diffusion", "toy_diffusion"])
+@pytest.mark.parametrize("experiment", ["paper_diffusion", "toy_diffusion"])
 def test_latent_diffusion_reads_no_targets(experiment):
     assert compose_config("fit", f"experiment={experiment}").data.targets == 0

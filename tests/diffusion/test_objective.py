@@ -1,7 +1,5 @@
 """Training targets, against closed forms, diffusers, and the sampler that must undo them."""
 
-from types import SimpleNamespace
-
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler
@@ -57,6 +55,6 @@ def test_a_perfect_denoiser_takes_ddim_back_to_the_latent(kind, steps):
 
 def test_another_prediction_type_is_refused_with_the_known_ones():
     latent, noise, timestep = drawn()
-    other = SimpleNamespace(config=SimpleNamespace(prediction_type="flow_prediction"))
+    other = scheduler("flow_prediction")
     with pytest.raises(CompleteSplatError, match=r"flow_prediction.*epsilon, v_prediction, sample"):
         target(other, latent, noise, timestep)

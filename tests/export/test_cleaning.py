@@ -34,7 +34,7 @@ def whole():
         ("scales", 1e-60),  # nothing is left of it in float32
     ],
 )
-def test_what_is_broken_in_one_place_is_taken_out_and_counted(caplog, whole, field, value):
+def test_broken_gaussians_are_removed_and_counted(caplog, whole, field, value):
     whole = whole.to(torch.float64)
     damaged = getattr(whole, field).clone()
     damaged.view(6, -1)[[1, 4], -1] = value
@@ -54,7 +54,7 @@ def test_a_set_without_a_fault_stays_and_one_of_nothing_else_is_refused(caplog, 
 
 @pytest.mark.parametrize("depth", [0.7, 3.0])
 @pytest.mark.parametrize("scales", [[1e-4, 1e-4, 1e-4], [0.05, 0.002, 0.01]])
-def test_a_picture_without_blur_is_the_one_that_training_saw_with_it(scales, depth):
+def test_an_image_without_blur_equals_the_one_with_blur_in_training(scales, depth):
     there = {"means": torch.tensor([[0, 0, depth]]), "scales": torch.tensor([scales])}
     gaussians = replace(some_gaussians(1)[0][:1], **there)
     dilated = with_screen_space_dilation(gaussians, CAMERA)

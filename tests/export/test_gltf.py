@@ -94,7 +94,7 @@ def test_points_have_linear_colours_and_the_opacity(tmp_path):
     np.testing.assert_allclose(points[:, 3], scene.opacities.numpy(), atol=1e-5)
 
 
-def test_what_cannot_be_stored_is_left_out_and_nothing_at_all_is_refused(tmp_path):
+def test_broken_gaussians_are_left_out_and_an_empty_set_is_refused(tmp_path):
     broken = some(3)
     broken.means[1, 0] = torch.nan
     assert write_glb(tmp_path / "a.glb", broken) == 2

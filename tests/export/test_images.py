@@ -3,37 +3,44 @@ import pytest
 import torch
 from picture_sheets import cells
 
-from completesplat.export import pictures
-from completesplat.export.images import SheetCell, color_depth, color_normals, image_grid, picture_sheet, to_bytes
+from completesplat.export.images import (
+    NOTHING,
+    SheetCell,
+    color_depth,
+    color_normals,
+    image_grid,
+    image_sheet,
+    to_bytes,
+)
 
 
 def test_images_stand_where_they_were_given_each_pixel_a_square():
     first, second = torch.rand(3, 3, 4, 5), torch.rand(2, 3, 4, 5)
     large = np.asarray(image_grid(first, second, factor=3))
-    picture = large[::3, ::3]
+    plain = large[::3, ::3]
     assert large.shape == (24, 45, 3)
-    assert np.array_equal(large, picture.repeat(3, axis=0).repeat(3, axis=1))
+    assert np.array_equal(large, plain.repeat(3, axis=0).repeat(3, axis=1))
     for row, images in enumerate((first, second)):
         for column, image in enumerate(images):
-            place = picture[4 * row : 4 * row + 4, 5 * column : 5 * column + 5]
+            place = plain[4 * row : 4 * row + 4, 5 * column : 5 * column + 5]
             assert np.array_equal(place, to_bytes(image))
-    assert np.all(picture[4:, 10:] == 255)
+    assert np.all(plain[4:, 10:] == 255)
 
 
-def test_every_picture_of_a_sheet_lies_in_its_row_and_column_and_places_may_be_empty():
+def test_every_image_of_a_sheet_lies_in_its_row_and_column_and_places_may_be_empty():
     images = torch.rand(3, 4, 3, 16, 24)
     rows = [[SheetCell(image, "a label") for image in row] for row in images]
     rows[0][0], rows[2] = None, rows[2][:1]
     expected = images.clone()
     expected[0, 0] = expected[2, 1:] = 1
-    found = cells(picture_sheet(["one", "two", "three", "four"], rows), 16, 24)
-    torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
+    result = cells(image_sheet(["one", "two", "three", "four"], rows), 16, 24)
+    torch.testing.assert_close(result, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
 def test_headings_and_labels_are_drawn_and_move_nothing():
     image = torch.rand(3, 16, 16)
-    plain = np.asarray(picture_sheet(["", ""], [[SheetCell(image), None]])).astype(int)
-    named = np.asarray(picture_sheet(["", "heading"], [[SheetCell(image, "label"), None]])).astype(int)
+    plain = np.asarray(image_sheet(["", ""], [[SheetCell(image), None]])).astype(int)
+    named = np.asarray(image_sheet(["", "heading"], [[SheetCell(image, "label"), None]])).astype(int)
     rows, columns = np.nonzero((plain != named).any(-1))
     assert plain.shape == named.shape
     in_heading, in_label = (rows < 32) & (columns > 144), (rows >= 32) & (rows < 52) & (columns < 144)
@@ -42,7 +49,7 @@ def test_headings_and_labels_are_drawn_and_move_nothing():
     assert (in_heading | in_label).all()
 
 
-def test_nearer_is_brighter_on_one_scale_for_all_pictures():
+def test_nearer_is_brighter_on_one_scale_for_all_images():
     colors, (near, far) = color_depth(torch.linspace(1, 20, 100).view(10, 1, 1, 10))
     lightness = (colors * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(-3)
     assert (lightness.flatten().diff() <= 0).all()
@@ -50,7 +57,7 @@ def test_nearer_is_brighter_on_one_scale_for_all_pictures():
     assert 19 < far <= 20
 
 
-def test_what_is_not_seen_is_grey_and_moves_the_scale_as_little_as_stray_depths():
+def test_missing_depths_are_grey_and_stray_depths_hardly_move_the_scale():
     depth = torch.linspace(1, 2, 400).view(1, 20, 20)
     colors, ends = color_depth(depth)
     holes = torch.cat([depth, torch.tensor([0.0, -1, torch.nan, torch.inf]).expand(1, 20, 4)], dim=-1)
@@ -62,7 +69,7 @@ def test_what_is_not_seen_is_grey_and_moves_the_scale_as_little_as_stray_depths(
     torch.testing.assert_close(color_depth(depth)[0][:, 1:-1], colors[:, 1:-1], rtol=0, atol=0.05)
 
 
-def test_nothing_seen_and_one_depth_are_pictures_too():
+def test_nothing_seen_and_one_depth_are_images_too():
     colors, ends = color_depth(torch.zeros(1, 4, 4))
     assert (colors.shape, ends) == ((3, 4, 4), (0.0, 0.0))
     assert color_depth(torch.full((1, 4, 4), 3.0))[0].isfinite().all()
@@ -74,9 +81,9 @@ def test_nothing_seen_and_one_depth_are_pictures_too():
         ([0.0, 0, -1], [0.5, 0.5, 1]),  # faces the camera
         ([1.0, 0, 0], [1, 0.5, 0.5]),  # right
         ([0.0, -1, 0], [0.5, 1, 0.5]),  # up
-        ([0.0, 0, 0], [pictures.NOTHING] * 3),
+        ([0.0, 0, 0], [NOTHING] * 3),
     ],
 )
 def test_colors_are_those_of_normal_maps(normal, color):
-    found = color_normals(torch.tensor(normal)[:, None, None])
-    torch.testing.assert_close(found[:, 0, 0], torch.tensor(color))
+    result = color_normals(torch.tensor(normal)[:, None, None])
+    torch.testing.assert_close(result[:, 0, 0], torch.tensor(color))

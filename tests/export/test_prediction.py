@@ -13,7 +13,6 @@ from support import some_gaussians, strict_json
 from completesplat.export.images import color_depth, surface_depth
 from completesplat.export.ply import read_ply
 from completesplat.export.prediction import (
-    SampleViews,
     Wanted,
     contact_sheet,
     write_maps,
@@ -29,15 +28,14 @@ GREY, KINDS = 128, ("depth", "normals", "opacity")
 
 def test_every_image_stands_upright_in_its_row_and_column_below_the_title(tmp_path):
     reference, images, depths = torch.rand(3, 36, 48), torch.rand(3, 8, 3, 36, 48), torch.rand(3, 1, 36, 48)
-    rows = [SampleViews("a sample", views, depth) for views, depth in zip(images, depths, strict=True)]
-    contact_sheet(tmp_path / "a.png", "a title", reference, rows)
+    contact_sheet(tmp_path / "a.png", "a title", reference, images, depths)
     sheet = Image.open(tmp_path / "a.png")
     assert np.asarray(sheet)[:30].std() > 0
     above = torch.ones(3, 1, 3, 36, 48)
     above[0] = reference
     expected = torch.cat([above, images, color_depth(depths)[0][:, None]], dim=1)
-    found = cells(sheet.crop((0, 30, *sheet.size)), 36, 48)
-    torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
+    result = cells(sheet.crop((0, 30, *sheet.size)), 36, 48)
+    torch.testing.assert_close(result, expected, atol=0.5 / 255 + 1e-5, rtol=0)
 
 
 CAMERA = Cameras(torch.eye(4), pinhole(60, 16), (16, 16))

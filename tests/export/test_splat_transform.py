@@ -7,6 +7,8 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export import splat_transform
 from completesplat.export.splat_transform import PACKAGE, SplatTransform, around_the_target, find_splat_transform
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def bin_folder(tmp_path, monkeypatch):
@@ -19,7 +21,7 @@ def bin_folder(tmp_path, monkeypatch):
     return tmp_path / "bin"
 
 
-def test_without_node_it_is_said_what_to_install_and_what_needs_nothing(bin_folder):
+def test_without_node_the_message_names_what_to_install(bin_folder):
     with pytest.raises(CompleteSplatError, match=r"need Node\.js 20 .* ply, splat and glb need nothing"):
         find_splat_transform()
 
@@ -37,16 +39,16 @@ def test_the_program_on_path_comes_first_else_npx_provides_the_pinned_package(bi
 
 
 @pytest.mark.parametrize(
-    ("name", "script", "said"),
+    ("name", "script", "message"),
     [
         ("npx", "#!/bin/sh\necho npm warn a hint >&2; echo npm error network >&2; exit 1", "1: npm error network$"),
         ("splat-transform", "#!/bin/sh\necho node is too old >&2; exit 3", "failed with status 3: node is too old"),
         ("splat-transform", "#!/no/such/interpreter\n", "splat-transform does not start"),
     ],
 )
-def test_a_program_that_does_not_start_is_found_out_before_it_is_needed(bin_folder, name, script, said):
+def test_programs_that_do_not_start_are_refused_early(bin_folder, name, script, message):
     install(bin_folder, name).write_text(script)
-    with pytest.raises(CompleteSplatError, match=said):
+    with pytest.raises(CompleteSplatError, match=message):
         find_splat_transform()
 
 
@@ -71,24 +73,24 @@ def test_a_file_is_converted_in_place_of_an_older_one(bin_folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("script", "said"),
+    ("script", "message"),
     [
         ("echo '    at main (x.js:1)' >&2; echo 'no GPU\nat all' >&2; exit 1", "failed with status 1: no GPU at all$"),
         ("exit 9", "failed with status 9: it does not say why"),
         ("exit 0", "has not written a.spz"),
     ],
 )
-def test_a_failure_is_one_line_and_leaves_the_older_file(bin_folder, tmp_path, script, said):
+def test_a_failure_is_one_line_and_leaves_the_older_file(bin_folder, tmp_path, script, message):
     program = install(bin_folder, "splat-transform", script)
     (tmp_path / "a.ply").write_text("splats")
     (tmp_path / "a.spz").write_text("older")
-    with pytest.raises(CompleteSplatError, match=said) as caught:
+    with pytest.raises(CompleteSplatError, match=message) as caught:
         SplatTransform(str(program)).convert(tmp_path / "a.ply", tmp_path / "a.spz")
     assert "\n" not in str(caught.value)
     assert (tmp_path / "a.spz").read_text() == "older"
 
 
-def test_what_takes_too_long_is_ended_with_all_that_it_started(bin_folder, tmp_path, monkeypatch):
+def test_slow_converters_are_killed_with_their_children(bin_folder, tmp_path, monkeypatch):
     monkeypatch.setattr(splat_transform, "LIMIT_SECONDS", 0.3)
     # Would write the file after a minute, and holds the pipes open until then.
     program = install(bin_folder, "splat-transform", f"(sleep 60; touch {tmp_path / 'late'}) & sleep 100")

@@ -35,17 +35,20 @@ def test_frames_come_back_in_order_and_upright(tmp_path):
         assert np.abs(images[quadrant] - expected[quadrant]).max() < 12
 
 
-@pytest.mark.parametrize(("height", "width", "stored"), [(300, 301, (300, 302)), (33, 57, (264, 456))])
-def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog, height, width, stored):
-    write_video(tmp_path / "a.mp4", torch.rand(5, 3, height, width))
-    assert read(tmp_path / "a.mp4")[0].shape == (5, *stored, 3)
+def test_odd_sizes_are_padded_and_small_ones_enlarged(tmp_path, caplog):
+    write_video(tmp_path / "a.mp4", torch.rand(2, 3, 171, 57))
+    assert read(tmp_path / "a.mp4")[0].shape == (2, 856, 286, 3)
     assert "resizing" not in caplog.text  # what imageio says when it scales the frames instead
 
 
 def test_nothing_to_show_or_another_format_is_refused(tmp_path):
     black, broken = torch.zeros(1, 3, 64, 64), torch.full((2, 3, 64, 64), torch.nan)
-    for name, frames, said in (("a.mp4", black[:0], "needs"), ("a.txt", black, "needs"), ("a.mp4", broken, "finite")):
-        with pytest.raises(ValueError, match=said):
+    for name, frames, message in (
+        ("a.mp4", black[:0], "needs"),
+        ("a.txt", black, "needs"),
+        ("a.mp4", broken, "finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
             write_video(tmp_path / name, frames)
     assert list(tmp_path.iterdir()) == []
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import distributed, multiprocessing
 
@@ -13,13 +14,14 @@ from completesplat.metrics.image_sets import Patches
 from completesplat.metrics.scoring import Evaluation
 from completesplat.scene import Views
 
+pytestmark = pytest.mark.processes
 COUNTS = (1, 2, 5)
 BATCH = 2
 
 
 def scored(count: int, skipped: set[str]) -> dict[str, Any]:
-    """Results of so many scenes, of which this process scores its share."""
-    store = SceneStore.__new__(SceneStore)  # of names alone: nothing is read
+    """Return the results of some scenes, of which this process scores its share."""
+    store = SceneStore.__new__(SceneStore)  # with names alone, because nothing is read
     store.names = [f"scene {index}" for index in range(count)]
     evaluation = Evaluation(samples=2, sets={"swd": Patches(patches=2)})
     cameras = Cameras(torch.eye(4).expand(3, 4, 4), torch.eye(3).expand(3, 3, 3), (16, 16))
@@ -42,7 +44,7 @@ def one_of_two(rank: int, folder: str) -> None:
     distributed.destroy_process_group()
 
 
-def test_two_processes_tell_what_one_tells_for_any_number_of_scenes(tmp_path):
+def test_two_processes_have_the_scores_of_one_for_any_number_of_scenes(tmp_path):
     multiprocessing.spawn(one_of_two, (str(tmp_path),), nprocs=2)
     alone = json.loads(json.dumps([scored(count, {"unreadable", "unreadable 0", "unreadable 1"}) for count in COUNTS]))
     for rank in (0, 1):

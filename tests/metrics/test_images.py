@@ -37,7 +37,7 @@ def similarity_map(first, second, border):
     return luminance * (2 * covariance + 0.03**2) / (variances + 0.03**2)
 
 
-def test_ssim_mirrors_the_picture_at_the_border_and_counts_all_pixels_where_skimage_leaves_5_out(pair):
+def test_ssim_mirrors_images_at_the_border_and_counts_all_pixels(pair):
     settings = {"channel_axis": 0, "data_range": 1, "gaussian_weights": True, "sigma": 1.5}
     for p, t, ours in zip(*pair, ssim(*pair), strict=True):
         similarity = similarity_map(p, t, "mirror")
@@ -45,7 +45,7 @@ def test_ssim_mirrors_the_picture_at_the_border_and_counts_all_pixels_where_skim
         theirs = structural_similarity(t.double().numpy(), p.double().numpy(), use_sample_covariance=False, **settings)
         assert similarity[:, 5:-5, 5:-5].mean() == pytest.approx(theirs, abs=1e-9)
     assert METRICS["ssim"]["border"] == "mirrored, counted"
-    assert "mean over all pixels, the picture mirrored at its border" in SSIM_NOTE
+    assert "mean over all pixels, images mirrored at their border" in SSIM_NOTE
     assert "skimage leaves 5 pixels out on every side" in SSIM_NOTE
 
 

@@ -37,12 +37,12 @@ def test_features_are_those_of_the_image_in_8_bits_from_a_frozen_network_that_kn
     network = load_inception(str(file), hashlib.sha256(file.read_bytes()).hexdigest())
     levels = torch.tensor([0.0, 0.4999 / 255, 0.5001 / 255, 0.6, 1.0, 1.5, -1.0])
     images = levels.view(-1, 1, 1, 1) * torch.tensor([1.0, 0.0, 0.0]).view(3, 1, 1).expand(3, 4, 5)
-    features = network(images)
+    features = network.features(images)
     red = torch.tensor([0.0, 0, 1, 153, 255, 255, 0])
     torch.testing.assert_close(features, torch.stack([red, 0 * red, 0 * red, red / 3], dim=1))
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(network(images), features)
-    assert not any(parameter.requires_grad for parameter in network.parameters())
+        assert torch.equal(network.features(images), features)
+    assert not features.requires_grad
 
 
 def test_only_the_published_file_is_run_unless_another_hash_is_given(file):
@@ -53,7 +53,7 @@ def test_only_the_published_file_is_run_unless_another_hash_is_given(file):
 
 
 @pytest.mark.parametrize(
-    ("write", "said"),
+    ("write", "reason"),
     [
         (lambda path: None, "no such file"),
         (lambda path: path.write_bytes(b"PK\x03\x04"), "not a readable TorchScript file"),
@@ -61,9 +61,9 @@ def test_only_the_published_file_is_run_unless_another_hash_is_given(file):
         (lambda path: torch.jit.script(torch.nn.Identity()).save(str(path)), "gives no features"),
     ],
 )
-def test_what_is_no_such_network_is_refused_in_one_line_with_what_to_do(tmp_path, write, said):
+def test_other_files_are_refused_in_one_line_with_advice(tmp_path, write, reason):
     write(tmp_path / "network.pt")
-    with pytest.raises(WeightsError, match=said) as caught:
+    with pytest.raises(WeightsError, match=reason) as caught:
         load_inception(str(tmp_path / "network.pt"), None)
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'network.pt'}: ")

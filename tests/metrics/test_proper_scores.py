@@ -17,10 +17,10 @@ def mean_energy(samples_of):
 
 def test_draws_of_the_truth_have_the_exact_energy_score():
     generator = torch.Generator().manual_seed(0)
-    found = [
+    result = [
         energy_score(FORMS[torch.randint(K, (8,), generator=generator)], FORMS[i % K]) for i in range(DRAWS)
     ]  # unbiased: also with 8 samples
-    assert sum(found) / DRAWS == pytest.approx(0.375 * D, abs=0.004)
+    assert sum(result) / DRAWS == pytest.approx(0.375 * D, abs=0.004)
 
 
 def test_the_mean_of_the_forms_has_the_exact_energy_score():
@@ -36,8 +36,9 @@ def test_noise_around_the_mean_does_not_improve_the_energy_score():
     assert mean_energy(lambda i: FORMS.mean(0) + noise) > 0.375 * D * 1.4
 
 
+@pytest.mark.slow
 def test_scores_are_those_of_an_independent_implementation():
-    import scoringrules  # compiles for seconds when it is loaded: not in every process that collects the tests
+    import scoringrules  # compiles for seconds when it is loaded
 
     samples = torch.rand(6, 50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     truth = torch.rand(50, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -54,11 +55,11 @@ def test_crps_of_equal_samples_is_the_mean_absolute_error():
 
 def test_ranks_are_flat_for_draws_of_one_distribution():
     values = torch.randn(10, 200_000, generator=torch.Generator().manual_seed(0))
-    found = rank_histogram(values[1:], values[0])
-    assert found.shape == (10,)
-    torch.testing.assert_close(found, torch.full((10,), 0.1, dtype=torch.float64), atol=0.004, rtol=0)
+    result = rank_histogram(values[1:], values[0])
+    assert result.shape == (10,)
+    torch.testing.assert_close(result, torch.full((10,), 0.1, dtype=torch.float64), atol=0.004, rtol=0)
 
 
 def test_equal_values_share_their_ranks():
-    found = rank_histogram(torch.tensor([[0.0], [0.5], [0.5]]), torch.tensor([0.5]))
-    torch.testing.assert_close(found, torch.tensor([0, 1, 1, 1], dtype=torch.float64) / 3)
+    result = rank_histogram(torch.tensor([[0.0], [0.5], [0.5]]), torch.tensor([0.5]))
+    torch.testing.assert_close(result, torch.tensor([0, 1, 1, 1], dtype=torch.float64) / 3)

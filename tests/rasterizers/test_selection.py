@@ -14,9 +14,9 @@ from omegaconf import OmegaConf
 from support import compose_config
 
 from completesplat.commands import refusal
-from completesplat.commands.trained import config_of_run
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.opening import config_of_run
 from completesplat.rasterizers import Rendering, RenderingConstants, cuda, selection
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.rasterizers.tiled import TiledRasterizer

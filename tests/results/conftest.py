@@ -8,8 +8,6 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from completesplat.results.sweeps import write_summary
-
 PROTOCOL = {
     "name": "images",
     "method": "VariationalAutoReconstructor",
@@ -27,7 +25,7 @@ PROTOCOL = {
 
 
 def entry(psnr: float) -> dict[str, Any]:
-    """A predictor's scores, PSNR of novel views given."""
+    """A predictor's scores with a PSNR of novel views."""
     full = {"novel": {"psnr": psnr, "ssim": 0.5}, "reference": {"psnr": psnr + 5, "ssim": 0.75}}
     same = {"novel": {"psnr": psnr + 1, "ssim": 0.625}, "reference": {"psnr": psnr + 6, "ssim": 0.875}}
     return {"scenes": 20, "views": 80, "full": full, "object": same}
@@ -84,8 +82,8 @@ class Sweep:
         job.mkdir(parents=True)
         self.count += 1
         OmegaConf.save(OmegaConf.create(CONFIG), job / "config.yaml")
-        own = ["data.root=/home/someone/data/set", f"out={self.folder}", "ckpt_path=last"]
-        given = ["experiment=small", *overrides, *own]
+        places = ["data.root=/home/someone/data/set", f"out={self.folder}", "ckpt_path=last"]
+        given = ["experiment=small", *overrides, *places]
         record = {"command": COMMAND, "commit": commit, "overrides": given}
         (job / "run.json").write_text(json.dumps(record))
         if test is not None:
@@ -99,7 +97,7 @@ class Sweep:
         return self.add(*overrides, test={"model": predictor(psnr, scenes, **others)} | naive, steps=steps)
 
     def plan(self, overrides: Sequence[str]) -> None:
-        """What hydra writes down when the sweep starts."""
+        """Write the file that hydra writes when the sweep starts."""
         self.folder.mkdir(exist_ok=True)
         planned = {"hydra": {"overrides": {"task": list(overrides)}}, "out": "${somewhere:}"}
         OmegaConf.save(OmegaConf.create(planned), self.folder / "multirun.yaml")
@@ -119,14 +117,3 @@ def ablations(sweep: Sweep) -> Sweep:
             figures = {"full_novel_ssim": 0.5 + psnr / 100, "object_novel_psnr": psnr - 2 + offset}
             sweep.scored(f"ablation={ablation}", f"seed={seed}", psnr=psnr + offset, **figures)
     return sweep
-
-
-@pytest.fixture
-def written() -> Callable[[Sweep], str]:
-    """Writes a sweep's summary and gives the Markdown."""
-
-    def write(sweep: Sweep) -> str:
-        write_summary(sweep.folder)
-        return (sweep.folder / "summary.md").read_text()
-
-    return write

@@ -66,7 +66,7 @@ def level(shown, index: int = 0) -> float:
     return pixels[height // 4 : -height // 4, width // 4 : -width // 4].mean().item()
 
 
-def test_nothing_is_wider_than_the_page_and_all_pictures_are_drawn(opened):
+def test_nothing_is_wider_than_the_page_and_all_images_are_drawn(opened):
     width, window = opened.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert width <= window
     scrolled = "[...document.querySelectorAll('.scroll')].some(box => box.scrollWidth > box.clientWidth)"

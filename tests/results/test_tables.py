@@ -26,9 +26,9 @@ def written(runs, run, tmp_path):
     whole |= {"protocol_views": "reference: a sequence's first frame; targets: its other frames"}
     run("a", 17.123456, name="co3d", data_set="co3d/hydrant", resolution=128, **whole)
     run("b_100%|", 20.0)
-    found = tables(find(runs))
-    write_tables(found, tmp_path / "out")
-    return found, tmp_path / "out"
+    made = tables(find(runs))
+    write_tables(made, tmp_path / "out")
+    return made, tmp_path / "out"
 
 
 def rows_of_latex(text: str) -> list[str]:
@@ -44,7 +44,7 @@ def width(row: str) -> int:
 
 
 def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written) -> None:
-    found, out = written
+    made, out = written
     text = (out / "tables.tex").read_text()
     opened: list[str] = []
     for kind, name in re.findall(r"\\(begin|end)\{(\w+\*?)\}", text):
@@ -54,39 +54,39 @@ def test_latex_is_balanced_and_all_rows_have_the_columns_of_their_table(written)
             assert opened.pop() == name
     assert opened == []
     assert len(re.findall(r"(?<!\\)\{", text)) == len(re.findall(r"(?<!\\)\}", text))
-    for one in found:
-        latex = as_latex(one)
+    for each in made:
+        latex = as_latex(each)
         (columns,) = re.findall(r"\\begin\{tabular\}\{(\w+)\}", latex)
-        assert {width(row) for row in rows_of_latex(latex)} == {len(columns)} == {len(one.headings)}
-        lines = [line for line in as_markdown(one).splitlines() if line.startswith("|")]
-        assert {len(re.split(r"(?<!\\)\|", line)) - 2 for line in lines} == {len(one.headings)}
+        assert {width(row) for row in rows_of_latex(latex)} == {len(columns)} == {len(each.headings)}
+        lines = [line for line in as_markdown(each).splitlines() if line.startswith("|")]
+        assert {len(re.split(r"(?<!\\)\|", line)) - 2 for line in lines} == {len(each.headings)}
     uncommented = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     assert re.findall(r"(?<!\\)[%#](?!$)", uncommented, re.MULTILINE) == []
     assert text.isascii()
 
 
 def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_of_ours(written, capsys) -> None:
-    found, out = written
+    made, out = written
     markdown, latex = (out / "tables.md").read_text(), (out / "tables.tex").read_text()
     with (out / "tables.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
-    for one in published():
-        texts = {line["text"] for line in lines if line["table"] == one.name and line["source"] == "paper"}
-        for cell in (cell for row in one.rows for cell in row if cell.text):
+    for known in published():
+        texts = {line["text"] for line in lines if line["table"] == known.name and line["source"] == "paper"}
+        for cell in (cell for row in known.rows for cell in row if cell.text):
             assert cell.text in markdown
             assert cell.text in latex
             assert any(text.startswith(cell.text) for text in texts)
     assert "| **17.93** | 0.54 | 180.20 | 0.14 |" in markdown
     assert r"PixelNeRF $\dagger$ & Offline & 5.0 sec" in latex
     assert r"\underline{17.59}" in latex
-    assert len(lines) == sum(len(one.rows) * len(one.headings) for one in found)
+    assert len(lines) == sum(len(each.rows) * len(each.headings) for each in made)
     assert all(line["text"] for line in lines)
     (line,) = (line for line in lines if line["text"] == "17.12")
     assert (float(line["value"]), line["table"], line["column"]) == (17.123456, "full_images", "Hydrants PSNR ↑")
-    show(*found, width=240)
+    show(*made, width=240)
     printed = capsys.readouterr().out
-    for one in found:
-        assert all(line[:40] in printed for line in (one.title, *one.below()))
+    for each in made:
+        assert all(line[:40] in printed for line in (each.title, *each.below()))
 
 
 def test_latex_prints_special_characters_literally() -> None:
@@ -99,7 +99,7 @@ def test_the_heading_says_which_direction_is_better(name, arrow) -> None:
     assert metric(f"full_novel_{name}") == arrow
 
 
-def test_what_a_record_lacks_stays_empty(capsys) -> None:
+def test_missing_entries_of_records_stay_empty(capsys) -> None:
     shown = table("Title", [("name", "name", ""), ("figure", "figure", ".1f")], [{"name": "[red]"}, {"figure": 1.25}])
     assert [[cell.text for cell in row.cells] for row in shown.rows] == [["[red]", ""], ["", "1.2"]]
     show(shown)

@@ -128,7 +128,7 @@ def test_a_value_is_named_where_it_was_set():
             "fit xyzzy=1",
             r"no setting 'xyzzy' of completesplat fit; completesplat fit --help shows those that there are",
         ),
-        ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are co3d_diffusion, .*; did you mean toy_var"),
+        ("fit experiment=toy_vr", r"no experiment 'toy_vr': there are co3d_small_diffusion, .*; did you mean toy_var"),
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit data=toy_object", r"no data 'toy_object': there are .*; did you mean toy_objects"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are stage1, stage2; did you mean stage1"),

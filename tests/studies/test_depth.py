@@ -84,35 +84,37 @@ def depths() -> torch.Tensor:
 
 @pytest.mark.parametrize(("far_degrees", "views"), [(89, [1, 2]), (91, [2]), (1, [1, 2, 3])])
 def test_far_is_an_angle_and_the_object_is_its_mask(far_degrees, views):
-    found = deviations(depths(), scene(), far_degrees)
+    result = deviations(depths(), scene(), far_degrees)
     mean = np.mean(views) / np.sqrt(2)
-    assert found["far_object_deviation"] == pytest.approx(2 * mean)
-    assert found["far_deviation"] == pytest.approx(mean * (1 + 1 / SIZE))
-    assert (found["reference_deviation"], found["far_measured"]) == (0, 1)
+    assert result["far_object_deviation"] == pytest.approx(2 * mean)
+    assert result["far_deviation"] == pytest.approx(mean * (1 + 1 / SIZE))
+    assert (result["reference_deviation"], result["far_measured"]) == (0, 1)
 
 
-def test_what_is_not_seen_is_not_measured():
+def test_hidden_pixels_are_not_measured():
     depth = depths()
     depth[0, 2, :, : SIZE // 2] = 0
     assert deviations(depth, scene(), 91)["far_measured"] == 0.5
     depth[0, 2] = 0
-    found = deviations(depth, scene(), 91)
-    assert (found["far_deviation"], found["far_object_deviation"], found["far_measured"]) == (None, None, 0)
-    found = deviations(depths(), scene(), 180)
-    assert {found[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
+    result = deviations(depth, scene(), 91)
+    assert (result["far_deviation"], result["far_object_deviation"], result["far_measured"]) == (None, None, 0)
+    result = deviations(depths(), scene(), 180)
+    assert {result[f"far_{name}"] for name in ("deviation", "object_deviation", "measured")} == {None}
 
 
 def test_a_row_shows_the_truth_some_samples_from_behind_and_where_all_disagree():
-    own = scene()
-    ((truth, first, second, where),) = strips(renderer(samples=3), [own], 0.0, 0.5, shown=2)
-    assert torch.equal(truth.images, torch.stack([own.reference.images[0], own.all_views().images[0, 2]]))
+    batch = scene()
+    (row,) = strips(renderer(samples=3), [batch], 0.0, 0.5, shown=2)
+    images = torch.stack([cell.image for cell in row])
+    assert torch.equal(images[:2], torch.stack([batch.reference.images[0], batch.all_views().images[0, 2]]))
     # From behind, the second sample is nearer: brighter on the scale that both share.
-    assert first.label.removeprefix("sample 0") == second.label.removeprefix("sample 1") == ": depth 2.50 to 3.00"
-    torch.testing.assert_close(first.images[1], ramp(torch.zeros(1, SIZE, SIZE)))
-    torch.testing.assert_close(second.images[1], ramp(torch.ones(1, SIZE, SIZE)))
+    labels = {0: "a: input, far view", 2: "sample 0: depth 2.50 to 3.00", 5: "sample 1: depth 2.50 to 3.00"}
+    assert {place: cell.label for place, cell in enumerate(row) if cell.label} == labels | {8: "deviation 0 to 0.5"}
+    torch.testing.assert_close(images[3], ramp(torch.zeros(1, SIZE, SIZE)))
+    torch.testing.assert_close(images[6], ramp(torch.ones(1, SIZE, SIZE)))
     # All face the camera.
-    torch.testing.assert_close(first.images[2, :, 8, 8], torch.tensor([0.5, 0.5, 1]), atol=0.01, rtol=0)
-    assert (where.images.shape, where.label) == ((2, 3, SIZE, SIZE), "deviation 0 to 0.5")
+    torch.testing.assert_close(images[4, :, 8, 8], torch.tensor([0.5, 0.5, 1]), atol=0.01, rtol=0)
+    assert len(row) == 10
 
 
 def test_disagreement_is_bright_and_what_cannot_be_compared_grey():

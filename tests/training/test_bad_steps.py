@@ -92,8 +92,7 @@ def test_a_run_without_bad_steps_is_as_it_would_be_without_the_callback(monkeypa
     assert all(equal(one, other) for one, other in zip(watched.seen, free.seen, strict=True))
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("batch", [3, 4, 5])
+@pytest.mark.parametrize(("fault", "batch"), list(zip(FAULTS, (3, 4, 5, 3, 4), strict=True)))
 def test_one_bad_batch_of_several_leaves_out_their_step(fault, batch):
     module = Faulty(FAULTS[fault], batches=(batch,))
     bad = train(module, ExponentialMovingAverage(0.9), steps=4, accumulated=3)
@@ -194,25 +193,16 @@ def test_a_run_that_diverges_ends_with_one_line_and_keeps_its_checkpoint(command
         return loss * NAN if self.global_step >= 3 else loss
 
     monkeypatch.setattr(ReconstructionModule, "training_step", failing)
-    settings = ["trainer.max_steps=20", "callbacks.checkpoint.every_n_train_steps=2"]
+    settings = ["trainer.max_steps=8", "callbacks.checkpoint.every_n_train_steps=2", "trainer.limit_val_batches=0"]
+    settings += ["callbacks.bad_steps.most_bad_steps=2"]
     finished = fit(command, toy_root, tmp_path / "run", *settings)
     assert finished.status == 1
     line = finished.err.splitlines()[-1]
-    assert line.startswith("error: step 12: 10 steps in a row")
+    assert line.startswith("error: step 4: 2 steps in a row")
     assert "model." in line
     weights = torch.load(tmp_path / "run/checkpoints/last.ckpt", weights_only=True)["state_dict"]
     assert all(value.isfinite().all() for value in weights.values())
     assert "Traceback" not in finished.err
-
-
-def test_two_steps_that_are_both_bad_end_a_run_with_status_1_and_leave_no_weights(
-    command, toy_root, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(ReconstructionModule, "training_step", lambda self, *_: NAN * next(self.parameters()).sum())
-    finished = fit(command, toy_root, tmp_path / "run")
-    assert finished.status == 1
-    assert finished.err.splitlines()[-1].startswith("error: step 1: 2 steps in a row")
-    assert not [path for path in (tmp_path / "run").rglob("*") if path.suffix in (".ckpt", ".safetensors")]
 
 
 def test_a_run_with_one_bad_step_says_so_in_json_that_is_valid(command, toy_root, tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 import itertools
 import os
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -92,24 +91,3 @@ def test_only_whole_optimizer_steps_are_written(tmp_path, monkeypatch):
     batches = [c["loops"]["fit_loop"]["epoch_loop.batch_progress"]["total"]["completed"] for c in counts]
     assert [c["global_step"] for c in counts] == [1, 2, 3, 4]
     assert all(batch in (3 * n, 3 * n - 1) for n, batch in enumerate(batches, start=1))
-
-
-class Killed(BaseException): ...
-
-
-@pytest.mark.parametrize("survived", range(8))
-def test_a_run_killed_between_any_two_changes_of_files_has_a_whole_last_checkpoint(tmp_path, monkeypatch, survived):
-    """Killed before the file system's change number `survived`; nothing tidies up behind a killed process."""
-    train(tmp_path, steps=1)
-    changes = itertools.count()
-
-    def counted(change, *arguments):
-        if next(changes) >= survived:
-            raise Killed
-        return change(*arguments)
-
-    for place, name in ((torch, "save"), (os, "link"), (os, "replace")):
-        monkeypatch.setattr(place, name, partial(counted, getattr(place, name)))
-    with pytest.raises(Killed):
-        train(tmp_path, steps=9, every_n_train_steps=1, keep_every=2)
-    assert step_of(tmp_path / "checkpoints/last.ckpt") in range(1, 9)

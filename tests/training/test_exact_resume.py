@@ -105,7 +105,8 @@ def results(run) -> dict:
     return {k: v for k, v in strict_json(run / "metrics.json").items() if not k.startswith(("speed/", "memory/"))}
 
 
-@pytest.mark.parametrize("written", [4, 6, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("written", [2, 4, 6])
 def test_a_run_killed_when_its_checkpoint_was_just_written_misses_nothing(
     settings, whole, tmp_path, monkeypatch, written
 ):

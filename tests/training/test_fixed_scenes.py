@@ -19,13 +19,13 @@ from completesplat.scene import SceneBatch
 from completesplat.training.fixed_scenes import (
     distributions,
     fixed_scenes,
-    latent_bits,
     layer_figures,
     layer_maps,
     percentiles,
     scene_panels,
     write_newest,
 )
+from completesplat.training.reconstruction import ReconstructionModule
 from completesplat.viewer.sample import read_newest
 
 
@@ -91,7 +91,7 @@ def test_distributions_are_of_all_values():
     assert np.allclose(values["log10_scale"], -3)
     assert np.unique(values["depth"].round(5)).tolist() == [1, 3]
     shuffled = np.random.default_rng(0).permutation(101).astype(float)  # of 0 to 100 the n-th percentile is n
-    assert percentiles({"depth": shuffled}) == {"depth_p10": 10, "depth_p50": 50, "depth_p90": 90}
+    assert percentiles({"depth": shuffled}) == {f"gaussians/depth_p{n}": n for n in (10, 50, 90)}
 
 
 def test_maps_and_figures_of_the_layers_are_those_of_the_reference_s_pixels():
@@ -116,7 +116,8 @@ def test_maps_and_figures_of_the_layers_are_those_of_the_reference_s_pixels():
 def test_the_bits_of_the_channels_are_those_of_the_posterior():
     means = torch.randn(3, 4, 5, 6) * torch.tensor([0.0, 1, 0.05, 1])[:, None, None]  # 0.05^2 / 2 nats are 0.0018 bits
     posterior = Posterior(means, torch.zeros(3, 4, 5, 6))
-    logged = latent_bits(posterior)
+    model = lambda scenes: SimpleNamespace(posterior=posterior)  # noqa: E731
+    logged = ReconstructionModule.latent_figures(model, scene_batch())
     bits = [logged[f"latent/bits_{channel}"] for channel in range(4)]
     assert logged["latent/bits"] == pytest.approx(sum(bits))
     assert sum(bits) == pytest.approx(posterior.kl().mean().item() / math.log(2), rel=1e-5)
@@ -144,28 +145,26 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
     assert len(read_newest(tmp_path / "newest")[1]) == 1
 
 
-@pytest.mark.parametrize("text", ["", "{}", '{"step": 1, "scenes": [{"file": "../a.ply"}]}'])
-def test_newest_scenes_that_are_not_there_are_refused(tmp_path, text):
+def test_newest_scenes_that_are_not_there_are_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match="not the newest scenes"):
         read_newest(tmp_path)
-    (tmp_path / "scenes.json").write_text(text)
+    (tmp_path / "scenes.json").write_text('{"step": 1, "scenes": [{"file": "../a.ply"}]}')
     with pytest.raises(CompleteSplatError, match="not the newest scenes"):
         read_newest(tmp_path)
 
 
 def test_scenes_are_the_first_of_validation():
     several = [scene_batch(2, targets=1, seed=0), scene_batch(1, targets=3, seed=1), scene_batch(2, targets=2, seed=2)]
-    data = SimpleNamespace(val_dataloader=lambda: several)
-    scenes = fixed_scenes(data, 4)
+    scenes = fixed_scenes(several, 4)
     assert [scene.names for scene in scenes] == ["scene 0 0", "scene 0 1", "scene 1 0", "scene 2 0"]
     assert torch.equal(scenes[2].targets.images, several[1].targets.images[0, :1])
-    assert len(fixed_scenes(data, 10)) == 5
+    assert len(fixed_scenes(several, 10)) == 5
 
 
 @pytest.mark.parametrize(("views", "chosen"), [(1, [0]), (3, [0, 2, 4]), (9, range(6))])
 def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
     (whole,) = batch = [scene_batch(1, targets=6)]
-    (scene,) = fixed_scenes(SimpleNamespace(val_dataloader=lambda: batch), 1, views)
+    (scene,) = fixed_scenes(batch, 1, views)
     assert torch.equal(scene.targets.images, whole.targets.images[0, list(chosen)])
 
 

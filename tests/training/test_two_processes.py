@@ -13,6 +13,7 @@ from torch import multiprocessing
 
 from completesplat.training.loggers import ContinuedCSVLogger
 
+pytestmark = pytest.mark.processes
 # Without anything that is drawn in the steps: what processes draw is their own.
 SETTINGS = ["experiment=toy_var", "ablation=no_variational", "autoreconstructor.skip_dropout=0", *SMALL]
 SETTINGS += ["rasterizer=reference", "data.image_size=16", "data.batch_size=4", "data.references_per_sequence=8"]

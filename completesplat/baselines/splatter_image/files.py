@@ -8,7 +8,8 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from types import NoneType
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import yaml
@@ -17,7 +18,7 @@ from torch import Tensor
 from completesplat.errors import TensorFileError, WeightsError
 from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.settings.schema import Entries, Few, Natural, Range, Width, refused, shown
-from completesplat.weights import RUN_WEIGHTS, read_small
+from completesplat.weights import RUN_WEIGHTS, first_line, read_small
 from completesplat.weights.checkpoint_reading import read_tensor_file
 
 HUB = "szymanowiczs/splatter-image-v1"
@@ -27,44 +28,35 @@ GENERAL, GENERAL_FILE = "objaverse", "model_latest.pth"
 MODEL_FILE = re.compile(r"model_(\w+)\.pth")
 
 
-class Camera(TypedDict):
-    """Options that are read from the section `data`."""
-
-    training_resolution: Annotated[int, Range(8, 1024)]
-    znear: Annotated[float, Range(-1e6, 1e6)]
-    zfar: Annotated[float, Range(-1e6, 1e6)]
-    white_background: bool
-    origin_distances: bool
-    input_images: Literal[1]
-
-
-class Network(TypedDict):
-    """Options that are read from the section `model`; all published weights share the literal values."""
-
-    name: Literal["SingleUNet"]
-    base_dim: Width
-    num_blocks: Few
-    attention_resolutions: Annotated[Sequence[Natural], Entries(most=8)]
-    max_sh_degree: Literal[1]
-    network_with_offset: Literal[True]
-    isotropic: Literal[False]
-
-
-class Embedding(TypedDict):
-    """Options that are read from the section `cam_embd`: models of two images embed their cameras."""
-
-    embedding: None
-
-
-SECTIONS = {"data": Camera, "model": Network, "cam_embd": Embedding}
+# Options that are read, by section; all published weights for one image share the literal values.
+SECTIONS: dict[str, dict[str, object]] = {
+    "data": {
+        "training_resolution": Annotated[int, Range(8, 1024)],
+        "znear": Annotated[float, Range(-1e6, 1e6)],
+        "zfar": Annotated[float, Range(-1e6, 1e6)],
+        "white_background": bool,
+        "origin_distances": bool,
+        "input_images": Literal[1],
+    },
+    "model": {
+        "name": Literal["SingleUNet"],
+        "base_dim": Width,
+        "num_blocks": Few,
+        "attention_resolutions": Annotated[Sequence[Natural], Entries(most=8)],
+        "max_sh_degree": Literal[1],
+        "network_with_offset": Literal[True],
+        "isotropic": Literal[False],
+    },
+    "cam_embd": {"embedding": NoneType},  # models of two images embed their cameras
+}
 
 
 class Published(NamedTuple):
     """Checkpoint of published weights, and the sections `data` and `model` of its config."""
 
     weights: Path
-    data: Camera
-    model: Network
+    data: Mapping[str, Any]
+    model: Mapping[str, Any]
 
 
 def is_published(weights: Path | str) -> bool:
@@ -79,8 +71,13 @@ def find(weights: str) -> Published:
     Raises:
         WeightsError: they are missing, cannot be downloaded, or have options that no published weights have.
     """
-    config, model = _download(weights.removeprefix(PREFIX)) if weights.startswith(PREFIX) else _local(weights)
-    return Published(model, **_read_config(config))
+    if weights.startswith(PREFIX):
+        config, model = _download(weights.removeprefix(PREFIX))
+    else:
+        model = _local(Path(weights).expanduser())
+        config = _config_beside(model)
+    options = _read_config(config)
+    return Published(model, options["data"], options["model"])
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
@@ -119,18 +116,16 @@ def _config_beside(model: Path) -> Path:
     return model.with_name(f"config_{name}.yaml")
 
 
-def _local(weights: str) -> tuple[Path, Path]:
-    path = Path(weights).expanduser()
+def _local(path: Path) -> Path:
     models = _models_in(path) if path.is_dir() else [path]
     if len(models) > 1:
         names = ", ".join(model.name for model in models)
         raise WeightsError(f"{path}: holds {names}; give one of these files")
     if not models or not models[0].is_file():
         raise WeightsError(f"{path}: no such file")
-    config = _config_beside(models[0])
-    if not config.is_file():
+    if not (config := _config_beside(models[0])).is_file():
         raise WeightsError(f"{models[0]}: {config.name} is missing beside it; both are at https://huggingface.co/{HUB}")
-    return config, models[0]
+    return models[0]
 
 
 def _download(name: str) -> tuple[Path, Path]:
@@ -144,15 +139,14 @@ def _download(name: str) -> tuple[Path, Path]:
     try:
         config, model = (Path(hf_hub_download(HUB, file)) for file in files)
     except Exception as error:  # from the hub, its HTTP library or the file system
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(
-            f"{PREFIX}{name}: not to be had from the hub ({reason}); where there is a network, `hf download {HUB} "
-            f"{' '.join(files)} --local-dir DIR` fetches it; then give weights=DIR/{files[1]}"
+            f"{PREFIX}{name}: not to be had from the hub ({first_line(error)}); where there is a network, "
+            f"`hf download {HUB} {' '.join(files)} --local-dir DIR` fetches it; then give weights=DIR/{files[1]}"
         ) from error
     return config, model
 
 
-def _read_config(path: Path) -> dict[str, Any]:
+def _read_config(path: Path) -> dict[str, dict[str, Any]]:
     """Read the options in `SECTIONS`; a missing option counts as null, a missing `input_images` as 1."""
     text = read_small(path)
     try:
@@ -161,14 +155,15 @@ def _read_config(path: Path) -> dict[str, Any]:
         config = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as YAML ({type(error).__name__})") from error
-    sections: dict[str, Any] = {}
-    for section, kind in SECTIONS.items():
+    sections: dict[str, dict[str, Any]] = {}
+    for section, hints in SECTIONS.items():
         options = config.get(section) if isinstance(config, Mapping) else None
-        options = {"input_images": 1} | dict(options) if isinstance(options, Mapping) else {}
-        sections[section] = {name: options.get(name) for name in kind.__annotations__}
-        for name, value, reason in refused(kind, sections[section]):
-            message = f"{path}: {section}{name} is {shown(value)}: {reason}"
-            raise WeightsError(f"{message}; only Splatter Image's weights for one picture, as published, are read")
+        options = {"input_images": 1, **options} if isinstance(options, Mapping) else {}
+        sections[section] = {name: options.get(name) for name in hints}
+        for name, hint in hints.items():
+            for place, value, reason in refused(hint, sections[section][name]):
+                message = f"{path}: {section}.{name}{place} is {shown(value)}: {reason}"
+                raise WeightsError(f"{message}; only Splatter Image's weights for one image, as published, are read")
     if not sections["data"]["znear"] < sections["data"]["zfar"]:
         raise WeightsError(f"{path}: data.znear must be below data.zfar")
-    return {"data": sections["data"], "model": sections["model"]}
+    return sections

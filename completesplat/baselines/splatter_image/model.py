@@ -1,9 +1,14 @@
 """Splatter Image with its authors' published weights (Szymanowicz et al., CVPR 2024): one pass, one answer.
 
-This is a new implementation after commit 78a6ad0 of szymanowiczs/splatter-image (`scene/gaussian_predictor.py`).
+It sees an object on a plain background and predicts one Gaussian per pixel. It draws no samples, so hidden parts are
+reconstructed as an average. This is a new implementation after commit 78a6ad0 of szymanowiczs/splatter-image
+(`scene/gaussian_predictor.py`).
 """
 
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -11,19 +16,26 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from completesplat.autoreconstructor.model import Reconstruction
+from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
 from completesplat.baselines.splatter_image.directional import DirectionalGaussians
 from completesplat.baselines.splatter_image.files import find, read_tensors
 from completesplat.baselines.splatter_image.network import SongUNet
-from completesplat.errors import WeightsError
+from completesplat.data.images.photograph import Photograph, Picture, read_photograph
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
+from completesplat.scene_model import SceneModel, require_one
 from completesplat.splatter_image import CHANNELS, SH_C0, Parameterization, SplatterImage
+from completesplat.weights.checkpoint_reading import mismatch
 
 SH_C1 = 0.4886025119029199
 """Spherical harmonics of degree 1 are this factor, sqrt(3 / (4 pi)), times -y, z and -x of the unit direction."""
 HARMONICS = 9
 OBJECT_SIZE = 2 * 0.57
 """Largest extent of the captured objects, in scene units (`preprocess_co3d.py`: 1.2 * 0.95)."""
+OBJECT_SHARE = 0.65
+"""Share of the image that a cut-out object fills (`gradio_app.py`, `resize_foreground`)."""
+PHONE_FOV = 50.0
 TOLERANCE = 1e-4
 # Neither scales nor depths are clamped.
 PARAMETERIZATION = Parameterization(layers=1, smallest_scale=1e-9, largest_scale=1e9)
@@ -69,21 +81,7 @@ class DirectionalSplatterImage(SplatterImage):
         return DirectionalGaussians(**{**vars(seen), "colors": colors})
 
 
-class _Predictor(nn.Module):
-    """U-Net followed by a 1x1 convolution."""
-
-    def __init__(self, **sizes: object) -> None:
-        super().__init__()
-        outputs = CHANNELS + HARMONICS
-        self.encoder = SongUNet(inputs=3, outputs=outputs, **sizes)  # type: ignore[arg-type]
-        self.out = nn.Conv2d(outputs, outputs, 1)
-
-    def forward(self, images: Tensor) -> Tensor:
-        result: Tensor = self.out(self.encoder(images))
-        return result
-
-
-class PublishedSplatterImage(nn.Module):
+class PublishedSplatterImage(ReconstructionModel):
     """Network from an image to a Splatter Image, with published weights.
 
     Attributes:
@@ -94,7 +92,7 @@ class PublishedSplatterImage(nn.Module):
 
     Args:
         weights: `splatter_image:NAME` on the hub, a `.pth` file beside its `config_NAME.yaml`, or a folder with
-            both; see `weights/splatter_image.py`.
+            both; see `files.py`.
 
     Raises:
         WeightsError: the files are missing, unreadable, or have other tensors (name, size, type) than this network.
@@ -113,21 +111,22 @@ class PublishedSplatterImage(nn.Module):
         if size % 8 or model["base_dim"] % 4:
             raise WeightsError(f"{file}: a size of {size}, {model['base_dim']} wide: neither fits the network")
         with torch.device("meta"):  # tensors have sizes but take no memory
-            self.network_with_offset = _Predictor(
-                size=size,
-                width=model["base_dim"],
-                blocks=model["num_blocks"],
-                attention_sizes=model["attention_resolutions"],
+            network = SongUNet(
+                size, 3, CHANNELS + HARMONICS, model["base_dim"], model["num_blocks"], model["attention_resolutions"]
             )
+            last = nn.Conv2d(CHANNELS + HARMONICS, CHANNELS + HARMONICS, 1)
+            self.network_with_offset = nn.Sequential(OrderedDict(encoder=network, out=last))
             self.register_buffer("ray_dirs", torch.empty(1, 3, size, size))
             for name in ("v_to_sh_transform", "sh_to_v_transform"):
                 self.register_buffer(name, torch.empty(1, 3, 3))
         tensors = read_tensors(file)
-        if message := _mismatch(self.state_dict(), tensors):
-            raise WeightsError(f"{file}: {message}")
-        self.load_state_dict({name: value.clone() for name, value in tensors.items()}, assign=True)
-        if message := self._other_constants():
-            raise WeightsError(f"{file}: {message}")
+        others = (f"{name} is of {value.dtype}" for name, value in tensors.items() if value.dtype != torch.float32)
+        reason = mismatch(self.state_dict(), tensors) or next(others, None)
+        if reason is None:
+            self.load_state_dict({name: value.clone() for name, value in tensors.items()}, assign=True)
+            reason = self._other_constants()
+        if reason is not None:
+            raise WeightsError(f"{file}: {reason}")
         self.fov_degrees = self._field_of_view()
 
     def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Reconstruction:
@@ -155,16 +154,13 @@ class PublishedSplatterImage(nn.Module):
             known = torch.full_like(value, 0.25) if name.endswith("resample_filter") else expected.get(name)
             if known is not None and not torch.equal(known, value):
                 return f"{name} has other values than published weights have"
-        corner = self.ray_dirs[0, 0, 0, 0]
-        if not torch.allclose(self.ray_dirs, self._rays(corner), rtol=TOLERANCE, atol=TOLERANCE) or corner >= 0:
+        corner = float(self.ray_dirs[0, 0, 0, 0])
+        along = torch.linspace(corner, -corner, self.image_size)
+        y, x = torch.meshgrid(along, along, indexing="ij")
+        rays = torch.stack([x, y, torch.ones_like(x)])[None]  # through the pixels' centres
+        if not torch.allclose(self.ray_dirs, rays, rtol=TOLERANCE, atol=TOLERANCE) or corner >= 0:
             return "ray_dirs are not those of a camera that looks along +z, with +x right and +y down"
         return None
-
-    def _rays(self, corner: Tensor) -> Float[Tensor, "1 3 size size"]:
-        """Return rays through the pixels' centres, given x and y of the first one."""
-        along = torch.linspace(float(corner), -float(corner), self.image_size)
-        y, x = torch.meshgrid(along, along, indexing="ij")
-        return torch.stack([x, y, torch.ones_like(x)])[None]
 
     def _field_of_view(self) -> float | None:
         """Derive the field of view from the rays; None if these are in pixels, for a focal length of 1."""
@@ -174,15 +170,86 @@ class PublishedSplatterImage(nn.Module):
         return None if abs(focal_length - 1) < TOLERANCE else float(2 * torch.atan(half / focal_length).rad2deg())
 
 
-def _mismatch(own: dict[str, Tensor], there: dict[str, Tensor]) -> str | None:
-    """Describe the first tensor that differs in name, size or type, if there is one."""
-    for name, value in own.items():
-        if name not in there:
-            return f"{name} is missing there"
-        if (there[name].shape, there[name].dtype) != (value.shape, value.dtype):
-            actual = f"{list(there[name].shape)} of {there[name].dtype}"
-            return f"{name} is {actual} there and {list(value.shape)} of {value.dtype} here"
-    for name in there:
-        if name not in own:
-            return f"{name} has no place here"
-    return None
+class PublishedOneAnswer(SceneModel):
+    """Published weights of Splatter Image, as `CompleteSplat.from_pretrained` and `predict` take them.
+
+    Its field of view is that of the training images, or if these have different ones, that of a phone's main camera.
+    Its up direction points upwards in the photo. Arguments and errors are those of `PublishedSplatterImage`.
+    """
+
+    def __init__(self, weights: str) -> None:
+        network = PublishedSplatterImage(weights)
+        super().__init__({"image_size": network.image_size})
+        self.network = network.eval().requires_grad_(False)
+        self.background = network.background
+        self.fov_degrees.fill_(PHONE_FOV if network.fov_degrees is None else network.fov_degrees)
+        color = "white" if network.background else "black"
+        self.note = (
+            "Splatter Image (Szymanowicz et al., CVPR 2024), another method. It knows objects on "
+            f"{color}: give images that are transparent or {color} around one, or background=remove"
+        )
+
+    @property
+    def reconstruction_model(self) -> PublishedSplatterImage:
+        """Return the network."""
+        return self.network
+
+    def needed_of_data(self, data: Mapping[str, object]) -> dict[str, object]:
+        """Return size and background, and for weights of captures the depth range around an object.
+
+        Raises:
+            CompleteSplatError: the weights need the distance of the object, and the data do not contain it.
+        """
+        needed = super().needed_of_data(data) | {"background": self.background}
+        if not self.network.depths.around_object:
+            return needed
+        if "depth_after" not in data:  # the far end of the depth range says where the object is
+            raise CompleteSplatError(f"{self.network.file}: knows objects; these data do not say where objects are")
+        return needed | {"depth_after": self.network.depths.far}
+
+    def read(self, image: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+        """Read an image at the model's size, on the background that the weights know (`read_photograph`).
+
+        If the weights know only one camera, the image counts as that camera's, and a cut-out object is put into the
+        middle of the image, as large as in training.
+
+        Raises:
+            CompleteSplatError: as `read_photograph`, or a field of view for weights that know one camera.
+        """
+        known = self.network.fov_degrees
+        if known is not None and fov_degrees is not None:
+            raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
+        share = None if known is None else OBJECT_SHARE
+        background = self.network.background
+        photograph = read_photograph(
+            image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share
+        )
+        return photograph if known is None else replace(photograph, fov_degrees=known, fov_source="default")
+
+    def depth_range_of(self, photograph: Photograph) -> Float[Tensor, "2"]:
+        """Return near and far; for weights of captures, around the distance that gives the object its trained size."""
+        focal_length = self.camera(photograph).intrinsics[0, 0].item()
+        distance = self.network.object_distance(photograph.image, focal_length)
+        known = torch.tensor([0.0, distance + self.network.depths.far], device=self.up.device)
+        return self.network.depths.range(known)
+
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        samples: int = 1,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        **settings: object,
+    ) -> Gaussians:
+        """Return scenes as `OneAnswer.generate`, in the colours that the cameras see; hidden pixels are background."""
+        require_one(samples)
+        if visible is not None:
+            images = images * visible + self.network.background * (1 - visible)
+        scenes: DirectionalGaussians = self.network(images).splatter_image.gaussians(cameras, depth_range)
+        return scenes.seen_from(cameras.centers)
+
+    def save_pretrained(self, path: Path | str) -> None:
+        """Raise WeightsError, because published weights stay in their authors' files."""
+        raise WeightsError("published weights are kept as their authors' files: copy these")

@@ -293,7 +293,7 @@ class SceneDataModule(LightningDataModule):
             return mean_camera(self.store("train"))
 
     def training_facts(self) -> dict[str, Any]:
-        """Return the facts about training images that weights store (`completesplat.parts.TrainingPictures`)."""
+        """Return the facts about training images that weights store (`completesplat.opening.parts.TrainingImages`)."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         return {"box_masks": hidden, **feature_moments(self.store("train"))}
 

@@ -11,9 +11,8 @@ from support import compose_config
 
 from completesplat.commands import conf_folder
 from completesplat.commands.jobs import use_working_folder
-from completesplat.commands.trained import config_of_run
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.opening import GROUPS
+from completesplat.opening import GROUPS, config_of_run
 
 MINE = """
 import json
@@ -76,39 +75,29 @@ def configuration(run, *overrides, trust=False):
 
 FOREIGN = [
     {"_target_": "torch.load", "f": "PAYLOAD", "weights_only": False},
-    {"_target_": "numpy.load", "file": "PAYLOAD", "allow_pickle": True},
     {"_target_": "os.system", "command": "touch SPRUNG"},
-    {"_target_": "posix.system", "_args_": ["touch SPRUNG"]},
     {"_target_": "builtins.eval", "_args_": ["open('SPRUNG', 'w')"]},
-    {"_target_": "lightning.Trainer", "default_root_dir": "SPRUNG"},
     {"_target_": "torch.optim.adam.torch.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "torch.optim.Adam.__init__.__globals__"},
     {"_target_": "completesplat.commands.launch", "verb": "test", "arguments": []},
-    {"_target_": "completesplat.cli.main"},
-    {"_target_": "completesplat.data.toy.write", "out": "SPRUNG"},
     {"_target_": "completesplat.losses.mse.torch.load", "f": "PAYLOAD", "weights_only": False},
-    {"_target_": "completesplat.training.callbacks.Progress"},
-    {"_target_": "__main__.open", "file": "SPRUNG", "mode": "w"},
     {"_target_": "missing_module.Thing"},
     {"_target_": ""},
-    {"_target_": None},
     {"_target_": ["os.system"]},
     {"_target_": "torch.optim.Adam", "_args_": [[{"_target_": "os.system", "command": "touch SPRUNG"}]]},
     {"_target_": "mine.load", "f": "PAYLOAD", "weights_only": False},
     {"_target_": "mine.json.loads", "s": "{}"},
-    {"_target_": "mine.Mine.mro"},
     {"_target_": "mine.make.__globals__.get"},
 ]
 
 
 @pytest.mark.parametrize("foreign", FOREIGN, ids=lambda foreign: str(foreign["_target_"]))
-@pytest.mark.parametrize("place", ["model.rasterizer", "data.more"])
-def test_what_is_neither_the_packages_nor_the_users_own_is_refused_always(
-    run, mine, elsewhere, tmp_path, monkeypatch, foreign, place
+def test_what_is_neither_the_packages_nor_the_users_is_refused_always(
+    run, mine, elsewhere, tmp_path, monkeypatch, foreign
 ):
     torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")
     text = OmegaConf.to_yaml(foreign).replace("PAYLOAD", str(tmp_path / "payload"))
-    name(run, OmegaConf.create(text.replace("SPRUNG", str(tmp_path / "sprung"))), place)
+    name(run, OmegaConf.create(text.replace("SPRUNG", str(tmp_path / "sprung"))), "model.rasterizer")
     for trust in (False, True):
         with pytest.raises(WeightsError, match=r"config\.yaml names |cannot be imported"):
             configuration(run, trust=trust)
@@ -191,8 +180,6 @@ def test_what_the_user_changes_may_name_anything_and_what_the_package_offers_nee
         ("data.batch_size=-1", "data.batch_size=-1: must be at least 1"),
         ("data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
         ("model.background=2", "model.background=2: must lie between 0 and 1"),
-        ("model.loss.terms.kl.weight=.inf", "model.loss.terms.kl.weight=inf: must be finite"),
-        ("model.optimizer.lr=-1", "model.optimizer.lr=-1: must be at least 0"),
         ("model.optimizer.adam_betas=[2,2]", "optimizer: "),
         ("data.image_size=50", "data.image_size=50: must be a multiple of 8 "),
         ("seed=3", "seed: no setting of a run's model or data"),
@@ -203,23 +190,21 @@ def test_changes_are_held_to_what_fit_takes(run, change, said):
         configuration(run, change)
 
 
-@pytest.mark.parametrize("value", ["${oc.env:HOME}", "${hydra:runtime.cwd}", "${data.root}", "a ${x}"])
+@pytest.mark.parametrize("value", ["${oc.env:HOME}", "a ${x}"])
 def test_resolvers_and_references_are_refused(run, value):
     name(run, value, "model.background")
     with pytest.raises(WeightsError, match=re.escape(f"{value} refers to something else")):
         configuration(run, trust=True)
 
 
-@pytest.mark.parametrize("text", ["", "[1]", "model: 3", "{", "model: {}", "!!python/object/apply:os.getcwd []"])
+@pytest.mark.parametrize("text", ["", "[1]", "model: 3", "{", "!!python/object/apply:os.getcwd []"])
 def test_what_is_no_configuration_is_refused(run, text):
     (run / "config.yaml").write_text(text)
     with pytest.raises(WeightsError, match=r"config\.yaml: not "):
         configuration(run)
 
 
-@pytest.mark.parametrize(
-    "verb", ["test", "test evaluation=hidden_modes", "report samplers", "report views", "data latents"]
-)
+@pytest.mark.parametrize("verb", ["test", "report samplers", "data latents"])
 def test_no_verb_runs_what_a_run_names(command, run, elsewhere, monkeypatch, tmp_path, verb):
     monkeypatch.chdir(elsewhere)  # `command` works in the folder that holds the run
     torch.save(Payload(tmp_path / "sprung"), tmp_path / "payload")

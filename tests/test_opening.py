@@ -1,4 +1,4 @@
-"""Folders of weights: which one is meant, and whether it is whole."""
+"""Names of weights: which file is meant, and whether it is whole."""
 
 import shutil
 import subprocess
@@ -8,7 +8,8 @@ import pytest
 from completesplat import weights
 from completesplat.errors import WeightsError
 from completesplat.generator import CompleteSplat
-from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, in_the_box, weights_folder, write_sums
+from completesplat.opening import locate
+from completesplat.weights import CONFIG_FILE, SUMS_FILE, WEIGHTS_FILE, shipped, write_sums
 
 
 @pytest.fixture
@@ -16,43 +17,43 @@ def folder(tiny_weights, tmp_path):
     return shutil.copytree(tiny_weights, tmp_path / "copy")
 
 
-def test_the_sums_are_those_of_sha256sum(folder):
+def test_checksums_are_those_of_sha256sum(folder):
     checked = subprocess.run(["sha256sum", "--check", SUMS_FILE], cwd=folder, capture_output=True, text=True)
     assert checked.returncode == 0
     assert checked.stdout.splitlines() == [f"{CONFIG_FILE}: OK", f"{WEIGHTS_FILE}: OK"]
 
 
-def test_one_flipped_bit_is_refused_until_the_sums_say_so(folder):
+def test_a_flipped_bit_is_refused_until_the_checksums_are_rewritten(folder):
     content = bytearray((folder / WEIGHTS_FILE).read_bytes())
     content[len(content) // 2] ^= 1
     (folder / WEIGHTS_FILE).write_bytes(content)
     with pytest.raises(WeightsError, match=rf"{WEIGHTS_FILE}: damaged or changed.*remove {SUMS_FILE}"):
         CompleteSplat.from_pretrained(folder)
     write_sums(folder)
-    assert weights_folder(folder) == folder
+    assert locate(folder) == folder / WEIGHTS_FILE
 
 
 @pytest.mark.parametrize("left", [0, 1])
-def test_sums_that_do_not_cover_both_files_are_refused_and_none_are_fine(folder, left):
+def test_checksums_must_cover_both_files_or_be_missing(folder, left):
     sums = folder / SUMS_FILE
     sums.write_text("".join(sums.read_text().splitlines(keepends=True)[:left]))
     with pytest.raises(WeightsError, match=f"is not the one in {SUMS_FILE}"):
-        weights_folder(folder)
+        locate(folder)
     sums.unlink()
-    assert weights_folder(folder) == folder
+    assert locate(folder) == folder / WEIGHTS_FILE
 
 
-def test_names_of_the_box_are_found_and_listed(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "BOX", tmp_path)
-    assert in_the_box() == ["copy"]
-    assert weights_folder("copy") == tmp_path / "copy"
+def test_shipped_weights_are_named_first(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path)
+    assert list(shipped()) == ["copy"]
+    assert locate("copy") == tmp_path / "copy" / WEIGHTS_FILE
     # Data may lie in a folder of the same name where somebody works.
     monkeypatch.chdir(tmp_path / "copy")
     (tmp_path / "copy" / "copy").mkdir()
-    assert weights_folder("copy") == tmp_path / "copy"
+    assert locate("copy") == tmp_path / "copy" / WEIGHTS_FILE
     assert CompleteSplat.from_pretrained(".").image_size
     with pytest.raises(WeightsError, match="nothing_of_this_name: no such folder; with the package come copy"):
-        weights_folder("nothing_of_this_name")
+        locate("nothing_of_this_name")
 
 
 def test_a_hub_repository_in_the_cache_needs_no_network(tiny_weights, tmp_path, monkeypatch):
@@ -65,9 +66,9 @@ def test_a_hub_repository_in_the_cache_needs_no_network(tiny_weights, tmp_path, 
     shutil.copytree(tiny_weights, repository / "snapshots" / commit)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    assert weights_folder("some/splats") == repository / "snapshots" / commit
+    assert locate("some/splats") == repository / "snapshots" / commit / WEIGHTS_FILE
     with pytest.raises(WeightsError, match="other/splats: no folder here, and not to be had from the hub"):
-        weights_folder("other/splats")
+        locate("other/splats")
 
 
 def test_a_name_that_is_too_long_for_a_file_is_refused_in_a_short_line():

@@ -18,9 +18,7 @@ from diffusers import (
     FlowMatchEulerDiscreteScheduler,
     UniPCMultistepScheduler,
 )
-from omegaconf import OmegaConf
-from safetensors import safe_open
-from torch import nn
+from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder
 from completesplat.autoreconstructor.model import VariationalAutoReconstructor
@@ -33,7 +31,7 @@ from completesplat.diffusion.sampling import Sampler
 from completesplat.errors import WeightsError
 from completesplat.settings.schema import Entries, Range, Share, hints_of, refused, shown
 from completesplat.splatter_image import Parameterization
-from completesplat.weights import CONFIG_FILE, RUN_CONFIG_FILE, SCENES, read_small
+from completesplat.weights import read_small
 
 # The classes that each setting may name, for settings that are parts of a model.
 PARTS: dict[str, tuple[type, ...]] = {
@@ -49,15 +47,11 @@ PARTS: dict[str, tuple[type, ...]] = {
     "scheduler": (DDIMScheduler, DPMSolverMultistepScheduler, FlowMatchEulerDiscreteScheduler, UniPCMultistepScheduler),
 }
 NETWORKS = ("autoreconstructor", "conditioning", "denoiser", "network")
-# For each Lightning module of a run: the key of the model in its config and of the tensors in its checkpoints.
-STAGES = {
-    "completesplat.training.latent_diffusion.LatentDiffusion": "completesplat",
-    "completesplat.training.reconstruction.ReconstructionModule": "model",
-}
-Part = Mapping[str, Any]
+PartConfig = Mapping[str, object]
+"""Config of a part: `_target_`, and arguments."""
 
 
-class TrainingPictures(TypedDict, total=False):
+class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
     `box_masks`: how often parts of an image were hidden. The others: mean and standard deviation of the training
@@ -69,33 +63,10 @@ class TrainingPictures(TypedDict, total=False):
     picture_std: Annotated[Sequence[Annotated[float, Range(1e-6, 1)]], Entries(8, 8)]
 
 
-class Needed(TypedDict):
-    """Settings of `CompleteSplat` that all weights have."""
-
-    autoreconstructor: Part
-    conditioning: Part
-    denoiser: Part
-    sampler: Part
-    image_size: Annotated[int, Range(8, 1024)]
-
-
-class Architecture(Needed, total=False):
-    """All settings of `CompleteSplat`."""
-
-    training: TrainingPictures
-
-
-class NeededOfOneAnswer(TypedDict):
-    """Settings of `OneAnswer` that all weights have."""
-
-    network: Part
-    image_size: Annotated[int, Range(8, 1024)]
-
-
-class OneAnswerArchitecture(NeededOfOneAnswer, total=False):
-    """All settings of `OneAnswer`."""
-
-    training: TrainingPictures
+# Settings of models: those of `CompleteSplat`, and those of `OneAnswer`. All but `training` are needed.
+COMMON = {"image_size": Annotated[int, Range(8, 1024)], "training": TrainingImages}
+DRAWING = dict.fromkeys(("autoreconstructor", "conditioning", "denoiser", "sampler"), PartConfig) | COMMON
+ONE_ANSWER = {"network": PartConfig} | COMMON
 
 
 class SchedulerSettings(TypedDict, total=False):
@@ -150,57 +121,18 @@ def settings_of(kind: Any) -> dict[str, Any]:
     return hints | dict.fromkeys(hints.keys() & {"pretrained"}, NoneType)
 
 
-def read_architecture(folder: Path) -> dict[str, Any]:
-    """Read the config in a folder of weights.
+def read_architecture(path: Path) -> dict[str, Any]:
+    """Read the `config.json` of weights.
 
     Raises:
         WeightsError: the config cannot be read, or `check_architecture` refuses it.
     """
-    path = folder / CONFIG_FILE
     try:
         architecture: dict[str, Any] = json.loads(read_small(path))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as JSON ({error})") from error
-    try:
-        check_architecture(architecture)
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from error
+    check_architecture(architecture, path)
     return architecture
-
-
-def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
-    """Return a run's model config, from `config.yaml` beside the checkpoint's folder, and its tensors' prefix.
-
-    Raises:
-        WeightsError: the config cannot be read, its model makes no scene from an image, or as `check_architecture`.
-    """
-    run = checkpoint.absolute().parent.parent
-    path = run / RUN_CONFIG_FILE
-    if not path.is_file():
-        raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
-    try:
-        config: Any = OmegaConf.to_container(OmegaConf.create(read_small(path)), resolve=False)
-        model, image_size = config["model"], config["data"]["image_size"]
-        target = str(model["_target_"])
-    except WeightsError:
-        raise
-    except Exception as error:  # raised by YAML or OmegaConf, or because it is no mapping
-        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
-    if target not in STAGES:
-        reason = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
-        fitted = f"; those that it fitted are in {run / SCENES}" if (run / SCENES).is_dir() else ""
-        raise WeightsError(f"{path} names {shown(target)}: {reason}{fitted}")
-    part = model.get(STAGES[target])
-    if STAGES[target] == "model":
-        architecture: dict[str, Any] = {"network": untrained(part), "image_size": image_size}
-    else:
-        settings = part if isinstance(part, Mapping) else {}
-        architecture = {name: untrained(x) for name, x in settings.items() if name not in ("_target_", "_recursive_")}
-    try:
-        check_architecture(architecture)
-    except WeightsError as error:
-        raise WeightsError(f"{path}: {error}") from error
-    return architecture, f"{STAGES[target]}."
 
 
 def untrained(part: Any) -> Any:
@@ -210,21 +142,23 @@ def untrained(part: Any) -> Any:
     return {key: None if key == "pretrained" else value for key, value in part.items()}
 
 
-def check_architecture(architecture: Any) -> None:
+def check_architecture(architecture: object, file: Path | None = None) -> None:
     """Check a config against `PARTS`, the signatures of these classes, and the bounds in their annotations.
 
     Raises:
-        WeightsError: a setting does not fit; the message names the first one.
+        WeightsError: a setting does not fit; the message names the file, if it is given, and the first such setting.
     """
-    one_answer = isinstance(architecture, Mapping) and "network" in architecture
-    hints = hints_of(OneAnswerArchitecture if one_answer else Architecture)
-    needed = (NeededOfOneAnswer if one_answer else Needed).__required_keys__
-    if not isinstance(architecture, Mapping) or not needed <= architecture.keys() <= hints.keys():
-        raise WeightsError(f"a model's settings are {', '.join(hints)}")
-    _check_settings("", hints, architecture)
+    settings = architecture if isinstance(architecture, Mapping) else {}
+    hints = ONE_ANSWER if "network" in settings else DRAWING
+    try:
+        if not hints.keys() - {"training"} <= settings.keys() <= hints.keys():
+            raise WeightsError(f"a model's settings are {', '.join(hints)}")
+        _check_settings("", hints, settings)
+    except WeightsError as error:
+        raise (error if file is None else WeightsError(f"{file}: {error}")) from None
 
 
-def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str, object]) -> None:
     for name, value in settings.items():
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
@@ -237,7 +171,7 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
             raise WeightsError(f"{key}={shown(value)}: {refusals[0].reason}")
 
 
-def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
+def _check_part(place: str, part: object, allowed: Sequence[type]) -> None:
     target = part.get("_target_") if isinstance(part, Mapping) else part
     kinds = [kind for kind in allowed if name_of(kind) == target]
     if not kinds or not isinstance(part, Mapping):
@@ -247,14 +181,14 @@ def _check_part(place: str, part: Any, allowed: Sequence[type]) -> None:
     _check_settings(place, settings_of(kinds[0]), settings)
 
 
-def build(part: Part) -> Any:
+def build(part: PartConfig) -> Any:
     """Build a part, and the parts in it, from a config that `check_architecture` has accepted."""
     settings = {name: build(value) if isinstance(value, Mapping) else value for name, value in part.items()}
-    return CLASSES[settings.pop("_target_")](**settings)
+    return CLASSES[str(settings.pop("_target_"))](**settings)
 
 
-def check_sizes(architecture: Mapping[str, Any], held: Mapping[str, Sequence[int]], files: tuple[str, str]) -> None:
-    """Compare the networks' tensors with the sizes `held`; `files` names the tensors' file and the config's.
+def check_sizes(architecture: Mapping[str, Any], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:
+    """Compare the networks' tensors with those in a file; `files` names the tensors' file and the config's.
 
     Raises:
         WeightsError: a tensor is missing, or has another size.
@@ -262,13 +196,6 @@ def check_sizes(architecture: Mapping[str, Any], held: Mapping[str, Sequence[int
     with torch.device("meta"):  # tensors with sizes but without memory
         networks = nn.ModuleDict({name: build(architecture[name]) for name in NETWORKS if name in architecture})
     for name, value in networks.state_dict().items():
-        stored = held.get(name)
-        if stored is None or list(stored) != list(value.shape):
-            actual = "missing" if stored is None else list(stored)
+        actual = list(tensors[name].shape) if name in tensors else "missing"
+        if actual != list(value.shape):
             raise WeightsError(f"{name} is {actual} in {files[0]} and {list(value.shape)} by {files[1]}")
-
-
-def sizes_in(file: Path) -> dict[str, list[int]]:
-    """Return the sizes of the tensors in a `safetensors` file, of which only the header is read."""
-    with safe_open(file, "pt") as tensors:
-        return {name: tensors.get_slice(name).get_shape() for name in tensors.keys()}  # noqa: SIM118

@@ -9,18 +9,19 @@ from support import strict_json
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.generator import CompleteSplat
 from completesplat.metrics.images import psnr
+from completesplat.opening import locate
 from completesplat.rasterizers.tiled import TiledRasterizer
 from completesplat.training.stage import copy_reference, repeat_image
-from completesplat.weights import BOX, SUMS_FILE, in_the_box, weights_folder
+from completesplat.weights import SHIPPED, SUMS_FILE, shipped
 
 NAME = "toy_objects"
 
 
 def test_they_are_small_and_complete():
-    assert in_the_box() == [NAME]
-    assert sum(path.stat().st_size for path in BOX.rglob("*") if path.is_file()) < 32e6
-    assert (BOX / NAME / SUMS_FILE).is_file()
-    assert weights_folder(NAME) == BOX / NAME
+    assert list(shipped()) == [NAME]
+    assert sum(path.stat().st_size for path in SHIPPED.rglob("*") if path.is_file()) < 32e6
+    assert (SHIPPED / NAME / SUMS_FILE).is_file()
+    assert locate(NAME).parent == SHIPPED / NAME
 
 
 def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
@@ -34,7 +35,7 @@ def test_samples_fit_the_picture_they_are_drawn_for(tmp_path, monkeypatch):
     model, truth = CompleteSplat.from_pretrained(NAME), scenes.all_views()
     given = scenes.reference.images, scenes.reference.cameras, scenes.depth_range
     with torch.no_grad():
-        images = TiledRasterizer()(model.generate(*given, steps=10), truth.cameras).over(0.5)
+        images = TiledRasterizer()(model.generate(*given, steps=5), truth.cameras).over(0.5)
     drawn, mean, copied = (
         psnr(other.flatten(0, 1).clamp(0, 1), truth.images.flatten(0, 1)).unflatten(0, truth.images.shape[:2])
         for other in (images, repeat_image(data.mean_image(), scenes), copy_reference(scenes))

@@ -1,0 +1,303 @@
+"""The door for models: what a name of weights means, and what may pass before anything is built (SECURITY.md).
+
+Weights may name only the parts in `parts`. Configs of runs may name all parts of models and data in `conf/`, and the
+user's modules if the run is trusted (`check_names`).
+"""
+
+import os
+import re
+import sysconfig
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hydra.utils import get_object
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from safetensors.torch import load_file
+from torch import Tensor
+from yaml import YAMLError
+
+from completesplat.baselines.splatter_image.files import find, is_published
+from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.files import printable
+from completesplat.opening.parts import check_architecture, check_sizes, read_architecture, untrained
+from completesplat.scene_model import camera_tensors
+from completesplat.settings.checks import check_image_size, check_optimizer, check_parts
+from completesplat.settings.options import conf_folder
+from completesplat.settings.schema import check_value, shown
+from completesplat.weights import (
+    CAMERA,
+    CONFIG_FILE,
+    RUN_CHECKPOINT,
+    RUN_CONFIG_FILE,
+    RUN_WEIGHTS,
+    SCENES,
+    WEIGHTS_FILE,
+    check_folder,
+    first_line,
+    from_hub,
+    read_small,
+    shipped,
+)
+from completesplat.weights.checkpoint_reading import read_checkpoint
+
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+SECTIONS = ["model", "data"]
+"""Sections of a run's config that are read."""
+ONLY_FOR_TRAINING = (
+    "model.autoreconstructor_checkpoint",
+    "model.checkpoint",
+    "model.model.pretrained",
+    "model.completesplat.autoreconstructor.pretrained",
+    "model.completesplat.conditioning.pretrained",
+    "model.loss.terms.lpips",
+)
+"""Weights that training reads before its first step or for its loss; a checkpoint holds what became of them."""
+GROUPS = {"ablation", "autoreconstructor", "conditioning", "data", "denoiser", "experiment", "loss", "model"}
+GROUPS |= {"objective", "optimizer", "posterior", "rasterizer", "regressor", "sampler", "schedule"}
+"""Groups of `conf/` that models and data are composed of."""
+TARGET = re.compile(r"_target_: *([\w.]+)")
+OPTIMIZER = re.compile(r"torch\.optim\.[A-Z]\w*")
+# For each stage of a run: the key of the model in its config and of the tensors in its checkpoints.
+STAGES = {
+    "completesplat.training.latent_diffusion.LatentDiffusion": "completesplat",
+    "completesplat.training.reconstruction.ReconstructionModule": "model",
+}
+
+
+class SavedModel(NamedTuple):
+    """Checked config of a model, and its tensors by name."""
+
+    architecture: dict[str, Any]
+    tensors: Mapping[str, Tensor]
+
+
+def locate(weights: Path | str) -> Path:
+    """Return the file of tensors that `weights` means.
+
+    Args:
+        weights: a name of shipped weights, a folder of weights or of a run, a checkpoint, an id on the Hugging Face
+            hub, or published weights of Splatter Image (`is_published`). A run means its final weights, or before they
+            exist its newest checkpoint, even if there is none yet.
+
+    Raises:
+        WeightsError: there is no such folder, files are missing, or one has another checksum.
+    """
+    name, path = str(weights), Path(weights).expanduser()
+    if is_published(weights):
+        return find(name).weights
+    if name in shipped():
+        path = shipped()[name]
+    elif not os.path.exists(path):  # `Path.exists` raises if a name is too long
+        if HUB_ID.fullmatch(name) is None:
+            included = ", ".join(shipped()) or "no weights"
+            raise WeightsError(f"{printable(name)}: no such folder; with the package come {included}")
+        path = from_hub(name)
+    elif path.is_file() and path.name != WEIGHTS_FILE:
+        return path
+    elif path.is_file():
+        path = path.parent
+    elif not (path / CONFIG_FILE).is_file():
+        if (path / RUN_WEIGHTS / CONFIG_FILE).is_file():
+            path /= RUN_WEIGHTS
+        elif (path / RUN_CONFIG_FILE).is_file():
+            return path / RUN_CHECKPOINT
+    check_folder(path)
+    return path / WEIGHTS_FILE
+
+
+def read_saved(file: Path) -> SavedModel:
+    """Read the model of a file from `locate`, unless it is Splatter Image's; averaged weights if a run averages them.
+
+    Raises:
+        WeightsError: the config or the tensors cannot be read, name parts that weights may not name, or do not belong
+            together; or the run's model makes no scene from a photo.
+    """
+    if file.name == WEIGHTS_FILE:
+        architecture, tensors = read_architecture(file.with_name(CONFIG_FILE)), load_file(file)
+        check_sizes(architecture, tensors, (WEIGHTS_FILE, CONFIG_FILE))
+        return SavedModel(architecture, tensors)
+    architecture, prefix = architecture_of_run(file)
+    contents = read_checkpoint(file)
+    one_answer = "network" in architecture
+    name = "network." if one_answer else ""
+    tensors = {name + k.removeprefix(prefix): x for k, x in contents["state_dict"].items() if k.startswith(prefix)}
+    check_sizes(architecture, tensors, (file.name, RUN_CONFIG_FILE))
+    return SavedModel(architecture, tensors | camera_tensors(contents.get(CAMERA, {})) if one_answer else tensors)
+
+
+def config_of_run(checkpoint: Path, overrides: list[str], trust: bool = False) -> Any:
+    """Return model and data of the config saved beside a checkpoint's folder, with changes that `fit` accepts.
+
+    The file may come from anyone (`check_names`); the changes may name anything.
+
+    Raises:
+        WeightsError: the checkpoint or its config is missing or not readable, or the config names something else.
+        CompleteSplatError: the changes cannot be read, or `fit` would refuse them, too.
+    """
+    if not checkpoint.is_file():
+        raise WeightsError(f"{checkpoint}: no such checkpoint")
+    path, config = _read(checkpoint)
+    check_names(_plain(config), path, path.resolve().parent, trust)
+    return without_training(_changed(config, overrides))
+
+
+def architecture_of_run(checkpoint: Path) -> tuple[dict[str, Any], str]:
+    """Return the config of a run's model, and the prefix of its tensors in the run's checkpoints.
+
+    Raises:
+        WeightsError: the config cannot be read, its model makes no scene from an image, or as `check_architecture`.
+    """
+    path, config = _read(checkpoint)
+    plain = _plain(config)
+    model, target = plain["model"], str(plain["model"].get("_target_"))
+    if target not in STAGES:
+        reason = f"a run of {shown(target).rpartition('.')[2]} makes no scene of a photograph"
+        fitted = path.parent / SCENES
+        advice = f"; those that it fitted are in {fitted}" if fitted.is_dir() else ""
+        raise WeightsError(f"{path} names {shown(target)}: {reason}{advice}")
+    part = model.get(STAGES[target])
+    if STAGES[target] == "model":
+        architecture = {"network": untrained(part), "image_size": plain["data"].get("image_size")}
+    else:
+        settings = part if isinstance(part, Mapping) else {}
+        architecture = {key: untrained(x) for key, x in settings.items() if key not in ("_target_", "_recursive_")}
+    check_architecture(architecture, path)
+    return architecture, f"{STAGES[target]}."
+
+
+def _read(checkpoint: Path) -> tuple[Path, Any]:
+    """Return the path of the config of a checkpoint's run, and the config's model and data."""
+    path = checkpoint.absolute().parent.parent / RUN_CONFIG_FILE
+    if not path.is_file():
+        raise WeightsError(f"{checkpoint}: the run's configuration {path} is missing")
+    try:
+        config = OmegaConf.masked_copy(OmegaConf.create(read_small(path)), SECTIONS)  # type: ignore[arg-type]
+    except WeightsError:
+        raise
+    except Exception as error:  # of YAML and of OmegaConf
+        raise WeightsError(f"{path}: not a run's configuration ({type(error).__name__})") from error
+    if not all(isinstance(_plain(config).get(section), Mapping) for section in SECTIONS):
+        raise WeightsError(f"{path}: not the configuration of a run of fit, which has {' and '.join(SECTIONS)}")
+    return path, config
+
+
+def _plain(config: object) -> dict[str, Any]:
+    """Return a config as plain containers, with its references to other settings as they are written."""
+    plain: Any = OmegaConf.to_container(config, resolve=False)
+    return dict(plain)
+
+
+def _changed(config: Any, overrides: list[str]) -> Any:
+    try:
+        changes = OmegaConf.from_dotlist(overrides)
+        if others := [str(key) for key in changes if key not in SECTIONS]:
+            raise CompleteSplatError(f"{others[0]}: no setting of a run's model or data, which overrides= changes")
+        changed: Any = OmegaConf.merge(config, changes)
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise CompleteSplatError(f"overrides={overrides}: cannot be applied: {first_line(error)}") from error
+    for section in SECTIONS:
+        check_value(section, Mapping[str, object], changed[section])
+    if overrides:
+        check_parts(changed)
+        check_image_size(changed)
+        check_optimizer(changed.model.get("optimizer"))
+    return changed
+
+
+def without_training(config: Any) -> Any:
+    """Remove from a config what only training needs: other weights (`ONLY_FOR_TRAINING`), and a GPU.
+
+    Where there is a GPU, `rasterizer=auto` is the same as `cuda`.
+    """
+    for key in ONLY_FOR_TRAINING:
+        parent, _, name = key.rpartition(".")
+        if name in list(OmegaConf.select(config, parent) or ()):  # also where its value is missing
+            OmegaConf.update(config, key, None)
+    for place in ("model.rasterizer", "model.rasterizer.rasterizer"):
+        if OmegaConf.select(config, f"{place}._target_") == "completesplat.rasterizers.selection.cuda":
+            OmegaConf.update(config, f"{place}._target_", "completesplat.rasterizers.selection.auto")
+    return config
+
+
+def check_names(config: object, source: Path, run: Path, trust: bool) -> None:
+    """Refuse a config of the file `source` that names anything but parts of models and data, which may be the user's.
+
+    It may name what `conf/` names for models and data, or an optimizer of torch. Where the run is trusted, or belongs
+    to the user, it may also name the user's modules, such as those in the working folder.
+
+    Args:
+        run: the run's folder, without links. It is the user's if the user owns it and `source`, and it lies below the
+            working folder.
+
+    Raises:
+        WeightsError: the config names something else.
+    """
+    for name, value in _strings(config):
+        # `fit` writes what it has resolved; a resolver can read the environment and more.
+        if "${" in value:
+            refusal = f"{source}: {shown(value)} refers to something else"
+            raise WeightsError(f"{refusal}, which a run's configuration does not")
+        if name != "_target_" or value in _known_names() or OPTIMIZER.fullmatch(value):
+            continue
+        refusal = f"{source} names {shown(value)}, which is no part of models or data in this package"
+        if not trust and not _belongs_to_user(source, run):
+            raise WeightsError(f"{refusal}; if it is a module of your own, and you trust who made the run: trust=true")
+        if not _is_users_module(value):
+            raise WeightsError(f"{refusal}, and not defined in a module of your own (SECURITY.md)")
+
+
+@cache
+def _known_names() -> set[str]:
+    """Return the names of all parts of models and data in `conf/`."""
+    files = [file for group in GROUPS for file in (conf_folder() / group).glob("*.yaml")]
+    return {name for file in files for name in TARGET.findall(file.read_text())}
+
+
+def _strings(config: object, name: object = "") -> Iterator[tuple[object, str]]:
+    """Yield all keys and values as text, each with the name of the setting that it belongs to."""
+    if isinstance(config, Mapping):
+        for key, value in config.items():
+            yield name, str(key)
+            yield from _strings(value, key)
+    elif isinstance(config, list):
+        for value in config:
+            yield from _strings(value, name)
+    else:
+        yield name, str(config)
+
+
+def _belongs_to_user(file: Path, run: Path) -> bool:
+    """Whether a run lies below the working folder and is the user's, who has then made or brought it there.
+
+    In the run's folder itself, modules that came with it would count as the user's.
+    """
+    return Path.cwd() in run.parents and {run.stat().st_uid, file.stat().st_uid} == {os.getuid()}
+
+
+def _is_users_module(target: str) -> bool:
+    """Whether the target is defined in a module that is neither this package's nor of Python's installation."""
+    top = target.partition(".")[0]
+    try:
+        spec = find_spec(top)  # of a name without a dot: nothing is imported
+    except (ImportError, ValueError):
+        return False
+    if spec is None or top == "completesplat":
+        return False
+    places = [spec.origin] if spec.has_location else spec.submodule_search_locations or []
+    if not places or any(_is_installed(Path(str(place)).resolve()) for place in places):
+        return False
+    try:
+        part = get_object(target)
+    except (ImportError, ValueError) as error:
+        raise WeightsError(f"{target}: cannot be imported ({error})") from error
+    # A user's module leads to others, by the names that it imports.
+    return str(getattr(part, "__module__", None)).partition(".")[0] == top
+
+
+def _is_installed(path: Path) -> bool:
+    libraries = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    return not {"site-packages", "dist-packages"}.isdisjoint(path.parts) or not libraries.isdisjoint(path.parents)
