@@ -55,7 +55,7 @@ class TrainingImages(TypedDict, total=False):
     """Facts about the training images that are stored with weights; older weights have none.
 
     `box_masks`: how often parts of an image were hidden. The others: mean and standard deviation of the training
-    images' features, see `completesplat.data.images.photograph.picture_features`.
+    images' features, see `completesplat.data.images.photograph.image_features`.
     """
 
     box_masks: Share
