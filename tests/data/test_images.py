@@ -191,8 +191,8 @@ BAD: dict[str, tuple[bytes, str, str]] = {
     "transparent_palette_entry": (saved(Image.fromarray(LARGE).quantize(16), transparency=0), "RGB", "transparent"),
     "coloured_mask": (saved(LARGE), "L", "has colours"),
     "float_tiff": (saved(LARGE_GREY.astype(np.float32) / 255, "TIFF"), "RGB", "colour mode F"),
-    "other_size": (saved(LARGE[:23]), "RGB", "has 23 x 32 pixels, its annotation says 24 x 32"),
-    "annotated_before_rotation": (saved(LARGE, orientation=6), "RGB", "before it is turned as its EXIF orientation 6"),
+    "other_size": (saved(LARGE[:23]), "RGB", "has 23 x 32 pixels when upright, its annotation says 24 x 32"),
+    "annotated_before_rotation": (saved(LARGE, orientation=6), "RGB", "has 32 x 24 pixels when upright"),
 }  # fmt: skip
 
 

@@ -72,7 +72,7 @@ def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
     [
         ({"test0": {**PAIR, "overlap": 0.5}}, "test0: neither null"),
         ({"test0": 3}, "test0: neither null"),
-        ({"test0": PAIR, "test1": [PAIR]}, "test1: in the format of latentSplat, clips before it in that"),
+        ({"test0": PAIR, "test1": [PAIR]}, "test1: formats of several works: pixelSplat, latentSplat"),
         ({"test0": {"context": [1], "target": [2.5]}}, "test0: context and target must be lists of frame numbers"),
         ({"test0": [{"context": [], "target": [1]}]}, "test0: context and target must be lists of frame numbers"),
         ({"test0": None}, "no clip with views"),
