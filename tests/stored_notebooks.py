@@ -1,4 +1,4 @@
-"""Runs the notebooks from top to bottom and stores them with what they print and draw: `make notebooks`.
+"""Runs the notebooks from top to bottom and stores them with their outputs: `make notebooks`.
 
 A stored notebook has the hash of the code that it ran, for `test_notebooks.py`, and pictures that are small: JPEG, at
 most 1200 pixels wide.
@@ -29,12 +29,12 @@ def code_cells(notebook: Notebook) -> list[dict[str, Any]]:
 
 
 def hash_of(notebook: Notebook) -> str:
-    """Of all code, in order."""
+    """Return the hash of all code, in order."""
     return hashlib.sha256("\0".join("".join(cell["source"]) for cell in code_cells(notebook)).encode()).hexdigest()
 
 
 def jpeg(content: str) -> str:
-    """A picture in base64, in fewer bytes."""
+    """Encode an image in base64 as JPEG."""
     picture = Image.open(io.BytesIO(base64.b64decode(content))).convert("RGB")
     picture.thumbnail((WIDEST, picture.height))
     picture.save(buffer := io.BytesIO(), "JPEG", quality=QUALITY)
@@ -42,7 +42,7 @@ def jpeg(content: str) -> str:
 
 
 def slimmed(notebook: Notebook) -> Notebook:
-    """With small pictures, each stream in one piece, without bars that moved, and with its hash."""
+    """Return a notebook with small images, each stream in one piece, without progress bars, and with its hash."""
     for cell in code_cells(notebook):
         outputs: list[dict[str, Any]] = []
         for output in cell["outputs"]:

@@ -18,7 +18,7 @@ POINT = [("x", "f4"), ("y", "f8"), ("z", "f4"), ("red", "u1"), ("label", "i2")]
 
 
 def written(form: str, elements: list[PlyElement]) -> bytes:
-    """By plyfile, as `ascii`, `<` or `>`."""
+    """Return a file of plyfile, as `ascii`, `<` or `>`."""
     file = io.BytesIO()
     PlyData(elements, text=form == "ascii", byte_order="=" if form == "ascii" else form, comments=["a b"]).write(file)
     return file.getvalue()

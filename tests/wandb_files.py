@@ -11,7 +11,7 @@ from typing import Any
 from support import waited_for
 
 BLOCK, FILE_HEADER, CHUNK_HEADER = 2**15, 7, 7
-TYPES = {"image": "image-file", "histogram": "histogram", "table": "table-file", "video": "videos"}
+TYPES = {"image": "image-file"}
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,6 @@ class OfflineRun:
     def merged(self) -> dict[str, Any]:
         """The last value of each key."""
         return {key: value for row in self.history for key, value in row.items()}
-
-    def table(self, name: str) -> tuple[list[dict[str, Any]], dict[str, Path]]:
-        """The rows of a table, and the files that they show by their paths in it."""
-        artifacts = [r.artifact for r in self.records if r.WhichOneof("record_type") == "artifact"]
-        contents = [{c.path: Path(c.local_path) for c in artifact.manifest.contents} for artifact in artifacts]
-        (files,) = (paths for paths in contents if f"{name}.table.json" in paths)
-        content = json.loads(files[f"{name}.table.json"].read_text())
-        return [dict(zip(content["columns"], row, strict=True)) for row in content["data"]], files
 
 
 def offline_runs(out: Path) -> list[OfflineRun]:

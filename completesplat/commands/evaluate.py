@@ -1,13 +1,14 @@
 """`completesplat test`: score a trained model's images against true ones, and its samples against hidden modes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypedDict, cast
+from typing import Annotated, Any, TypedDict
 
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
+from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import track
@@ -21,10 +22,10 @@ from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.packed.manifest import is_packed, settings_must_match
 from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import Column, evaluation_table, show, table
-from completesplat.results.wandb import begin, finished, log_modes, log_test
 from completesplat.settings.schema import Natural, Positive, Range
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
+from completesplat.training.wandb import wandb_runs
 
 
 def scored_data(run_config: DictConfig, evaluation: Mapping[str, Any]) -> SceneDataModule:
@@ -93,22 +94,16 @@ def run(
     set_scoring(module, evaluation)
     loggers = list(instantiate(logger or {}, _convert_="all").values())
     tester: Trainer = instantiate(trainer, precision=evaluation["precision"], logger=loggers, _convert_="all")
-    with finished(loggers):
-        scenes = begin(module, tester, _config_of(out), out)
+    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
         tester.test(module, datamodule=data, verbose=False)
         results = module.test_results()
         if not tester.is_global_zero:
             return
         described = protocol(evaluation, module, data, results, out) | tested.facts()
         write_json(out / METRICS, {"protocol": described} | results)
-        log_test(results, scenes, tester)
     show(evaluation_table(results))
     for name, reason in described["missing"].items():
         print(f"{name}: {reason}")
-
-
-def _config_of(out: Path) -> DictConfig:
-    return cast(DictConfig, OmegaConf.load(out / CONFIG))
 
 
 class HiddenModesEvaluation(TypedDict):
@@ -138,7 +133,7 @@ def run_hidden_modes(
     logger: Mapping[str, Any] | None,
     out: Path,
 ) -> None:
-    """Write JSON files of hidden modes, shares, calibration and protocol, draw `hidden_modes.png`, print the table.
+    """Write JSON files of hidden modes, shares and protocol, draw `hidden_modes.png`, and print the table.
 
     Args:
         trainer: only its `accelerator` has an effect; "cpu" leaves a GPU alone.
@@ -173,18 +168,29 @@ def run_hidden_modes(
     used = {"scenes": measured.names, "skipped": skipped}
     write_json(out / "protocol.json", _hidden_modes_protocol(tested, evaluation, module, data, used, out))
     draw(measured, samples, out / "hidden_modes.png")
-    loggers = list(instantiate(logger or {}, _convert_="all").values())
-    with finished(loggers):
-        log_modes(results, out / "hidden_modes.png", _config_of(out), loggers)
+    _log_modes(results, list(instantiate(logger or {}, _convert_="all").values()), out)
     title = "Hidden modes (best: coverage 1, the others 0; draws of the truth: true_sampler)"
     Console(width=140).print(table(title, COLUMNS, [{"method": name, **values} for name, values in results.items()]))
     if skipped:
         print(f"{len(skipped)} scenes skipped; the first: {skipped[0]}")
 
 
+def _log_modes(results: Mapping[str, Mapping[str, float]], loggers: Sequence[Logger], out: Path) -> None:
+    scores = {f"hidden_modes/{method}/{name}": x for method, values in results.items() for name, x in values.items()}
+    with wandb_runs(loggers, OmegaConf.load(out / CONFIG)):
+        for logger in loggers:
+            logger.log_metrics(scores, step=0)
+            logger.save()
+
+
 def _hidden_modes_protocol(
-    tested: Trained, evaluation: Mapping[str, Any], module: Stage, data: Any, scenes: dict[str, list[str]], out: Path
-) -> dict[str, Any]:
+    tested: Trained,
+    evaluation: HiddenModesEvaluation,
+    module: Stage,
+    data: SceneDataModule,
+    scenes: dict[str, list[str]],
+    out: Path,
+) -> dict[str, object]:
     """Return the record of what was measured and how, with the names of the scenes."""
     return {
         "name": evaluation["name"],
@@ -192,7 +198,7 @@ def _hidden_modes_protocol(
         **data.describe(),
         "image_size": data.image_size,
         **scenes,
-        **{key: evaluation[key] for key in ("samples", "views", "spread_views", "seed")},
+        **{key: value for key, value in evaluation.items() if key in ("samples", "views", "spread_views", "seed")},
         **drawing(module),
         **provenance(data, out),
         **tested.facts(),

@@ -2,7 +2,6 @@
 
 import copy
 import logging
-import math
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,14 @@ from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
-from completesplat.errors import CompleteSplatError, WeightsError
+from completesplat.errors import CompleteSplatError
 from completesplat.results.tables import evaluation_table, show
-from completesplat.results.wandb import begin, finished, log_test
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
 from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
+from completesplat.training.wandb import wandb_runs
 from completesplat.weights import RUN_WEIGHTS
-from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
 
@@ -79,8 +77,8 @@ def run(config: DictConfig, out: Path) -> None:
     if trainer.is_global_zero:
         print(ModelSummary(module, max_depth=2))
         logger.info("batch: %d scenes a step, data.batch_per_process=%d", data.batch_size, share)
-    with finished(loggers):
-        scenes, metrics = begin(module, trainer, config, out), {}
+    metrics = {}
+    with wandb_runs(loggers, config):
         if any(parameter.requires_grad for parameter in module.parameters()):
             trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
             metrics = _logged(trainer)
@@ -94,31 +92,17 @@ def run(config: DictConfig, out: Path) -> None:
         scores = module.test_results() if tested is not None else None  # all processes gather them
         if not trainer.is_global_zero:
             return
-        results: dict[str, Any] = {"steps": trainer.global_step, "epochs": _epochs(trainer)}
-        results |= {"data.batch_per_process": share, **metrics}
+        results: dict[str, object] = {"steps": trainer.global_step, "data.batch_per_process": share, **metrics}
         if scores is not None:
             show(evaluation_table(scores))
             described = protocol(config.evaluation, module, tested, scores, out) | _facts(trainer, out)
             results |= {"upper_bound": module.upper_bound, "test": {"protocol": described} | scores}
         write_json(out / METRICS, results)  # the last file, because it means that the job is done
-        if scores is not None:
-            log_test(scores, scenes, trainer)
 
 
 def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
-    """Return the checkpoint that the run continues from, if any, and remove other weights from the config.
-
-    Raises:
-        WeightsError: the checkpoint is missing or damaged.
-    """
-    if config.ckpt_path == "last":
-        path = newest_whole(out / LAST)
-    else:
-        path = None if config.ckpt_path is None else Path(config.ckpt_path)
-        if path is not None and not path.is_file():
-            raise WeightsError(f"{path}: no such checkpoint")
-        if path is not None:
-            check_whole(path)
+    """Return the checkpoint that the run continues from, if any, and remove other weights from the config."""
+    path = newest_whole(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
     if path is None:
         return None
     for part in (config.autoreconstructor, config.conditioning, config.model):
@@ -133,14 +117,6 @@ def refuse_missing(config: DictConfig) -> None:
     missing += [f"model.{key}" for key in sorted(OTHER_WEIGHTS) if config.model.get(key) == ""]
     for key in missing[:1]:
         raise CompleteSplatError(f"{key} is needed: give {key}={EXAMPLES.get(key.rpartition('.')[2], 'VALUE')}")
-
-
-def _epochs(trainer: Trainer) -> int:
-    """Return the number of begun epochs. (`current_epoch` differs between processes after the last one.)"""
-    if not trainer.global_step:
-        return 0
-    steps_of_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
-    return int(-(-trainer.global_step // steps_of_epoch))
 
 
 def _logged(trainer: Trainer) -> dict[str, float]:

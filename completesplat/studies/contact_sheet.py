@@ -2,18 +2,25 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
+from completesplat.data.loading.training_statistics import world_up
 from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
-from completesplat.studies.frusta import CROSS_COLORS, NEAREST, Cross, drawings, place_cross, visible_segments
+from completesplat.geometry.cameras import Cameras, project, transform_points, unproject
 
 CELL = 216
 GREY, MASK = (190, 190, 190), (255, 220, 0)
@@ -21,6 +28,160 @@ LEGEND = """Images: one cross stands at one place of each scene and must stick t
 red: to the first camera's right, green: up, blue: ahead; yellow: mask.
 Cameras: black: the first, then dark blue to orange with time; the tick is the image's upper edge;
 grey bar: near to far of the first (without a tick: farther); right, up and ahead are the first camera's."""
+
+# In units of half the first image's width, as the first camera sees it.
+ARM = 0.3
+# Root mean squares. The horizon follows from image axes that turn at least this much (radians). Cameras look at one
+# thing if their optical axes spread at least this much and miss their common point by at most this share of its depth.
+LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
+# Share of an arm's length; lines nearer to a camera's plane are not drawn.
+NEAREST = 0.05
+
+
+@dataclass(frozen=True)
+class Cross:
+    """Three arms from one place; rows of `arms`: right, up and ahead."""
+
+    center: Float[Tensor, "3"]
+    arms: Float[Tensor, "3 3"]
+
+    def ends(self) -> Float[Tensor, "3 2 3"]:
+        """Return the two ends of each arm in the world; the first is the centre."""
+        return torch.stack([self.center.expand(3, 3), self.center + self.arms], dim=1)
+
+
+def place_cross(cameras: Cameras, depth_range: Float[Tensor, "2"]) -> Cross:
+    """Place a cross where the optical axes of cameras [view] meet, if they meet in front of all cameras.
+
+    Otherwise place it on the axis of the middle camera, in the middle of the depth range in terms of 1 / depth.
+    """
+    center = _common_point(cameras)
+    if center is None:
+        middle = (len(cameras.centers) - 1) // 2
+        center = cameras.centers[middle] + 2 / (1 / depth_range).sum() * cameras.world_to_camera[middle, 2, :3]
+    depth = transform_points(cameras.world_to_camera[0], center[None])[0, 2].abs()
+    length = ARM * depth * cameras.image_size[1] / 2 / cameras.intrinsics[0, 0, 0]
+    return Cross(center, length * level_axes(cameras))
+
+
+def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
+    """Return unit vectors in the world as rows: the first camera's right, up and ahead, levelled to the world's up.
+
+    If the cameras [view] hardly turn, no horizon follows from them, and up is the mean of their up directions.
+    """
+    right, down, forward = cameras.world_to_camera[:, :3, :3].unbind(dim=1)
+    turn = torch.linalg.svdvals(right)[1:2] / len(right) ** 0.5
+    up = world_up(cameras) if (turn > LEAST_TURN).any() else torch.nn.functional.normalize(-down.mean(dim=0), dim=0)
+    # Ahead is at the upper edge of an image taken straight down, and at the lower edge of one taken straight up.
+    ahead = forward[0] if (forward[0] @ up).abs() < 0.99 else down[0] * (forward[0] @ up).sign()
+    ahead = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
+    return torch.stack([torch.linalg.cross(ahead, up), up, ahead])
+
+
+def visible_segments(
+    camera: Cameras, segments: Float[Tensor, "segment 2 3"], nearest: float
+) -> list[tuple[int, Float[Tensor, "2 2"]]]:
+    """Return number and ends (pixels) of the segments before a camera [], cut off at the depth `nearest`."""
+    _, depths = project(camera, segments.flatten(0, 1))
+    result = []
+    for index, (ends, depth) in enumerate(zip(segments, depths.reshape(-1, 2), strict=True)):
+        if depth.max() <= nearest:
+            continue
+        shares = ((nearest - depth) / (depth.flip(0) - depth)).where(depth < nearest, 0)
+        pixels, _ = project(camera, ends + shares[:, None] * (ends.flip(0) - ends))
+        result.append((index, pixels))
+    return result
+
+
+def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
+    """Return the point nearest to all optical axes, if they pass close to it, from several sides, and face it."""
+    forward, centers = cameras.world_to_camera[:, 2, :3], cameras.centers
+    across = torch.eye(3).to(forward) - forward[:, :, None] * forward[:, None, :]
+    mean = across.mean(dim=0)
+    if torch.linalg.eigvalsh(mean)[0] < LEAST_SPREAD**2:
+        return None
+    point = torch.linalg.solve(mean, (across @ centers[:, :, None]).mean(dim=0)[:, 0])
+    offsets = point - centers
+    depths = (offsets * forward).sum(dim=-1)
+    misses = (across @ offsets[:, :, None]).square().sum(dim=(1, 2))
+    met = (depths > 0).all() and misses.mean().sqrt() < LARGEST_MISS * depths.mean()
+    return point if met else None
+
+
+FRUSTUM = 0.14
+# The depth range is drawn up to this multiple of the extent of everything else.
+REACH = 2.5
+MOST_FRUSTA = 25
+CROSS_COLORS = ((220, 30, 30), (20, 150, 20), (40, 80, 255))
+EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1), (5, 6)]
+VIEWS = {"from above": (0, 2), "from the side": (2, 1)}
+"""Axes (of right, up and ahead) to the right and to the top of each drawing."""
+
+
+def frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
+    """Return apex, corners of the image at this depth, and a tick upwards from the middle of its upper edge."""
+    height, width = cameras.image_size
+    pixels = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0), (width / 2, -height / 5)]
+    places, depths = (torch.tensor(values).to(cameras.intrinsics) for values in (pixels, [depth] * 6))
+    return torch.cat([cameras.centers[:, None], unproject(cameras, places, depths)], dim=1)
+
+
+def drawn_range(sequence: PosedSequence, cross: Cross) -> tuple[Float[Tensor, "2 3"], bool]:
+    """Return the ends of the first camera's depth range, and whether far is beyond the drawings."""
+    cameras, centers = sequence.cameras, sequence.cameras.centers
+    near, far = sequence.depth_ranges[0].tolist()
+    reach = REACH * max(near, _extent(centers), (cross.center - centers[0]).norm().item())
+    depths = torch.tensor([near, min(far, reach)]).to(centers)
+    return centers[0] + depths[:, None] * cameras.world_to_camera[0, 2, :3], far > reach
+
+
+def drawings(sequence: PosedSequence, cross: Cross, side: int) -> dict[str, UInt8[np.ndarray, "side side 3"]]:
+    """Draw cameras, depth range and cross in the units of the scene, as seen in each of `VIEWS`.
+
+    Right, up and ahead are the first camera's, levelled. Colours of cameras tell the time.
+    """
+    axes, centers = level_axes(sequence.cameras), sequence.cameras.centers
+    depth_range, cut = drawn_range(sequence, cross)
+    content = torch.cat([centers, depth_range, cross.ends().flatten(0, 1)])
+    pyramids = frusta(sequence.cameras, FRUSTUM * _extent(content))
+    count = len(centers)
+    chosen = [*range(count - 1, 0, -max(1, math.ceil(count / MOST_FRUSTA))), 0]
+    images = {}
+    for view, plane in VIEWS.items():
+        figure = Figure(figsize=(side / 100, side / 100), dpi=100, layout="constrained")
+        panel = figure.subplots()
+        line = partial(_line, panel, axes[list(plane)])
+        line(centers, "0.8", 1)
+        for index in chosen:
+            color = colormaps["plasma"](0.85 * index / (count - 1)) if index else "k"
+            for edge in EDGES:
+                line(pyramids[index, list(edge)], color, 1)
+            line(centers[[index]], color, 1, "." if index else "o")
+        line(depth_range, "0.67", 3, "" if cut else "|")
+        for arm, color in zip(cross.ends(), CROSS_COLORS, strict=True):
+            line(arm, [value / 255 for value in color], 2)
+        panel.set_aspect("equal", adjustable="datalim")
+        panel.tick_params(labelsize=6)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()  # type: ignore[no-untyped-call]
+        images[view] = np.asarray(canvas.buffer_rgba())[..., :3]  # type: ignore[no-untyped-call]
+    return images
+
+
+def _line(
+    panel: Axes,
+    plane: Float[Tensor, "2 3"],
+    points: Float[Tensor, "_ 3"],
+    color: str | Sequence[float],
+    width: float,
+    marker: str = "",
+) -> None:
+    panel.plot(*(plane @ points.mT).cpu(), color=color, linewidth=width, marker=marker)
+
+
+def _extent(points: Float[Tensor, "_ 3"]) -> float:
+    extent: float = (points.amax(dim=0) - points.amin(dim=0)).max().item()
+    return extent
 
 
 def show(sequences: Sequence[PosedSequence], path: Path, images: int, title: str) -> None:

@@ -150,7 +150,7 @@ class ExponentialMovingAverage(WeightAveraging):
 class Progress(RichProgressBar):
     """Lightning's progress bar over the optimizer steps of the whole run, so that it shows the run's remaining time.
 
-    Without a terminal, it logs a line after every validation. A line at the start shows the validation interval.
+    Without a terminal, it logs a line after every validation.
     """
 
     @property
@@ -158,13 +158,6 @@ class Progress(RichProgressBar):
         """Return the steps of the run, or the batches of an epoch if the run has no number of steps."""
         steps = self.trainer.max_steps
         return steps if steps > 0 else super().total_train_batches
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_train_start(trainer, pl_module)
-        interval = trainer.val_check_batch
-        if trainer.enable_validation and interval is not None and interval != float("inf"):
-            steps = interval // trainer.accumulate_grad_batches
-            logger.info("step %s; validation every %d (trainer.val_check_interval)", _steps(trainer), steps)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.max_steps <= 0 or self.train_progress_bar_id is None:

@@ -86,7 +86,7 @@ class Checkpoints(Checkpoint):
         self.keep_every = keep_every
         self.due = False
         self.signal: int | None = None
-        self.end_of_step: dict[str, Any] | None = None
+        self.end_of_step: dict[str, object] | None = None
         self.figures: dict[str, Tensor] = {}
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

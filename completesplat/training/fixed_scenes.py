@@ -1,10 +1,10 @@
-"""Images of a few fixed scenes while a model trains, and figures of its Gaussians and latents."""
+"""Images of a few fixed scenes while a model trains, and figures of its Gaussians, latents and samples."""
 
 import json
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ from completesplat.export.ply import write_ply
 from completesplat.export.prediction import plain_camera
 from completesplat.files import make_folder, write_text
 from completesplat.gaussians import Gaussians
+from completesplat.metrics.images import psnr
+from completesplat.metrics.scoring import diversity
 from completesplat.rasterizers import Rasterizer, Rendering
 from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Natural, Positive
@@ -119,8 +121,8 @@ def _spread(scene: SceneBatch, views: int) -> list[int]:
 class Pictures(DrawsFixedScenes):
     """Callback that draws the first target of each scene and figures of its Gaussians; see `DrawsFixedScenes`.
 
-    `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/layers_000500.png` the layers of its
-    Splatter Image (`layer_maps`), `folder/newest/` the scenes themselves (`write_newest`). All loggers get
+    `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/newest/` the scenes themselves
+    (`write_newest`). All loggers get
     `gaussians/opacity_p10`, `_p50`, `_p90`, the same percentiles of all `distributions`, figures of the layers on the
     object (`layer_figures`), and the model's `latent_figures`. Weights & Biases gets the images and histograms too.
     """
@@ -135,15 +137,11 @@ class Pictures(DrawsFixedScenes):
             latents = module.latent_figures(batch)
         with torch.autocast(module.device.type, enabled=False):
             panels = scene_panels(module.rasterizer, gaussians, batch, module.background)
-        images = {"step": sheet_of(panels), "layers": sheet_of(layer_maps(gaussians, batch))}
-        for kind, image in images.items():
-            write_png(self.folder / f"{kind}_{trainer.global_step:06}.png", image)
+        sheet = image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
+        write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
         write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
-
-        values = distributions(gaussians)
-        figures = percentiles(values) | layer_figures(gaussians, batch) | latents
-        named = {"pictures": images["step"], "layers": images["layers"]}
-        log_drawings(trainer, figures, named, {f"histograms/{name}": array for name, array in values.items()})
+        figures = percentiles(distributions(gaussians)) | layer_figures(gaussians, batch) | latents
+        log_drawings(trainer, figures, "pictures", sheet)
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
@@ -163,11 +161,6 @@ def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBat
             described.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
     summary = {"step": step, "up": up.tolist(), "scenes": described}
     write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
-
-
-def sheet_of(panels: Mapping[str, Float[Tensor, "batch 3 height width"]]) -> Image.Image:
-    """Draw a sheet with a column for each panel and a row for each scene."""
-    return image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
 
 
 def scene_panels(
@@ -200,31 +193,14 @@ def scene_panels(
     return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
 
 
-def layers_of(gaussians: Gaussians, scenes: SceneBatch) -> Gaussians:
-    """Arrange the Gaussians of a Splatter Image by the reference's pixels: [batch layer height width]."""
-    size = scenes.reference.images.shape[-2:]
-    return gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))
-
-
-def layer_maps(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, Float[Tensor, "batch 3 height width"]]:
-    """Return the input, and depth (one scale for all layers of a scene), opacity and colour of each layer's pixels."""
-    layers = layers_of(gaussians, scenes)
-    depths = torch.stack([color_depth(depth)[0] for depth in layers.means[..., 2].unsqueeze(2)])
-    panels = {"input": scenes.reference.images}
-    for layer in range(depths.shape[1]):
-        panels[f"depth {layer + 1}"] = depths[:, layer]
-        panels[f"opacity {layer + 1}"] = layers.opacities[:, layer, None].expand(-1, 3, -1, -1)
-        panels[f"colour {layer + 1}"] = layers.colors[:, layer].movedim(-1, 1)
-    return {name: panel.clamp(0, 1).nan_to_num() for name, panel in panels.items()}
-
-
 def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     """Return each layer's mean opacity on the object, and mean distance behind the first layer.
 
     Keys are `layers/opacity_1`, ... and `layers/behind_2`, ... (in scene units along the reference's optical axis). A
     layer whose opacity goes to zero is dead: it shows nothing of what is hidden.
     """
-    layers, on_object = layers_of(gaussians, scenes), scenes.reference.masks[:, 0]
+    size, on_object = scenes.reference.images.shape[-2:], scenes.reference.masks[:, 0]
+    layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
     figures = {}
     for layer in range(layers.opacities.shape[1]):
         behind = layers.means[:, layer, ..., 2] - layers.means[:, 0, ..., 2]
@@ -250,19 +226,81 @@ def percentiles(values: Mapping[str, Float[np.ndarray, " _"]]) -> dict[str, floa
     return {f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for (name, array), p in pairs}
 
 
-def log_drawings(
-    trainer: Trainer,
-    figures: dict[str, float],
-    images: Mapping[str, Image.Image],
-    histograms: Mapping[str, Float[np.ndarray, " _"]],
-) -> None:
-    """Log figures to all loggers, and images and histograms to Weights & Biases."""
+def log_drawings(trainer: Trainer, figures: dict[str, float], name: str, image: Image.Image) -> None:
+    """Log figures to all loggers, and an image to Weights & Biases."""
     step = trainer.global_step - 1  # Lightning's step of a row is the number of optimizer steps before it
     for logger in trainer.loggers:
         logger.log_metrics(figures, step=step)
         if isinstance(logger, WandbLogger):
             import wandb
 
-            media: dict[str, Any] = {name: wandb.Histogram(values.tolist()) for name, values in histograms.items()}
-            media |= {name: wandb.Image(image) for name, image in images.items()}
+            media: dict[str, Any] = {name: wandb.Image(image)}
             logger.log_metrics(media, step=step)
+
+
+class Samples(DrawsFixedScenes):
+    """Callback that draws samples of each scene from its reference and target views; see `DrawsFixedScenes`.
+
+    `folder/step_000500.png` has rows for each scene: true images (the input first), each sample, and the depth of the
+    first sample. All loggers get metrics of the target views: `samples/diversity` (of two samples or more),
+    `samples/psnr` (mean over the samples) and `samples/psnr_of_mean` (of their mean image).
+
+    Args:
+        samples: samples of a scene, always from the same noise.
+    """
+
+    def __init__(
+        self,
+        folder: str,
+        every_n_steps: Positive = 2000,
+        scenes: Natural = 2,
+        samples: Positive = 4,
+        views: Positive = 8,
+    ) -> None:
+        super().__init__(folder, every_n_steps, scenes, views)
+        self.samples = samples
+
+    def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
+        drawn = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
+        sheet = samples_sheet(drawn)
+        write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
+        scores = [scene.scores() for scene in drawn]
+        figures = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+        log_drawings(trainer, figures, "samples", sheet)
+
+    def _draw_scene(self, trainer: Trainer, module: Stage, scene: SceneBatch) -> "SceneDrawings":
+        views = scene.all_views()
+        with trainer.precision_plugin.forward_context():
+            gaussians = module.draw(scene, [0], self.samples)
+        rendering = module.render_from(gaussians, views.cameras[0])
+        images = rendering.over(module.background).clamp(0, 1)
+        return SceneDrawings(views.images[0], images, rendering.expected_depth()[:1])
+
+
+@dataclass(frozen=True)
+class SceneDrawings:
+    """True images and renders of one scene, the reference view first."""
+
+    true: Float[Tensor, "view 3 height width"]
+    samples: Float[Tensor, "sample view 3 height width"]
+    depth: Float[Tensor, "1 view 1 height width"]
+
+    def scores(self) -> dict[str, float]:
+        """Score the target views."""
+        images, true = self.samples[:, 1:], self.true[1:]
+        scores = {
+            "psnr": psnr(images.flatten(0, 1), true.expand_as(images).flatten(0, 1)).mean().item(),
+            "psnr_of_mean": psnr(images.mean(0), true).mean().item(),
+        }
+        return scores | {"diversity": diversity(images)} if len(images) > 1 else scores
+
+
+def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
+    """Draw a sheet with a column for each view; views that a scene lacks stay white."""
+    rows: list[list[SheetCell | None]] = []
+    for scene in drawn:
+        labelled = {"true": scene.true, **{f"sample {n}": images for n, images in enumerate(scene.samples, 1)}}
+        for name, images in (labelled | {"depth of 1": color_depth(scene.depth[0])[0]}).items():
+            first, *others = images.nan_to_num()  # values that are not finite are black
+            rows.append([SheetCell(first, name), *map(SheetCell, others)])
+    return image_sheet(["input's view", *(f"target {i + 1}" for i in range(max(map(len, rows)) - 1))], rows)

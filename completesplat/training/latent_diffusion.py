@@ -38,8 +38,6 @@ class LatentDiffusion(Stage):
         unconditional_probability: probability of zeroing phi_ref, for guidance (0.2 in the paper).
         skip_weight, guidance_weight: settings of the samples drawn in validation and test.
         scale_batches: training batches on which the latents' mean and standard deviation are measured.
-        noise_draws: uses of each latent in a step, each with another noise and noise level: more steps of the denoiser
-            for one of the encoders.
         channels_last, compile: of the denoiser, see `prepare_network`.
         **rendering_and_optimization: see `Stage`.
 
@@ -59,7 +57,6 @@ class LatentDiffusion(Stage):
         skip_weight: Share = 1.0,
         guidance_weight: Share = 0.0,
         scale_batches: Positive = 50,
-        noise_draws: Positive = 1,
         channels_last: bool = False,
         compile: bool = False,
         **rendering_and_optimization: Any,
@@ -72,7 +69,6 @@ class LatentDiffusion(Stage):
         self.skip_weight = skip_weight
         self.guidance_weight = guidance_weight
         self.scale_batches = scale_batches
-        self.noise_draws = noise_draws
         if autoreconstructor_checkpoint is not None and checkpoint is not None:
             raise WeightsError("model.checkpoint holds stage 1 as well: set model.autoreconstructor_checkpoint=null")
         if autoreconstructor_checkpoint is not None:
@@ -174,7 +170,7 @@ class LatentDiffusion(Stage):
 
     def training_step(self, batch: SceneBatch | CachedScene, index: int) -> Float[Tensor, ""]:
         parts = self.completesplat
-        latent, conditioning = (x.repeat(self.noise_draws, 1, 1, 1) for x in self.inputs(batch))
+        latent, conditioning = self.inputs(batch)
         conditioned = torch.rand(len(latent), device=self.device) >= self.unconditional_probability
         conditioning = conditioning * conditioned[:, None, None, None]
         noise = torch.randn(latent.shape, device=self.device)  # `randn_like` would depend on the memory layout

@@ -23,13 +23,14 @@ from completesplat.errors import CompleteSplatError
 from completesplat.export.prediction import write_fitted_scene
 from completesplat.files import atomic_path, make_folder, safe_name
 from completesplat.gaussians import Gaussians
+from completesplat.geometry.cameras import Cameras
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.losses import WeightedSum
-from completesplat.scene import SceneBatch
+from completesplat.scene import SceneBatch, Views
 from completesplat.settings.schema import Range
 from completesplat.splatter_image import Parameterization, SplatterImage
 from completesplat.tensors import stack
-from completesplat.training.stage import ScoredScene, Stage
+from completesplat.training.stage import Stage
 
 logger = logging.getLogger(__name__)
 
@@ -57,16 +58,20 @@ class PerScene(Stage):
         self.fitting = fitting
         self.scenes_folder = None if scenes_folder is None else Path(scenes_folder)
 
-    def scene_scored(self, scene: ScoredScene) -> None:
+    def scene_scored(
+        self,
+        name: str,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        images: Float[Tensor, "sample view 3 height width"],
+        truth: Views,
+    ) -> None:
         """Write the scene, or log a warning if it has nothing that can be written."""
-        super().scene_scored(scene)
         if self.scenes_folder is None:
             return
-        folder, seed = self.scenes_folder / safe_name(scene.name), self.evaluation.scene_seed(scene.name)
+        folder, seed = self.scenes_folder / safe_name(name), self.evaluation.scene_seed(name)
         try:
-            write_fitted_scene(
-                folder, scene.name, scene.gaussians[0], scene.cameras, scene.images[0], scene.truth.images, seed
-            )
+            write_fitted_scene(folder, name, gaussians[0], cameras, images[0], truth.images, seed)
         except CompleteSplatError as error:
             logger.warning("%s: %s", folder, error)
 

@@ -5,7 +5,6 @@ import time
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -68,21 +67,6 @@ def prepare_network(network: nn.Module, channels_last: bool, compile: bool) -> N
         network.compile()
 
 
-@dataclass(frozen=True)
-class ScoredScene:
-    """Result of a test for one scene: Gaussians, and their images as they are scored, the reference view first.
-
-    The input is what the model sees. The cameras are those of the renders, which may be smaller than the scored images.
-    """
-
-    name: str
-    input: Float[Tensor, "3 _ _"]
-    gaussians: Gaussians
-    cameras: Cameras
-    images: Float[Tensor, "sample view 3 height width"]
-    truth: Views
-
-
 class Stage(LightningModule):
     """Base class of models that turn reference images into Gaussians.
 
@@ -114,7 +98,6 @@ class Stage(LightningModule):
         self.background = background
         self.evaluation = Evaluation()
         self.seconds: dict[str, list[float]] = defaultdict(list)  # for each scene, by the name of the work
-        self.on_scene_scored: Callable[[ScoredScene], None] | None = None
         self.config: Mapping[str, Any] | None = None
         # Lightning's name: some of several processes that test may have no scene.
         self.allow_zero_length_dataloader_with_multiple_devices = True
@@ -235,8 +218,7 @@ class Stage(LightningModule):
             depths = truth.depths
             if depths is not None and depths.shape[-2:] == rendered.alpha.shape[-2:]:
                 evaluation.update_depth(name, rendered[0].expected_depth(), truth[b])
-            visible = seen.reference.images[b] * seen.visible[b]
-            self.scene_scored(ScoredScene(name, visible, samples, cameras[b], images, truth[b]))
+            self.scene_scored(name, samples, cameras[b], images, truth[b])
         evaluation.update("mean_image", repeat_image(self.mean_image, scenes), scenes)
         evaluation.update("copy_reference", copy_reference(scenes), scenes)
 
@@ -247,10 +229,18 @@ class Stage(LightningModule):
         self.seconds[name].append((now() - start) / scenes)
         return result
 
-    def scene_scored(self, scene: ScoredScene) -> None:
-        """Pass on the result of a test for a scene."""
-        if self.on_scene_scored is not None:
-            self.on_scene_scored(scene)
+    def scene_scored(
+        self,
+        name: str,
+        gaussians: Gaussians,
+        cameras: Cameras,
+        images: Float[Tensor, "sample view 3 height width"],
+        truth: Views,
+    ) -> None:
+        """Write the result of a test for a scene: Gaussians [sample], and their images as they are scored.
+
+        The cameras are those of the renders, which may be smaller than the scored images.
+        """
 
     def on_test_epoch_end(self) -> None:
         """Log every score: the model's as `test/REGION/VIEW/METRIC`, a predictor's as `test/PREDICTOR/REGION/...`.

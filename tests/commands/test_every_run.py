@@ -62,7 +62,7 @@ def test_a_runs_folder_and_its_checkpoint_give_the_same_scenes(command, pipeline
 
 
 @pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)
-def test_a_scene_of_stage_one_is_what_its_test_scores(pipeline, run):
+def test_scenes_of_stage_one_are_those_that_its_test_scores(pipeline, run):
     model = CompleteSplat.from_pretrained(run)
     assert isinstance(model, OneAnswer)
     assert not model.draws_samples
@@ -82,7 +82,7 @@ def test_a_scene_of_stage_one_is_what_its_test_scores(pipeline, run):
         model(pipeline.photograph(), samples=2)
 
 
-def test_what_is_hidden_has_no_influence_on_stage_one(pipeline):
+def test_hidden_pixels_have_no_influence_on_stage_one(pipeline):
     model = CompleteSplat.from_pretrained(pipeline.var)
     photograph = model.read(pipeline.photograph())
     visible = torch.ones(1, 32, 32)

@@ -47,7 +47,7 @@ def test_stage_two_keeps_stage_ones_weights_and_measures_its_latents(pipeline):
 SCORED = ["evaluation.resolution=48", "+evaluation.data.evaluation_targets=1", "seed=4"]
 
 
-def test_a_fit_scores_what_a_test_of_its_checkpoint_scores(command, pipeline, tmp_path):
+def test_a_fit_has_the_scores_of_a_test_of_its_checkpoint(command, pipeline, tmp_path):
     """In the test's precision, with the protocol's changes to the data, and at its resolution."""
     fit = ["trainer.precision=bf16-mixed", "trainer.max_steps=1", f"data.root={pipeline.toy}"]
     run = tmp_path / "run"

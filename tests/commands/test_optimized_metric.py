@@ -18,13 +18,15 @@ def test_a_job_returns_the_figure_that_is_asked_for_and_names_those_that_it_has(
     assert optimized(None, tmp_path) is None
     assert optimized("val/psnr_novel", tmp_path) == 20.5
     assert math.isnan(optimized("val/loss", tmp_path))
-    said = r"^optimized_metric=val/psnr: no figure in .*, there are val/psnr_novel, val/loss; did you mean val/psnr_nov"
+    message = (
+        r"^optimized_metric=val/psnr: no figure in .*, there are val/psnr_novel, val/loss; did you mean val/psnr_nov"
+    )
     for name in ("val/psnr", "steps", "upper_bound", "test"):
-        with pytest.raises(CompleteSplatError, match=said if name == "val/psnr" else "no figure in"):
+        with pytest.raises(CompleteSplatError, match=message if name == "val/psnr" else "no figure in"):
             optimized(name, tmp_path)
 
 
-def test_a_finished_run_returns_what_it_wrote(command, pipeline):
+def test_a_finished_run_returns_its_metric(command, pipeline):
     settings = ["experiment=toy_var", f"data.root={pipeline.toy}", *SMALL, "ckpt_path=last", f"out={pipeline.var}"]
     finished = command("fit", *settings, "optimized_metric=val/psnr_novl")
     assert (finished.status, finished.err.count("\n")) == (2, 1)

@@ -31,7 +31,7 @@ def scored(command, pipeline, tmp_path):
 
 
 def test_scores_stand_beside_the_naive_predictors(scored):
-    said, metrics = scored("var")
+    printed, metrics = scored("var")
     described = metrics.pop("protocol")
     assert list(metrics) == ["model", "mean_image", "copy_reference"]
     assert described["data_set"] == "toy_objects"
@@ -42,7 +42,7 @@ def test_scores_stand_beside_the_naive_predictors(scored):
             assert -1 <= values["ssim"] <= 1
         assert 0 < scores["scenes"] == scores["views"] / 2
     assert metrics["copy_reference"]["full"]["reference"]["psnr"] == 100
-    assert "copy_reference" in said
+    assert "copy_reference" in printed
 
 
 def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_path):
@@ -57,7 +57,7 @@ def test_weights_that_only_training_needed_may_be_gone(command, pipeline, tmp_pa
     assert command("test", f"ckpt={checkpoint}", f"out={tmp_path / 'scores'}").status == 0
 
 
-def test_the_protocol_says_what_was_measured_and_how(scored, pipeline, monkeypatch):
+def test_the_protocol_records_the_measurement(scored, pipeline, monkeypatch):
     used = []
     draw = Sampler.__call__
 
@@ -67,7 +67,7 @@ def test_the_protocol_says_what_was_measured_and_how(scored, pipeline, monkeypat
 
     monkeypatch.setattr(Sampler, "__call__", watched)
     change = "overrides=['model.guidance_weight=0.5','data.evaluation_targets=1']"
-    said, metrics = scored("diffusion", change, "sampler=dpm10", "seed=3")
+    printed, metrics = scored("diffusion", change, "sampler=dpm10", "seed=3")
     described, model = metrics["protocol"], metrics["model"]
     assert set(used) == {("DPMSolverMultistepScheduler", 10)}
     assert model["views"] == model["scenes"] == described["scenes"]
@@ -81,14 +81,14 @@ def test_the_protocol_says_what_was_measured_and_how(scored, pipeline, monkeypat
     assert described["checkpoint"]["sha256"] == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
     ssim = described["metrics"]["ssim"]
     assert (ssim["window"], ssim["border"]) == (11, "mirrored, counted")
-    assert SSIM_NOTE in " ".join(said.split())
+    assert SSIM_NOTE in " ".join(printed.split())
     assert model["seconds"].keys() == {"inference", "rendering"}
     assert model["full"]["novel"]["swd"] > 0
     # Toy objects have true depth; predictors that are pictures alone have none to compare.
     assert 0 < model["object"]["novel"]["depth_abs_rel"] < 10
     assert "depth_abs_rel" not in metrics["mean_image"]["full"]["novel"]
     for name, reason in described["missing"].items():
-        assert f"{name}: missing: give " in said
+        assert f"{name}: missing: give " in printed
         assert reason.startswith("missing: ")
 
 
@@ -105,7 +105,7 @@ def test_the_best_of_several_samples_stands_beside_one_and_the_mean(scored):
     assert rules.keys() == {row for row in metrics if row.startswith("best_of_k")}
 
 
-def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pictures_it_was_trained_on(
+def test_a_larger_size_is_reached_by_upsampling_renders_from_images_of_the_trained_size(
     scored, pipeline, tmp_path, monkeypatch
 ):
     shown = []
@@ -131,7 +131,7 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["evaluation.resolution=16"], "evaluation.resolution=16: below the model's 32"),
         (["evaluation=realestate10k_100", "evaluation.data.scene_list=FILE"], "have no setting scene_list"),
@@ -140,10 +140,10 @@ def test_a_larger_size_is_reached_by_upsampling_what_the_model_makes_of_the_pict
         (["evaluation.resolution=48"], r"prepared with image_size=32 \(asked for: 48\)"),
     ],
 )
-def test_protocols_that_do_not_fit_the_data_are_refused(toy_root, packed_toys, arguments, said):
-    root = packed_toys if "prepared" in said else toy_root
+def test_protocols_that_do_not_fit_the_data_are_refused(toy_root, packed_toys, arguments, message):
+    root = packed_toys if "prepared" in message else toy_root
     run = compose_config("fit", "experiment=toy_var", f"data.root={root}", "data.image_size=32")
-    with pytest.raises((CompleteSplatError, DataError), match=said):
+    with pytest.raises((CompleteSplatError, DataError), match=message):
         scored_data(run, compose_config("fit", *arguments).evaluation)
 
 
@@ -157,14 +157,14 @@ def test_weights_score_as_the_run_they_were_saved_with(scored, pipeline):
     assert first["protocol"]["checkpoint"]["path"] == str(pipeline.weights)
 
 
-def test_what_is_to_be_scored_is_said_once():
-    for given, said in (
+def test_either_a_checkpoint_or_weights_are_scored():
+    for given, message in (
         ({"ckpt": None}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
         ({"ckpt": "a", "weights": "b"}, "give ckpt=RUN/checkpoints/last.ckpt, or weights=DIR"),
         ({"ckpt": None, "weights": "b"}, "weights know no data"),
         ({"ckpt": "a", "data": {"root": "DIR"}}, "a checkpoint's data are its run's"),
     ):
-        with pytest.raises(CompleteSplatError, match=said):
+        with pytest.raises(CompleteSplatError, match=message):
             Trained(**given).configuration()
 
 

@@ -27,7 +27,7 @@ def whole():
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        *((field, float("nan")) for field in ("means", "quaternions", "scales", "opacities", "colors")),
+        ("quaternions", float("nan")),
         ("opacities", -float("inf")),
         ("means", 1e30),  # its square is beyond float32
         ("scales", 0.0),

@@ -1,4 +1,4 @@
-"""Which files are written of a scene, by a stand-in for the converter; what a page begins with."""
+"""Files of a scene, written by a stand-in for the converter; initial view of a page."""
 
 import json
 import struct
@@ -11,8 +11,7 @@ from fake_converter import COPY, calls, install
 from support import some_gaussians
 
 from completesplat.errors import CompleteSplatError
-from completesplat.export.formats import FORMATS, write_formats, write_splat
-from completesplat.export.gltf import write_glb
+from completesplat.export.formats import FORMATS, write_formats, write_glb, write_splat
 from completesplat.export.ply import read_ply, write_ply
 from completesplat.export.splat_transform import PageView, SplatTransform, upright, viewer_settings
 from completesplat.gaussians import Gaussians
@@ -75,7 +74,7 @@ def test_colours_are_clipped_alike_in_all_formats_but_ply(tmp_path, converter):
 
 
 def test_spz_goes_without_opacities_that_round_to_nothing(tmp_path, converter):
-    """Of 8 bits, 0 is read back as a logit of minus infinity."""
+    """An opacity of 0 in 8 bits would be read as a logit of minus infinity."""
     opacities = torch.tensor([0.5 / 255 - 1e-6, 0.0, 1.0, 0.6 / 255] * 5)
     write_formats(tmp_path, "a", replace(some(), opacities=opacities), ["ply", "spz"], VIEW, converter)
     assert read_ply(tmp_path / "a.ply").count == 20
@@ -111,7 +110,7 @@ def test_a_page_begins_at_the_reference_camera_and_shows_its_whole_image(tmp_pat
 
 
 def some(count: int = 20) -> Gaussians:
-    """With quaternions of any length, and colours and opacities at the ends of their ranges and beyond."""
+    """Return quaternions of any length, and colours and opacities at the ends of their ranges and beyond."""
     generator = torch.Generator().manual_seed(0)
     means, quaternions, scales, rest = (torch.rand(count, n, generator=generator) for n in (3, 4, 3, 4))
     rest[0], rest[1] = torch.tensor([-0.5, 0, 1, 0]), torch.tensor([1.5, 1, 0, 1])

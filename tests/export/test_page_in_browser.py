@@ -1,4 +1,4 @@
-"""What the page draws, in headless Chromium without a network, against our own rasterizer; needs Node.js too."""
+"""The page in headless Chromium, without a network, against our rasterizer; needs Node.js too."""
 
 import io
 import math
@@ -42,7 +42,7 @@ def scene() -> Gaussians:
     return Gaussians(means, quaternions, torch.full((4, 3), 0.15), torch.full((4,), 0.99), colors)
 
 
-def our_picture(view: PageView) -> torch.Tensor:
+def our_image(view: PageView) -> torch.Tensor:
     fov = viewer_settings(view, upright(UP))["cameras"][0]["initial"]["fov"]
     assert fov < LARGEST_FOV
     focal = WIDTH / 2 / math.tan(math.radians(fov) / 2)
@@ -86,7 +86,7 @@ def test_the_page_draws_what_we_draw_and_asks_for_nothing(tmp_path):
     view = PageView(REFERENCE, PIVOT, UP, 0.25)
     write_page(tmp_path / "scene.html", scene(), view, converter)
     requests: list[str] = []
-    theirs, ours = screenshot(tmp_path / "scene.html", requests), our_picture(view)
+    theirs, ours = screenshot(tmp_path / "scene.html", requests), our_image(view)
     assert [url for url in requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert (theirs - ours).abs().mean() < 0.003
     # So does no other way up, nor the mirror image.

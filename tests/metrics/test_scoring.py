@@ -1,4 +1,4 @@
-"""How scores are averaged, samples chosen and depth measured: closed forms and brute force."""
+"""Averages of scores, choice of samples and errors of depth: closed forms and brute force."""
 
 import math
 from dataclasses import replace

@@ -59,7 +59,7 @@ def opened(request, browser, file):
 
 
 def level(shown, index: int = 0) -> float:
-    """Mean of the middle of what a sample shows now."""
+    """Return the mean value in the middle of the frame that a sample shows."""
     png = shown.locator(".turntable").nth(index).screenshot()
     pixels = np.asarray(Image.open(io.BytesIO(png)).convert("L"), dtype=float)
     height, width = pixels.shape
@@ -75,7 +75,7 @@ def test_nothing_is_wider_than_the_page_and_all_images_are_drawn(opened):
 
 
 def place(shown, index: int, frame: int) -> tuple[float, float]:
-    """Where a sample is touched to show a frame."""
+    """Return the point of a sample that shows a frame when it is touched."""
     box = shown.locator(".turntable").nth(index)
     box.scroll_into_view_if_needed()
     size = box.bounding_box()

@@ -1,4 +1,4 @@
-"""Which run stands in which of the paper's tables or in one of our own, and what its cells say."""
+"""Places of runs in the paper's tables or in a table of ours, and the texts of their cells."""
 
 import json
 from pathlib import Path
@@ -29,13 +29,13 @@ def made(runs) -> dict[str, Table]:
 
 
 def texts(table: Table) -> list[dict[str, str]]:
-    """The rows by heading."""
+    """Return the rows by heading."""
     names = [heading.joined(" ") for heading in table.headings]
     return [{name: cell.text for name, cell in zip(names, row.cells, strict=True)} for row in table.rows]
 
 
 def ours(table: Table) -> list[dict[str, str]]:
-    """The rows that are not the paper's, by heading."""
+    """Return the rows that are not the paper's, by heading."""
     return [row for row, shown in zip(texts(table), table.rows, strict=True) if shown.source != "paper"]
 
 

@@ -6,8 +6,7 @@ from completesplat.data.sequences import MaskedImage
 from completesplat.data.validation import BadImage, OutsidePath
 from completesplat.export.images import GAP, MARGIN
 from completesplat.geometry.cameras import project
-from completesplat.studies.contact_sheet import CELL, MASK, show
-from completesplat.studies.frusta import CROSS_COLORS, place_cross
+from completesplat.studies.contact_sheet import CELL, CROSS_COLORS, MASK, place_cross, show
 
 SIZE = 24
 

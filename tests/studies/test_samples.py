@@ -1,4 +1,4 @@
-"""What is measured of samples in closed form, and the figures that show them."""
+"""Measures of samples in closed form, and the figures of the studies."""
 
 import math
 

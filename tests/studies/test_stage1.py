@@ -1,4 +1,4 @@
-"""How thick an object is, by what other views show of it."""
+"""Thickness of an object by other views."""
 
 import torch
 
@@ -11,7 +11,7 @@ SIZE = 16
 
 
 def wall(eye_z: float, depth: float) -> Views:
-    """One view from `eye_z` along the z axis to z = 2.25: a wall at `depth`, the object in the picture's middle."""
+    """One view from `eye_z` along the z axis to z = 2.25: a wall at `depth`, the object in the image's middle."""
     pose = look_at(*(torch.tensor(point) for point in ([[0.0, 0, eye_z]], [[0.0, 0, 2.25]], [[0.0, -1, 0]])))
     cameras = Cameras(pose, pinhole(50, SIZE).float().expand(1, 3, 3), (SIZE, SIZE))
     masks = torch.zeros(1, 1, SIZE, SIZE)

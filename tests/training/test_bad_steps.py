@@ -102,7 +102,7 @@ def test_one_bad_batch_of_several_leaves_out_their_step(fault, batch):
     assert not equal(after, module.seen[8])
 
 
-def test_so_many_in_a_row_end_the_run_and_name_step_term_and_layer():
+def test_several_bad_steps_in_a_row_end_the_run_and_the_error_names_step_term_and_layer():
     module = Faulty(FAULTS["a loss that is NaN"], batches=(2, 3, 5, 6, 7, 8))
     with pytest.raises(
         DivergenceError, match=r"^step 7: 3 steps in a row .* gradients that of layer\.weight is the first"
@@ -112,7 +112,7 @@ def test_so_many_in_a_row_end_the_run_and_name_step_term_and_layer():
 
 
 @pytest.mark.parametrize("steps", [1, 5])
-def test_a_run_too_short_for_so_many_ends_too_if_all_its_steps_were_bad(tmp_path, steps):
+def test_a_shorter_run_also_ends_if_all_its_steps_were_bad(tmp_path, steps):
     module = Faulty(FAULTS["a loss that is NaN"], batches=range(5))
     with pytest.raises(DivergenceError, match=rf"^step {steps - 1}: {steps} steps in a row"):
         train(module, Checkpoints(str(tmp_path)), steps=steps, most=10)

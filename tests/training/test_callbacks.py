@@ -1,7 +1,6 @@
 """What training does around its steps: random numbers, speed and memory."""
 
 import itertools
-import logging
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -68,7 +67,7 @@ def speeds(module: Sleeper, nap: float = 0, **options) -> list[dict[str, float]]
     return [row for row in rows if "speed/data_wait" in row]
 
 
-def test_who_is_waited_for(clock):
+def test_waiting_for_data_is_measured(clock):
     """A batch is loaded in one second, and trained on in three."""
     rows = speeds(Sleeper(clock, training=3), nap=1)
     assert [row["step"] for row in rows] == [1, 3, 5, 7]
@@ -149,8 +148,7 @@ class Telling(BoringModel):
         return super().training_step(batch, index)
 
 
-def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss(caplog):
-    caplog.set_level(logging.INFO)
+def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss():
     bar = Progress()
     watched, quiet = Watched(bar), {**QUIET, "enable_progress_bar": True}
     settings = {"max_steps": 5, "max_epochs": -1, "val_check_interval": 4, "check_val_every_n_epoch": None}
@@ -159,4 +157,3 @@ def test_the_bar_is_the_whole_runs_and_shows_the_first_steps_loss(caplog):
     trainer.fit(Telling(), DataLoader(torch.zeros(4, 32)), DataLoader(torch.zeros(4, 32)))
     steps = [0, 1, 1, 2, 2, 3, 3, 4, 4, 5]  # of two batches each, two in an epoch
     assert watched.shown == [("Training", s, 5, f"{s}/5", 0.5 * (i % 4)) for i, s in enumerate(steps)]
-    assert "step 0/5; validation every 2 (trainer.val_check_interval)" in caplog.text

@@ -101,7 +101,7 @@ def test_a_draw_from_the_cache_is_the_draw_on_the_fly(tmp_path):
 
 
 @pytest.mark.parametrize(("value", "precision"), [(float("nan"), "float32"), (1e30, "float16")])
-def test_what_is_not_finite_is_refused_with_its_place(root, tmp_path, value, precision):
+def test_encodings_that_are_not_finite_are_refused_with_their_place(root, tmp_path, value, precision):
     sequence = rooms(root).source("train").read("c2")
     picture, model = sequence.read(3).image / 255, small_autoreconstructor()
 
@@ -118,7 +118,7 @@ def test_what_is_not_finite_is_refused_with_its_place(root, tmp_path, value, pre
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_what_a_killed_run_leaves_does_not_open_and_is_written_over(root, cache, tmp_path):
+def test_the_store_of_a_killed_run_does_not_open_and_is_overwritten(root, cache, tmp_path):
     model, left, calls = small_autoreconstructor(), tmp_path / "left", []
 
     def copy(*_: object) -> None:
@@ -165,7 +165,7 @@ def test_settings_without_a_meaning_and_a_full_disk_are_refused(root, tmp_path, 
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_the_fingerprint_tells_names_types_shapes_and_values():
+def test_the_fingerprint_depends_on_names_types_shapes_and_values():
     weights = torch.rand(2, 2)
     nudged = weights.clone()
     nudged[1, 1] = torch.nextafter(nudged[1, 1], torch.tensor(9.0))

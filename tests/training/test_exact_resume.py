@@ -8,7 +8,6 @@ import torch
 from support import SMALL, call, strict_json
 from torch import Tensor
 
-from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.latent_diffusion import LatentDiffusion
 from completesplat.training.reconstruction import ReconstructionModule
 
@@ -106,29 +105,7 @@ def results(run) -> dict:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("written", [2, 4, 6])
-def test_a_run_killed_when_its_checkpoint_was_just_written_misses_nothing(
-    settings, whole, tmp_path, monkeypatch, written
-):
-    """With rows, validation and pictures due at the same step; 6 is the last."""
-    monkeypatch.chdir(tmp_path)
-    arguments = [*settings["var"], "callbacks.checkpoint.every_n_train_steps=2", f"out={tmp_path}/run"]
-    save = CheckpointFiles.save_checkpoint
-
-    def last_deed(self, checkpoint, *inputs, **options):
-        save(self, checkpoint, *inputs, **options)
-        if checkpoint["global_step"] == written:
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(CheckpointFiles, "save_checkpoint", last_deed)
-        assert call(monkeypatch, *arguments) != 0
-    assert call(monkeypatch, *arguments, "ckpt_path=last") == 0
-    must_be_equal(whole("var"), tmp_path / "run")
-
-
-@pytest.mark.slow
-def test_drawing_pictures_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
+def test_drawing_images_and_samples_does_not_change_training(settings, whole, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for stage, drawn in {"var": ["pictures"], "diffusion": ["pictures", "samples"]}.items():
         kept = [setting for setting in settings[stage] if not setting.startswith(("callbacks.pic", "callbacks.sam"))]

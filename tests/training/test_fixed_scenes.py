@@ -6,22 +6,27 @@ import numpy as np
 import pandas
 import pytest
 import torch
+from hydra.utils import instantiate
 from picture_sheets import cells
 from PIL import Image
 from scenes_for_training import SIZE, scene_batch
+from support import SMALL, compose_config
 
 from completesplat.autoreconstructor.posterior import Posterior
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.geometry.cameras import pixel_rays
+from completesplat.metrics.images import PSNR_LIMIT, psnr
+from completesplat.metrics.scoring import diversity
 from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
 from completesplat.training.fixed_scenes import (
+    SceneDrawings,
     distributions,
     fixed_scenes,
     layer_figures,
-    layer_maps,
     percentiles,
+    samples_sheet,
     scene_panels,
     write_newest,
 )
@@ -67,7 +72,7 @@ def test_panels_are_input_target_error_and_layers():
         torch.testing.assert_close(error, torch.full_like(error, 4 * difference))
 
 
-def test_what_is_near_is_bright_on_each_scenes_own_scale_and_what_is_not_seen_is_grey():
+def test_near_depths_are_bright_on_a_scale_for_each_scene_and_unseen_pixels_are_grey():
     scenes = scene_batch(batch=2)
     rows = torch.arange(SIZE).repeat_interleave(SIZE)
     depths = torch.where(rows < 5, 3.0, 1.0) * torch.tensor([[1.0], [7.0]])
@@ -94,7 +99,7 @@ def test_distributions_are_of_all_values():
     assert percentiles({"depth": shuffled}) == {f"gaussians/depth_p{n}": n for n in (10, 50, 90)}
 
 
-def test_maps_and_figures_of_the_layers_are_those_of_the_reference_s_pixels():
+def test_figures_of_the_layers_are_those_of_the_reference_s_pixels():
     scenes = scene_batch(batch=2)
     masks = (torch.rand(2, 1, SIZE, SIZE) < 0.5).float()
     scenes = replace(scenes, reference=replace(scenes.reference, masks=masks))
@@ -106,11 +111,6 @@ def test_maps_and_figures_of_the_layers_are_those_of_the_reference_s_pixels():
     for layer in (0, 1):
         mean = 0.9 * opacities[:, layer][masks[:, 0] > 0].mean()
         assert figures[f"layers/opacity_{layer + 1}"] == pytest.approx(mean.item())
-    maps = layer_maps(gaussians, scenes)
-    assert list(maps) == ["input", *(f"{name} {n}" for n in (1, 2) for name in ("depth", "opacity", "colour"))]
-    assert torch.equal(maps["opacity 2"][:, 1], 0.9 * opacities[:, 1])
-    assert (maps["colour 2"] == torch.eye(3)[2][:, None, None]).all()  # blue
-    assert (maps["depth 1"].mean(1) > maps["depth 2"].mean(1)).all()
 
 
 def test_the_bits_of_the_channels_are_those_of_the_posterior():
@@ -131,8 +131,8 @@ def test_the_newest_scenes_take_the_place_of_older_ones_and_read_back_with_their
     gaussians = two_layers(scenes)
     for step in (500, 1000):
         write_newest(tmp_path / "newest", step, gaussians, scenes, up)
-        found, samples, said = read_newest(tmp_path / "newest")
-        assert (found, said) == (step, pytest.approx(up.tolist()))
+        step_of_files, samples, direction = read_newest(tmp_path / "newest")
+        assert (step_of_files, direction) == (step, pytest.approx(up.tolist()))
     assert [sample.settings for sample in samples] == [{"scene": name, "step": 1000} for name in scenes.names]
     for index, sample in enumerate(samples):
         assert sample.layers == 2
@@ -169,12 +169,11 @@ def test_targets_are_spread_over_all_that_a_scene_has(views, chosen):
 
 
 @pytest.mark.parametrize("stage", ["var", "diffusion"])
-def test_a_run_leaves_pictures_and_rows(pipeline, stage):
+def test_a_run_writes_images_and_rows(pipeline, stage):
     run = getattr(pipeline, stage)
-    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "layers_000002.png", "newest"}
-    # One validation scene in eight panels, and its picture with three maps of either layer.
+    assert {path.name for path in (run / "pictures").iterdir()} == {"step_000002.png", "newest"}
+    # One validation scene in eight panels.
     assert cells(Image.open(run / "pictures/step_000002.png"), 32, 32).shape[:2] == (1, 8)
-    assert cells(Image.open(run / "pictures/layers_000002.png"), 32, 32).shape[:2] == (1, 7)
     layers = {column for column in pandas.read_csv(run / "metrics.csv") if column.startswith("layers/")}
     assert layers == {"layers/opacity_1", "layers/opacity_2", "layers/behind_2"}
     table = pandas.read_csv(run / "metrics.csv")
@@ -183,3 +182,62 @@ def test_a_run_leaves_pictures_and_rows(pipeline, stage):
     assert 0 < row["gaussians/opacity_p10"] <= row["gaussians/opacity_p50"] <= row["gaussians/opacity_p90"] < 1
     assert len(row) == 1 + 3 * 3
     assert any(column.startswith("latent/bits_") for column in table) == (stage == "var")
+
+
+SIDE = 32
+
+
+def some_drawings(samples: int = 2, views: int = 3) -> SceneDrawings:
+    pictures = torch.rand(1 + samples, views, 3, SIDE, SIDE)
+    return SceneDrawings(pictures[0], pictures[1:], torch.ones(1, views, 1, SIDE, SIDE))
+
+
+def assert_shows(found: torch.Tensor, expected: torch.Tensor) -> None:
+    torch.testing.assert_close(found, expected, atol=0.5 / 255 + 1e-5, rtol=0)
+
+
+def test_rows_are_true_images_samples_and_depths_scene_by_scene():
+    drawn = [some_drawings(), some_drawings(views=2)]
+    found = cells(samples_sheet(drawn), SIDE, SIDE)
+    assert found.shape[:2] == (8, 3)
+    for top, scene in zip((0, 4), drawn, strict=True):
+        views = len(scene.true)
+        assert_shows(found[top, :views], scene.true)
+        assert_shows(found[top + 1 : top + 3, :views], scene.samples)
+    assert (found[4:, 2] == 1).all()
+
+
+def test_scores_are_of_novel_views():
+    scene = some_drawings()
+    assert scene.scores()["diversity"] == diversity(scene.samples[:, 1:])
+    symmetric = scene.true + torch.tensor([0.1, -0.1]).view(2, 1, 1, 1, 1)
+    symmetric[:, 0] = 0
+    scores = replace(scene, samples=symmetric).scores()
+    assert scores["psnr"] == pytest.approx(20, abs=1e-3)
+    assert scores["psnr_of_mean"] == PSNR_LIMIT
+    assert scores["diversity"] == pytest.approx(0.2, abs=1e-5)
+    assert "diversity" not in replace(scene, samples=symmetric[:1]).scores()
+
+
+def test_a_run_writes_samples_and_their_scores(pipeline):
+    run = pipeline.diffusion
+    assert {path.name for path in (run / "samples").iterdir()} == {"step_000002.png"}
+    assert not (pipeline.var / "samples").exists()
+    data = instantiate(compose_config("fit", f"data.root={pipeline.toy}", *SMALL).data, _convert_="all")
+    data.setup("fit")
+    # One validation scene with two targets, four samples.
+    (scene,) = fixed_scenes(data.val_dataloader(), 2, 8)
+    found = cells(Image.open(run / "samples/step_000002.png"), SIDE, SIDE)
+    assert found.shape[:2] == (1 + 4 + 1, 3)
+    assert_shows(found[0, 0], scene.reference.images)
+    assert_shows(found[0, 1:], scene.targets.images)
+    table = pandas.read_csv(run / "metrics.csv")
+    columns = [column for column in table if column.startswith("samples/")]
+    (row,) = table[["step", *columns]].dropna().to_dict("records")
+    assert row["step"] == 1
+    samples, true = found[1:5, 1:], scene.targets.images
+    assert row["samples/diversity"] == pytest.approx(diversity(samples), abs=2e-3)
+    assert row["samples/diversity"] > 0
+    assert row["samples/psnr_of_mean"] == pytest.approx(psnr(samples.mean(0), true).mean().item(), abs=0.02)
+    each = psnr(samples.flatten(0, 1), true.expand_as(samples).flatten(0, 1))
+    assert row["samples/psnr"] == pytest.approx(each.mean().item(), abs=0.02)

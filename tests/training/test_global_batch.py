@@ -48,7 +48,7 @@ def test_a_batch_that_is_larger_than_an_epoch_is_refused_before_training(toy_roo
         instantiate(config, _convert_="all").setup("fit")
 
 
-def test_accumulated_batches_share_it_and_what_a_process_gets_is_recorded(command, toy_root, tmp_path, monkeypatch):
+def test_accumulated_batches_share_the_batch_and_the_share_is_recorded(command, toy_root, tmp_path, monkeypatch):
     counts, step = [], ReconstructionModule.training_step
 
     def counted(self, scenes, index):

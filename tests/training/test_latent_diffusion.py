@@ -124,7 +124,7 @@ def test_the_buckets_losses_average_to_the_total(monkeypatch):
     assert values == {"train/loss_t0": 1.0, "train/loss_t1": 4.0}
 
 
-def test_what_was_encoded_beforehand_trains_the_same(monkeypatch):
+def test_encoded_scenes_train_the_same(monkeypatch):
     batch, found = scenes(0.5), []
     for cached in (False, True):
         module, logged = module_of(monkeypatch)

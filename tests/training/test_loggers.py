@@ -27,7 +27,7 @@ def test_rows_before_the_first_new_step_stay_and_the_others_are_replaced(tmp_pat
     assert numbers(tmp_path) == [OLD[0], *new]
 
 
-def test_the_old_file_stays_until_there_is_something_to_log_and_has_it_at_once(tmp_path):
+def test_the_old_file_stays_until_the_first_row_which_is_written_at_once(tmp_path):
     log(tmp_path, *OLD)
     logger = ContinuedCSVLogger(str(tmp_path))
     logger.save()

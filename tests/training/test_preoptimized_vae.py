@@ -79,7 +79,7 @@ MEANS = torch.tensor([[0.0, 0.0, 2.0], [0.1, -0.2, 2.5]])
 KNOWN = replace(some_gaussians(1), means=MEANS[None])  # of one scene, in the frame of its reference
 
 
-def test_a_scene_is_fitted_once_to_all_its_pictures_and_seen_from_any_of_its_cameras(store, tmp_path):
+def test_a_scene_is_fitted_once_to_all_its_images_and_seen_from_any_of_its_cameras(store, tmp_path):
     calls = []
 
     def fit(scenes: SceneBatch) -> Gaussians:

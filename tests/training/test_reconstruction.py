@@ -25,7 +25,7 @@ def test_a_second_part_starts_from_the_weights_of_the_first(pipeline):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_what_is_hidden_is_not_seen_but_compared(masked, monkeypatch):
+def test_hidden_pixels_are_not_seen_but_compared(masked, monkeypatch):
     scenes = scene_batch()
     scenes.visible[..., 4:12, 2:9] = 0
     trained = module(f"model.masked={str(masked).lower()}")

@@ -132,7 +132,7 @@ def test_a_signal_that_was_swallowed_does_not_end_with_success():
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_what_fails_after_a_signal_because_another_process_has_gone_ends_as_the_signal_does(monkeypatch):
+def test_an_error_after_a_signal_ends_as_the_signal_does(monkeypatch):
     with pytest.raises(RuntimeError, match="reset"), stopped_together():
         raise RuntimeError("Connection reset by peer")
     monkeypatch.setattr(signals, "received", lambda: signal.SIGTERM)

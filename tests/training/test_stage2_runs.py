@@ -52,7 +52,7 @@ def part(state: dict[str, torch.Tensor], name: str) -> dict[str, torch.Tensor]:
     return {key.removeprefix(name): value for key, value in state.items() if key.startswith(name)}
 
 
-def test_the_frozen_conditioning_stays_what_it_was_through_training_and_averaging(run):
+def test_training_and_averaging_leave_the_frozen_conditioning_unchanged(run):
     for place in ("state_dict", "current_model_state"):
         weights = part(run.checkpoint[place], f"{PREFIX}conditioning.encoder.")
         assert len(weights) > 20
@@ -61,7 +61,7 @@ def test_the_frozen_conditioning_stays_what_it_was_through_training_and_averagin
             assert torch.equal(value, run.vae[theirs]), name
 
 
-def test_the_average_is_what_is_sampled_and_written(run):
+def test_the_average_is_sampled_and_written(run):
     average, last = (part(run.checkpoint[place], PREFIX) for place in ("state_dict", "current_model_state"))
     denoiser = part(average, "denoiser.")
     assert any(not torch.equal(value, last[f"denoiser.{name}"]) for name, value in denoiser.items())
@@ -76,10 +76,10 @@ def test_the_weights_need_no_vae_any_more(run, pipeline):
     assert len(model(pipeline.photograph(), samples=1)) == 1
 
 
-def test_the_weights_say_what_they_were_trained_on(run):
-    said = CompleteSplat.from_pretrained(run.folder / "weights").architecture["training"]
-    assert said["box_masks"] == 0
-    assert [len(said[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
+def test_the_weights_hold_facts_about_the_training_images(run):
+    facts = CompleteSplat.from_pretrained(run.folder / "weights").architecture["training"]
+    assert facts["box_masks"] == 0
+    assert [len(facts[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
 
 
 def test_the_latents_and_the_losses_by_timestep_are_logged(run):
@@ -110,7 +110,7 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
         (["experiment=toy_diffusion_masked", "model.checkpoint={var}"], "another architecture"),
         ([*FROM_STAGE_1, "model.checkpoint={diffusion}"], "set model.autoreconstructor_checkpoint=null"),
@@ -122,7 +122,7 @@ def test_masked_diffusion_starts_from_all_weights_of_the_main_stage(pipeline):
         ([*FROM_STAGE_1, "conditioning.channels=[8,8,16]"], "latents are 4x4 and the conditioning's features 8x8"),
     ],
 )
-def test_starts_that_cannot_work_are_refused(pipeline, settings, said):
+def test_starts_that_cannot_work_are_refused(pipeline, settings, message):
     files = {stage: getattr(pipeline, stage) / "checkpoints/last.ckpt" for stage in ("var", "diffusion")}
     given = [setting.format(**files) for setting in settings]
-    assert said in refused("fit", f"data.root={pipeline.toy}", *QUICK, *given, "out=run")
+    assert message in refused("fit", f"data.root={pipeline.toy}", *QUICK, *given, "out=run")

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from unittest.mock import Mock
 
 import pytest
+from omegaconf import OmegaConf
 from wandb_files import offline_runs
 
 from completesplat.errors import CompleteSplatError
-from completesplat.results.wandb import START_SECONDS, WandbRun, finished
+from completesplat.training.wandb import START_SECONDS, WandbRun, wandb_runs
 
 wandb = pytest.importorskip("wandb")
 pytestmark = pytest.mark.processes
@@ -33,7 +34,7 @@ def test_without_an_answer_the_run_is_soon_offline(online, tmp_path, monkeypatch
             server.close()
         monkeypatch.setenv("WANDB_BASE_URL", url)
         begun = time.monotonic()
-        with finished([run_logger := WandbRun(str(tmp_path), "online", "some")]):
+        with wandb_runs([run_logger := WandbRun(str(tmp_path), "online", "some")], OmegaConf.create({})):
             run_logger.log_metrics({"a": 1.0}, step=3)
             assert time.monotonic() - begun < 10 * START_SECONDS  # on a busy machine
     (run,) = offline_runs(tmp_path)
@@ -46,11 +47,11 @@ def test_training_goes_on_when_the_process_of_wandb_dies(tmp_path, monkeypatch, 
     one, other = (WandbRun(str(tmp_path), "offline", "some") for _ in range(2))
     for name in ("log", "finish"):
         monkeypatch.setattr(one.experiment, name, Mock(side_effect=ConnectionResetError("Connection lost")))
-    with finished([one]):
+    with wandb_runs([one], OmegaConf.create({})):
         one.log_metrics({"a": 1.0})
         one.log_metrics({"a": 2.0})
     assert caplog.text.count("its process ended") == 1
-    with finished([other]):  # What comes next has a process again.
+    with wandb_runs([other], OmegaConf.create({})):  # What comes next has a process again.
         other.log_metrics({"a": 3.0})
     assert offline_runs(tmp_path)[-1].history[0]["a"] == 3
 
@@ -58,15 +59,12 @@ def test_training_goes_on_when_the_process_of_wandb_dies(tmp_path, monkeypatch, 
 def test_a_run_that_is_stopped_says_so(tmp_path):
     one = WandbRun(str(tmp_path), "offline", "some")
     one.log_metrics({"a": 1.0})
-    with pytest.raises(KeyboardInterrupt), finished([one]):
+    with pytest.raises(KeyboardInterrupt), wandb_runs([one], OmegaConf.create({})):
         raise KeyboardInterrupt
     (run,) = offline_runs(tmp_path)
     assert run.only("exit").exit_code == 1
 
 
-def test_a_run_that_was_never_begun_is_not_begun_to_be_closed(tmp_path):
-    with finished([WandbRun(str(tmp_path), "offline", "some")]):
-        pass
-    assert list(tmp_path.iterdir()) == []
+def test_an_unknown_mode_is_refused(tmp_path):
     with pytest.raises(CompleteSplatError, match=r"wandb\.mode=onlin: choose one of online"):
         WandbRun(str(tmp_path), "onlin", "some")
