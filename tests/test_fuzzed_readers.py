@@ -49,7 +49,10 @@ from completesplat.export.ply import read_ply, write_ply
 from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
-pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux reports it"),
+]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
 MOST_MEMORY_OF_A_PICTURE = 2**31  # of 50 million pixels, which are allowed

@@ -73,7 +73,7 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
+    """Write packed data into `out`; see `completesplat.data.packed.writing.prepare`."""
     from completesplat.data.packed.manifest import is_packed
     from completesplat.data.packed.writing import prepare as prepare_sources
 
@@ -119,7 +119,7 @@ def latents(
         store = encode_training_set(
             autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, fabric.device
         )
-    logger.info("deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
+    logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
 def _sources(data: Any, splits: Sequence[str]) -> "dict[str, SequenceSource]":

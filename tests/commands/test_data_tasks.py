@@ -7,9 +7,9 @@ import pytest
 from omegaconf import OmegaConf
 from support import refused, strict_json, write_capture
 
-from completesplat.commands.jobs import conf_folder
 from completesplat.data.toy import write_rooms
 from completesplat.data.toy.module import OWN_PLACE
+from completesplat.settings.options import conf_folder
 
 
 @pytest.fixture(scope="module")
