@@ -53,11 +53,6 @@ def test_each_format_gives_its_views(root, tmp_path, content, form, tests):
     assert f"in {form}'s format, SHA-256 " in data.describe()["protocol_views"]
 
 
-def test_two_lists_are_two_protocols(root, tmp_path):
-    lists = (PIXELSPLAT, MVSPLAT360, {**PIXELSPLAT, "test3": PAIR})
-    assert len({data_of(root, content, tmp_path).describe()["protocol_views"] for content in lists}) == 3
-
-
 def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
     missing = {f"gone{i}": PAIR for i in range(7)}
     data_of(root, {**PIXELSPLAT, **missing}, tmp_path).store("test")
