@@ -67,7 +67,7 @@ def read_photograph(
 
     Args:
         source: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
-            an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1] (rounded to bytes).
+            an array [height, width, 3] or tensor [3, height, width] of bytes, or floats in [0, 1] (rounded to bytes).
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
         remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
