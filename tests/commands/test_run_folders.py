@@ -1,15 +1,13 @@
 """One process at a time in a run's folder, and a run goes on with the data that it began with."""
 
-import csv
 import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from omegaconf import OmegaConf
-from support import SMALL, script, strict_json
+from support import SMALL, strict_json
 
 from completesplat.commands.jobs import alone_in
 from completesplat.data.toy import write_objects
@@ -109,30 +107,6 @@ def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
 
 FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=4", "trainer.log_every_n_steps=1"]
 FIT += ["callbacks.pictures=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
-
-
-@pytest.mark.slow
-def test_two_trainings_in_one_folder(toy_root, tmp_path):
-    """The second is refused, the first is whole; after a kill the next one goes on at once."""
-    run = tmp_path / "run"
-    given = ["fit", *FIT, f"data.root={toy_root}", f"out={run}", "trainer.max_steps=20", "data.workers=1"]
-    program = [sys.executable, str(script(tmp_path)), *given]
-    for killed in (True, False):
-        first = subprocess.Popen(program, stdout=subprocess.DEVNULL, start_new_session=True)
-        while not (run / "checkpoints/last.ckpt").exists() or str(first.pid) not in (run / ".lock").read_text():
-            assert first.poll() is None
-            time.sleep(0.05)
-        first.send_signal(signal.SIGSTOP)
-        second = subprocess.run(program, capture_output=True, text=True)
-        first.send_signal(signal.SIGCONT)
-        assert second.returncode == 2
-        assert second.stderr.startswith(f"error: {run}: process {first.pid} on ")
-        if killed:
-            first.kill()  # its worker lives on for seconds
-        assert first.wait() == (-signal.SIGKILL if killed else 0)
-    with (run / "metrics.csv").open() as file:
-        steps = [int(row["step"]) for row in csv.DictReader(file) if row["train/mse"]]
-    assert steps == list(range(21))  # each once, and the whole run's figures
 
 
 def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tmp_path, monkeypatch):
