@@ -113,8 +113,9 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     try:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
-        example = "['TEXT','TEXT']" if value.startswith("[") else quoted(value)
-        message = f"cannot be read; a text with such characters wants quotes: {_short(f'"{key}={example}"')}"
+        text = "['TEXT','TEXT']" if value.startswith("[") else quoted(value)
+        example = _short(f'"{key}={text}"')
+        message = f"cannot be read; a text with such characters wants quotes: {example}"
         raise CompleteSplatError(f"{_short(argument)}: {message}") from None
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
