@@ -105,7 +105,8 @@ def end_with_parent() -> None:
     leave_to_parent()
     signal.signal(signal.SIGTERM, _raise)
     parent = parent_process()
-    assert parent is not None and parent.pid is not None
+    assert parent is not None
+    assert parent.pid is not None
     end_with(parent.pid)
 
 
