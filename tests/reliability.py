@@ -91,13 +91,11 @@ def forked(folder: Path, *arguments: str) -> int:
         os._exit(status)
 
 
-def must_work(folder: Path, *arguments: str) -> float:
-    """Run the command; how long it took."""
-    begun = time.monotonic()
+def must_work(folder: Path, *arguments: str) -> None:
+    """Run the command."""
     _, status = os.waitpid(forked(folder, *arguments), 0)
     if status:
         raise RuntimeError(f"status {status} of {' '.join(arguments)}\n{(folder / 'log.txt').read_text()[-3000:]}")
-    return time.monotonic() - begun
 
 
 # kill -9
