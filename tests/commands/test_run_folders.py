@@ -105,7 +105,7 @@ def test_links_in_a_run_s_folder_are_not_followed(command, toy_root, tmp_path):
     assert not any((run / name).is_symlink() for name in written)
 
 
-FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=4", "trainer.log_every_n_steps=1"]
+FIT = [*SMALL, "experiment=toy_var", "test=false", "trainer.max_steps=2", "trainer.log_every_n_steps=1"]
 FIT += ["callbacks.pictures=null", "callbacks.checkpoint.every_n_train_steps=1", "ckpt_path=last"]
 
 
@@ -117,7 +117,7 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     step = ReconstructionModule.training_step
 
     def interrupted(self, *inputs):
-        if self.global_step == 2:
+        if self.global_step == 1:
             raise KeyboardInterrupt
         return step(self, *inputs)
 
@@ -136,6 +136,6 @@ def test_a_run_does_not_go_on_with_other_data_unless_that_is_allowed(command, tm
     went_on = command(*given, "data.allow_changed=true")
     assert went_on.status == 0, went_on.err
     assert said in (run / "commands.log").read_text()
-    assert strict_json(run / "metrics.json")["steps"] == 4
+    assert strict_json(run / "metrics.json")["steps"] == 2
     assert OmegaConf.load(run / "config.yaml").data.allow_changed
     assert "finished before" in command(*given).out
