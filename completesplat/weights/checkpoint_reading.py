@@ -150,7 +150,7 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
 
 
 def check_whole(path: Path) -> None:
-    """Raise WeightsError unless a checkpoint is as it was written.
+    """Raise WeightsError if a checkpoint has changed since it was written.
 
     Without a checksum, as in files that torch wrote, only the end is checked.
     """
