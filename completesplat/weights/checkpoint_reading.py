@@ -156,7 +156,7 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
 
 
 def check_whole(path: Path) -> None:
-    """Raise WeightsError unless a checkpoint, with its shards if several processes wrote it, is as it was written.
+    """Raise WeightsError if a checkpoint, or a shard that another process wrote, has changed since it was written.
 
     Without a checksum, as in files that torch wrote, only the end is checked.
     """
