@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel, VariationalAutoReconstructor
+from completesplat.autoreconstructor.model import VariationalAutoReconstructor
 from completesplat.baselines.splatter_image.files import is_published
 from completesplat.baselines.splatter_image.model import PublishedOneAnswer
 from completesplat.diffusion.guidance import allowed_skip_weight
@@ -24,7 +24,7 @@ from completesplat.geometry.cameras import Cameras
 from completesplat.opening import SavedModel, locate, read_saved
 from completesplat.opening.parts import PartConfig, build, check_architecture, untrained
 from completesplat.scene import Views
-from completesplat.scene_model import SceneModel, camera_tensors, require_one
+from completesplat.scene_model import SceneModel, camera_tensors
 from completesplat.settings.schema import Positive, Seed
 from completesplat.splatter_image import SplatterImage
 from completesplat.tensors import concatenate
@@ -113,7 +113,7 @@ class CompleteSplat(SceneModel):
         return (latent - self.latent_mean) / self.latent_std
 
     @torch.no_grad()
-    def generate(
+    def generate(  # type: ignore[override]
         self,
         images: Float[Tensor, "batch 3 height width"],
         cameras: Cameras,
@@ -228,35 +228,7 @@ class OneAnswer(SceneModel):
     def __init__(self, network: PartConfig, image_size: int, training: Mapping[str, object] | None = None) -> None:
         super().__init__(_checked({"network": untrained(network), "image_size": image_size}, training))
         with torch.random.fork_rng(devices=[]):  # initial weights are random; a run's later draws stay the same
-            self.network: ReconstructionModel = build(self.architecture["network"])
-
-    @property
-    def reconstruction_model(self) -> ReconstructionModel:
-        """Return the network."""
-        return self.network
-
-    @torch.no_grad()
-    def generate(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        cameras: Cameras,
-        depth_range: Float[Tensor, "batch 2"],
-        samples: int = 1,
-        visible: Float[Tensor, "batch 1 height width"] | None = None,
-        **settings: object,
-    ) -> Gaussians:
-        """Reconstruct the scene of each image, in its camera's frame.
-
-        Args:
-            visible: 0 where an image is hidden; hidden pixels have no influence.
-            **settings: sampling options of `CompleteSplat.generate`; they have no effect.
-
-        Raises:
-            CompleteSplatError: several samples are asked for.
-        """
-        require_one(samples)
-        reconstruction: Reconstruction = self.eval().network(images if visible is None else images * visible)
-        return reconstruction.splatter_image.gaussians(cameras, depth_range)
+            self.network = build(self.architecture["network"])
 
     @staticmethod
     def with_trained(

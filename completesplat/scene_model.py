@@ -1,7 +1,6 @@
 """Base class of all models that make scenes from photos: inputs, cameras, units and files."""
 
 import json
-from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ class SceneModel(nn.Module):
         architecture: the config that is written beside the weights; it has `image_size`.
     """
 
+    network: ReconstructionModel
     fov_degrees: Tensor
     depth_range: Tensor
     up: Tensor
@@ -53,18 +53,43 @@ class SceneModel(nn.Module):
         self.register_buffer("up", torch.tensor([0.0, -1.0, 0.0]))
 
     @property
-    @abstractmethod
     def reconstruction_model(self) -> ReconstructionModel:
         """Return the network that makes a Splatter Image without sampling."""
+        return self.network
 
     @property
     def default_steps(self) -> int:
         """Return the number of denoising steps of a drawing without `steps`; 1 if it draws no samples."""
         return 1
 
-    @abstractmethod
-    def generate(self, *inputs: Any, **settings: Any) -> Gaussians:
-        """Generate scenes, see `CompleteSplat.generate`."""
+    @torch.no_grad()
+    def generate(
+        self,
+        images: Float[Tensor, "batch 3 height width"],
+        cameras: Cameras,
+        depth_range: Float[Tensor, "batch 2"],
+        *,
+        samples: int = 1,
+        visible: Float[Tensor, "batch 1 height width"] | None = None,
+        **settings: object,
+    ) -> Gaussians:
+        """Reconstruct the scene of each image, in its camera's frame.
+
+        Args:
+            visible: 0 where an image is hidden; hidden pixels have no influence.
+            **settings: sampling options of `CompleteSplat.generate`; they have no effect.
+
+        Raises:
+            CompleteSplatError: several samples are asked for.
+        """
+        if samples != 1:
+            raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")
+        if visible is not None:
+            images = images * visible + (self.background or 0) * (1 - visible)
+        reconstruction: Reconstruction = self.eval().reconstruction_model(images)
+        scenes = reconstruction.splatter_image.gaussians(cameras, depth_range)
+        # Gaussians without what a subclass adds, such as colours that depend on the direction.
+        return Gaussians(scenes.means, scenes.quaternions, scenes.scales, scenes.opacities, scenes.colors)
 
     @property
     def parameterization(self) -> Parameterization:
@@ -186,12 +211,6 @@ class SceneModel(nn.Module):
             save_file(weights, temporary)
         write_text(folder / CONFIG_FILE, json.dumps(self.architecture, indent=2) + "\n")
         write_sums(folder)
-
-
-def require_one(samples: int) -> None:
-    """Raise CompleteSplatError if several samples are asked of a model that gives one answer."""
-    if samples != 1:
-        raise CompleteSplatError(f"samples={samples}: this model draws none, it gives one answer")
 
 
 def camera_tensors(camera: Mapping[str, Any]) -> dict[str, Tensor]:

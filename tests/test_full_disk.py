@@ -28,7 +28,6 @@ from completesplat.export.ply import write_ply
 from completesplat.export.video import write_video
 from completesplat.files import make_folder, write_text
 from completesplat.tensors import concatenate
-from completesplat.training import sharding
 from completesplat.training.checkpoints import CheckpointFiles
 from completesplat.training.loggers import MetricsFile
 from completesplat.training.reconstruction import ReconstructionModule
@@ -257,16 +256,6 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number
     # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
     assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
     assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None
-
-
-def test_shards_go_where_the_checkpoint_that_names_them_does_not_fit(tmp_path, monkeypatch):
-    strategy = sharding.FullyShardedStrategy(checkpoint_io=CheckpointFiles())
-    for name in ("barrier", "broadcast"):
-        monkeypatch.setattr(strategy, name, lambda value=None: value)
-    monkeypatch.setattr(sharding, "save", lambda *_, **__: None)
-    with quota(1000), pytest.raises(DiskError, match=rf"last\.ckpt: {SAID}"):
-        strategy.save_checkpoint({"state_dict": {"a": torch.ones(3000)}}, tmp_path / "last.ckpt")
-    assert list(tmp_path.iterdir()) == []
 
 
 FULL = """

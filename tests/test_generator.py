@@ -105,15 +105,6 @@ def test_samples_of_a_batch_stand_next_to_each_other(model, picture):
     assert moved.tolist() == [False] * 3 + [True] * 3
 
 
-def test_all_gaussians_lie_on_rays_of_the_stated_field_of_view(model, picture):
-    scene = model(model.read(picture, fov_degrees=90), samples=1)[0]
-    near, far = model.depth_range.tolist()
-    # The offset is small at first: depth stays near the range and |x / z| near tan(45 degrees).
-    assert near - 1 < scene.means[:, 2].min()
-    assert scene.means[:, 2].max() < far + 1
-    assert 0.8 < (scene.means[:, 0] / scene.means[:, 2]).abs().max() < 2
-
-
 def test_training_mode_leaves_the_autoreconstructor_frozen(model):
     model.train()
     assert model.denoiser.training
@@ -167,14 +158,11 @@ def calls_of(model, **settings) -> dict[str, list[int]]:
 def test_a_picture_is_encoded_once_for_all_samples_and_steps_and_only_as_far_as_skips_reach(
     model, guidance_weight, passes
 ):
+    found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
+    assert found == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
     found = calls_of(model, samples=20, steps=4, guidance_weight=guidance_weight)
     once = {"conditioning": [1], "first level": [1], "skip": [20], "reconstructor": [20]}
     assert found == {**once, "denoiser": [20 * passes] * 4}
-
-
-def test_without_skips_a_picture_is_not_encoded(model):
-    found = calls_of(model, samples=2, steps=1, skip_weight=0.0)
-    assert found == {"conditioning": [1], "denoiser": [2], "reconstructor": [2]}
 
 
 def test_latents_are_kept_where_memory_does_not_suffice_to_decode_all_at_once(model, picture, monkeypatch):
@@ -268,18 +256,6 @@ def test_weights_that_are_not_finite_are_refused(folder, tmp_path):
     torch.save(contents, published)
     with pytest.raises(WeightsError, match=rf"{name} is not finite$"):
         CompleteSplat.from_pretrained(published)
-
-
-@pytest.mark.parametrize("target", ["os.system", "completesplat.generator.torch.load"])
-def test_a_configuration_cannot_name_foreign_code(model, folder, target):
-    (folder / SUMS_FILE).unlink()
-    with pytest.raises(WeightsError, match="no part of a model"):
-        model.replace_sampler({"_target_": target, "scheduler": {}})
-    config = json.loads((folder / CONFIG_FILE).read_text())
-    config["sampler"]["scheduler"] = {"_target_": target, "f": "canary"}
-    (folder / CONFIG_FILE).write_text(json.dumps(config))
-    with pytest.raises(WeightsError, match="no part of a model"):
-        CompleteSplat.from_pretrained(folder)
 
 
 def test_cameras_of_any_units_come_to_where_gaussians_start(model):

@@ -33,10 +33,9 @@ def test_a_flipped_bit_is_refused_until_the_checksums_are_rewritten(folder):
     assert locate(folder) == folder / WEIGHTS_FILE
 
 
-@pytest.mark.parametrize("left", [0, 1])
-def test_checksums_must_cover_both_files_or_be_missing(folder, left):
+def test_checksums_must_cover_both_files_or_be_missing(folder):
     sums = folder / SUMS_FILE
-    sums.write_text("".join(sums.read_text().splitlines(keepends=True)[:left]))
+    sums.write_text("".join(sums.read_text().splitlines(keepends=True)[:1]))
     with pytest.raises(WeightsError, match=f"is not the one in {SUMS_FILE}"):
         locate(folder)
     sums.unlink()

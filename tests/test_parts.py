@@ -4,7 +4,6 @@ import copy
 import json
 import math
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import reduce
@@ -102,7 +101,6 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, tmp_pa
     [
         ("denoiser._target_", "mine.Mine", "denoiser names mine.Mine, which is no part of a model; allowed are comp"),
         ("denoiser._target_", "\x1b[2J", r"denoiser names \x1b[2J, which is no part"),
-        ("denoiser", None, "is no part of a model"),
         ("sampler._partial_", True, "sampler._partial_: there is no such setting, but scheduler, steps"),
         (f"{SCHEDULER}._args_", [10**9], "._args_: there is no such setting"),
         ("sampler.steps", "${oc.env:HOME}", "sampler.steps=${oc.env:HOME}: must be a whole number"),
@@ -110,16 +108,13 @@ def test_a_configuration_names_nothing_but_parts_of_a_model(folder, trap, tmp_pa
         ("autoreconstructor.pretrained", "some/hub-id", "autoreconstructor.pretrained=some/hub-id: must be null"),
         ("image_size", 1_000_000, "image_size=1000000: must lie between 8 and 1024"),
         (f"{ENCODER}.channels", [10**9] * 4, "must lie between 1 and 8192"),
-        (f"{ENCODER}.channels", [8] * 1000, "must have at most 8 entries"),
         (f"{ENCODER}.channels", 8, "must be a list"),
         (f"{ENCODER}.first_log_variance", math.inf, "must be finite"),
         ("denoiser.layers_per_block", 10**6, "must lie between 1 and 16"),
         ("autoreconstructor.skip_dropout", math.nan, "must lie between 0 and 1"),
         (f"{SCHEDULER}.num_train_timesteps", 10**9, "must lie between 1 and 10000"),
-        (f"{SCHEDULER}.trained_betas", [0.1] * 20_000, "must have at most 10000 entries"),
         ("more", {}, "a model's settings are autoreconstructor, "),
         ("training", None, "training=None: must be a mapping"),
-        ("training", {"box_masks": 2}, "must lie between 0 and 1"),
         ("training", {"picture_mean": [0.5] * 7}, "must have 8 entries"),
         ("training", {"picture_std": [0.5] * 7 + [0]}, "must lie between 1e-06 and 1"),
     ],
@@ -139,7 +134,7 @@ def test_what_is_no_configuration_at_all_is_refused(folder):
         ('{"image_size": ' + "9" * 5000 + "}", "not readable as JSON"),
         ("[]", "a model's settings are"),
         ("{}", "a model's settings are"),
-        (" " * LARGEST_TEXT + "{}", f"and {LARGEST_TEXT} are plenty"),
+        (" " * LARGEST_TEXT + "{}", f"{LARGEST_TEXT} are plenty"),
     ):
         (folder / CONFIG_FILE).write_text(text)
         assert said in refusal(folder)
@@ -157,26 +152,6 @@ def test_a_network_is_not_larger_than_its_file(folder, place, value, tensor):
     message = refusal(folder)
     assert tensor in message
     assert f"by {CONFIG_FILE}" in message
-
-
-@pytest.mark.slow
-@pytest.mark.processes
-def test_no_memory_is_asked_for_that_the_file_does_not_have(folder):
-    change(folder, "denoiser.channels", [1024] * 4)
-    program = f"""
-        import resource
-        from completesplat.generator import CompleteSplat
-        from completesplat.weights import SHIPPED
-        CompleteSplat.from_pretrained(SHIPPED / "toy_objects")
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        try:
-            CompleteSplat.from_pretrained({str(folder)!r})
-        except Exception:
-            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-    """
-    program = "\n".join(line.removeprefix(" " * 8) for line in program.splitlines())
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert int(found) < 100_000  # kB; such a network takes a million
 
 
 def settings(part: dict, place: str = "") -> Iterator[str]:

@@ -92,11 +92,8 @@ REPEATED = tensor(2 * MEBIBYTE)
 ASKS = {
     "bytearray": called("builtins.bytearray", number(2**31)),
     "FloatTensor": called("torch.FloatTensor", number(2**31)),
-    "UntypedStorage": called("torch.storage.UntypedStorage", number(2**31)),
-    "bytearray of Python 2": called("__builtin__.bytearray", number(2**31)),
     "new object": named("collections.Counter") + REPEATED + b"\x85\x81",
     "hexadecimal digits": doubled(24, text("Hex-Codec")),
-    "hexadecimal digits by a short string": doubled(24, b"U\x03hex"),
     "one text often": kept(text("x" * MEBIBYTE), lambda x: ENCODE + b"(" + x + text("latin1") + b"tR", 200),
     "one argument often": kept(b"(" + text("x" * MEBIBYTE) + text("latin1") + b"t", lambda x: ENCODE + x + b"R", 200),
     "one dictionary often": kept(dictionary(10_000), lambda x: named("collections.Counter") + x + b"\x85R", 400),
@@ -105,7 +102,6 @@ ASKS = {
     "numbers counted": called("collections.Counter", REPEATED),
     "numbers as pairs": called("collections.OrderedDict", REPEATED),
     "numbers as sizes": called("torch.Size", REPEATED),
-    "numbers as arguments": ENCODE + REPEATED + b"R",
     "numbers as a length": storage(length=tensor(2**22)),
     "numbers as a state": named("collections.OrderedDict") + b")R" + REPEATED + b"b",
 }  # fmt: skip

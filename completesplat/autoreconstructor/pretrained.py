@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors.torch import load_file
@@ -40,12 +39,13 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     Args:
         source: a folder with `config.json` and `diffusion_pytorch_model.safetensors` (or `.bin`), a folder with these
             in a subfolder `vae`, or a hub id of either.
-        reconstructor: None loads the encoder alone; the checkpoint may then lack a decoder.
+        reconstructor: None loads the encoder of a conditioning; the checkpoint may then lack a decoder.
 
     Raises:
         WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
     """
-    folder = _vae_folder(source)
+    part = "conditioning" if reconstructor is None else "autoreconstructor"
+    folder = _vae_folder(source, part)
     weights = {_current_name(name): value for name, value in _read_weights(folder).items()}
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
@@ -61,31 +61,35 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
         reason = f"its group normalisation has {groups} groups and {encoder.network.conv_norm_out.num_groups} here"
     if reason is not None:
-        raise WeightsError(f"{folder}: {reason}; {_needed_settings(config)}")
+        raise WeightsError(f"{folder}: {reason}; {_needed_settings(config, part)}")
     vae.load_state_dict(given, strict=False)
 
 
-def _needed_settings(config: Mapping[str, Any]) -> str:
+def _needed_settings(config: Mapping[str, object], part: str) -> str:
+    """Describe the options that fit a VAE's config: those of the autoreconstructor's encoder, or of a conditioning."""
+    conditioning = part == "conditioning"
+    names = SETTINGS | ({"latent_channels": "out_channels"} if conditioning else {})
+    place = part if conditioning else f"{part}.encoder"
     overrides = [
-        f"autoreconstructor.encoder.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
-        for theirs, ours in SETTINGS.items()
+        f"{place}.{ours}={json.dumps(config[theirs], separators=(',', ':'))}"
+        for theirs, ours in names.items()
         if theirs in config
     ]
     return f"its config.json asks for {' '.join(overrides)}" if overrides else "its config.json gives no sizes"
 
 
-def _vae_folder(source: str) -> Path:
+def _vae_folder(source: str, part: str) -> Path:
     """Return the folder of the VAE's files; download it from the hub if `source` is not a folder."""
     local = Path(source).expanduser()
     if local.exists():
         hint = "give a folder from `hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`"
         folder = _find(local)
     elif HUB_ID.fullmatch(source):
-        hint = _fetch_hint(source)
+        hint = _fetch_hint(source, part)
         names = [[f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)] for file in WEIGHTS_FILES]
         folder = _find(from_hub(source, names[0], hint)) or _find(from_hub(source, names[1], hint))
     else:
-        raise WeightsError(f"{source}: no such folder; {_fetch_hint('CompVis/stable-diffusion-v1-4')}")
+        raise WeightsError(f"{source}: no such folder; {_fetch_hint('CompVis/stable-diffusion-v1-4', part)}")
     if folder is None:
         files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
         raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {hint}")
@@ -99,14 +103,14 @@ def _find(folder: Path) -> Path | None:
     return None
 
 
-def _fetch_hint(hub_id: str) -> str:
+def _fetch_hint(hub_id: str, part: str) -> str:
     return (
         f"where there is a network, `hf download {hub_id} --local-dir DIR` fetches it (of a whole pipeline, "
-        "`--include 'vae/*'` is enough); then give autoreconstructor.pretrained=DIR"
+        f"`--include 'vae/*'` is enough); then give {part}.pretrained=DIR"
     )
 
 
-def _read_config(path: Path) -> dict[str, Any]:
+def _read_config(path: Path) -> dict[str, object]:
     try:
         config = json.loads(path.read_text())
     except (OSError, ValueError) as error:

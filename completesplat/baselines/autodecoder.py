@@ -51,7 +51,7 @@ class AutoDecoder(nn.Module):
         self.codes = nn.Parameter(INITIAL_STD * torch.randn(rows, *self.shape).to(device))
         self._rows: dict[tuple[str, int], int] = {}
 
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *others: Any) -> None:
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *others: object) -> None:
         if (codes := state_dict.get(f"{prefix}codes")) is not None and len(codes) != len(self.codes):
             self.make_room(len(codes))
         super()._load_from_state_dict(state_dict, prefix, *others)
@@ -67,7 +67,7 @@ class AutoDecoder(nn.Module):
 
     def _row(self, name: str, frame: int) -> int:
         if (name, frame) not in self._rows and len(self._rows) == len(self.codes):
-            raise CompleteSplatError(f"all {len(self.codes)} codes are taken: this is a picture of another data set")
+            raise CompleteSplatError(f"all {len(self.codes)} codes are taken: this is an image of another data set")
         return self._rows.setdefault((name, frame), len(self._rows))
 
     def get_extra_state(self) -> list[list[str | int]]:

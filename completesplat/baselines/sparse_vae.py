@@ -79,18 +79,18 @@ class SparseVAE(nn.Module):
         # A channel that does not vary is only centred; a layer without Gaussians is not normalised.
         self.std.copy_(torch.where(variance > 1e-8, variance, 1.0).sqrt())
 
-    def errors(self, found: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
+    def errors(self, predicted: SplatterImage, truth: SplatterImage) -> dict[str, Float[Tensor, ""]]:
         """Return the reconstruction error of each group of raw values.
 
         It is the mean squared error of the normalised values over occupied places; for "opacity", the binary cross
         entropy over all places in nats, where an empty place has opacity 0.
         """
         mask = occupied(truth)[:, :, None]
-        squared = torch.where(mask, self.normalize(found.raw) - self.normalize(truth.raw), 0.0).square()
+        squared = torch.where(mask, self.normalize(predicted.raw) - self.normalize(truth.raw), 0.0).square()
         places = mask.sum().clamp(min=1)
         errors = {
             name: group.sum() / (places * group.shape[2])
             for name, group in SplatterImage(squared, truth.parameterization).split().items()
         }
-        logits, opacities = found.split()["opacity"], truth.split()["opacity"].sigmoid()
+        logits, opacities = predicted.split()["opacity"], truth.split()["opacity"].sigmoid()
         return errors | {"opacity": nn.functional.binary_cross_entropy_with_logits(logits, opacities)}

@@ -9,18 +9,10 @@ from torch import Tensor, nn
 
 from completesplat.autoreconstructor.encoder import Encoder, vae_encoder
 from completesplat.autoreconstructor.pretrained import load_pretrained
-from completesplat.errors import WeightsError
 from completesplat.settings.schema import Few, Width, Widths
 
 STABLE_DIFFUSION_SCALE = 0.18215
 """Scale of Stable Diffusion's latents (CompVis `configs/stable-diffusion/v1-inference.yaml`, scale_factor)."""
-
-# Options as errors of `load_pretrained` name them, and a conditioning's options in their place.
-SETTINGS = {
-    "autoreconstructor.encoder.latent_channels=": "conditioning.out_channels=",
-    "autoreconstructor.encoder.": "conditioning.",
-    "autoreconstructor.pretrained=": "conditioning.pretrained=",
-}
 
 
 class LearnedConditioning(nn.Module):
@@ -81,7 +73,7 @@ class StableDiffusionConditioning(nn.Module):
         self.out_channels = out_channels
         self.encoder = Encoder(channels, layers_per_block, out_channels, norm_groups)
         if pretrained is not None:
-            _load_encoder(self.encoder, pretrained)
+            load_pretrained(pretrained, self.encoder)
         self.requires_grad_(False).eval()
 
     def train(self, mode: bool = True) -> "StableDiffusionConditioning":
@@ -93,13 +85,3 @@ class StableDiffusionConditioning(nn.Module):
         """Return features of sRGB images in [0, 1], at an eighth of their resolution."""
         mean: Tensor = self.encoder(images)[0].mean
         return mean * STABLE_DIFFUSION_SCALE
-
-
-def _load_encoder(encoder: Encoder, source: str) -> None:
-    try:
-        load_pretrained(source, encoder)
-    except WeightsError as error:
-        message = str(error)
-        for theirs, ours in SETTINGS.items():
-            message = message.replace(theirs, ours)
-        raise WeightsError(message) from error

@@ -10,6 +10,7 @@ from completesplat.errors import WeightsError
 from completesplat.losses.weighted_sum import Prediction
 from completesplat.scene import Views
 from completesplat.weights import weights_file
+from completesplat.weights.checkpoint_reading import mismatch
 
 BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
 URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
@@ -61,17 +62,16 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
     path = weights_file(weights, sha256, ADVICE, "loss.terms.lpips.term.vgg_sha256")
     try:
         contents = torch.load(path, map_location="cpu", weights_only=True)
-        part = {key: value for key, value in contents.items() if key.startswith("features.")}
+        tensors = {key: value for key, value in contents.items() if isinstance(value, Tensor)}
+        part = {key: value for key, value in tensors.items() if key.startswith("features.")}
     except Exception as error:
         raise WeightsError(f"{path}: not a readable state dict ({type(error).__name__}); {ADVICE}") from error
     # On "meta", the network draws no random weights: a run's seed gives the same with and without this loss.
     with torch.device("meta"):
         network = VGG16Features()
-    try:
-        network.load_state_dict(part, assign=True)
-    except RuntimeError as error:
-        first = str(error).splitlines()[1].strip()
-        raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({first:.200}); {ADVICE}") from error
+    if reason := mismatch(network.state_dict(), part):
+        raise WeightsError(f"{path}: not the weights of torchvision's vgg16 ({reason}); {ADVICE}")
+    network.load_state_dict(part, assign=True)
     return network.float()
 
 

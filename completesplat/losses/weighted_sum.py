@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple, Protocol, TypedDict
+from typing import Annotated, NamedTuple, Protocol, TypedDict
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from completesplat.tensors import TensorDataclass
 
 @dataclass(frozen=True)
 class Prediction(TensorDataclass):
-    """Rendered images of the reference and all targets (sRGB), the Gaussians they show, and the posterior if any."""
+    """Rendered images of the reference and all targets (sRGB), their Gaussians, and the posterior if any."""
 
     images: Float[Tensor, "batch view 3 height width"]
     gaussians: Gaussians
@@ -43,7 +43,7 @@ class Term(TypedDict, total=False):
     """Options of a `Weighted`."""
 
     weight: Annotated[float, Range(0)]
-    term: Any
+    term: LossTerm
     start_step: Natural
 
 

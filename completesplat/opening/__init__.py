@@ -187,8 +187,7 @@ def _read(checkpoint: Path) -> tuple[Path, Any]:
 
 def _plain(config: object) -> dict[str, Any]:
     """Return a config as plain containers, with its references to other settings as they are written."""
-    plain: Any = OmegaConf.to_container(config, resolve=False)
-    return dict(plain)
+    return dict(OmegaConf.to_container(config, resolve=False))  # type: ignore[arg-type]
 
 
 def _changed(config: Any, overrides: list[str]) -> Any:

@@ -128,11 +128,11 @@ def read_architecture(path: Path) -> dict[str, Any]:
         WeightsError: the config cannot be read, or `check_architecture` refuses it.
     """
     try:
-        architecture: dict[str, Any] = json.loads(read_small(path))
+        architecture = json.loads(read_small(path))
     except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: not readable as JSON ({error})") from error
     check_architecture(architecture, path)
-    return architecture
+    return dict(architecture)
 
 
 def untrained(part: Any) -> Any:
@@ -187,7 +187,7 @@ def build(part: PartConfig) -> Any:
     return CLASSES[str(settings.pop("_target_"))](**settings)
 
 
-def check_sizes(architecture: Mapping[str, Any], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:
+def check_sizes(architecture: Mapping[str, PartConfig], tensors: Mapping[str, Tensor], files: tuple[str, str]) -> None:
     """Compare the networks' tensors with those in a file; `files` names the tensors' file and the config's.
 
     Raises:

@@ -50,7 +50,7 @@ def write_sums(folder: Path) -> None:
 def read_small(path: Path) -> str:
     """Return the text of a file about weights; raise WeightsError if it has more than 1 MB."""
     if path.stat().st_size > LARGEST_TEXT:
-        raise WeightsError(f"{path}: of {path.stat().st_size} bytes, and {LARGEST_TEXT} are plenty")
+        raise WeightsError(f"{path}: {path.stat().st_size} bytes; {LARGEST_TEXT} are plenty")
     return path.read_text(errors="replace")
 
 
@@ -82,7 +82,7 @@ def from_hub(
 
 
 def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: str) -> Path:
-    """Return the path of a file, or of the file at a URL (http or https), downloaded into torch's hub cache once.
+    """Return the path of a file, or of the file at a URL, downloaded once into torch's hub cache (as by torchvision).
 
     Args:
         sha256: the file's SHA-256, or its first digits; None takes any file.
@@ -92,28 +92,23 @@ def weights_file(weights: str, sha256: str | None, advice: str, hash_setting: st
     Raises:
         WeightsError: the file is missing, cannot be downloaded, or has another SHA-256.
     """
+    import torch
+
     expected = None if sha256 is None else sha256.lower()
-    url = weights.startswith(("http://", "https://"))
-    path = _download_file(weights, expected, advice) if url else Path(weights).expanduser()
+    path = Path(weights).expanduser()
+    if weights.startswith(("http://", "https://")):
+        path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(weights).path).name
+        try:
+            if not path.is_file():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                torch.hub.download_url_to_file(weights, str(path), hash_prefix=expected)
+        except (OSError, RuntimeError) as error:
+            reason = f"cannot be downloaded to {path.parent} ({error})"
+            raise WeightsError(f"{weights} {reason}; elsewhere, {advice}") from error
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; {advice}")
     if expected is not None and not (actual := sha256_of(path)).startswith(expected):
         raise WeightsError(
             f"{path}: SHA-256 {actual}, not {sha256}; {advice} (if that file is meant, {hash_setting}={actual})"
         )
-    return path
-
-
-def _download_file(url: str, sha256: str | None, advice: str) -> Path:
-    """Download a URL's file into torch's hub cache, which torchvision uses too, unless it is there."""
-    import torch
-
-    path = Path(torch.hub.get_dir()) / "checkpoints" / Path(urlparse(url).path).name
-    if path.is_file():
-        return path
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(url, str(path), hash_prefix=sha256)
-    except (OSError, RuntimeError) as error:
-        raise WeightsError(f"{url} cannot be downloaded to {path.parent} ({error}); elsewhere, {advice}") from error
     return path

@@ -1,20 +1,17 @@
 """Options that change memory or speed, and nothing else: of the autoreconstructor and of the regression baseline."""
 
-import json
 from typing import Any
 
 import jaxtyping
 import pytest
 import torch
 from hydra.utils import instantiate
-from support import compose_config, tiny_generator
+from support import compose_config
 from torch import Tensor, nn
 
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.generator import CompleteSplat
 from completesplat.scene import SceneBatch
 from completesplat.training.reconstruction import ReconstructionModule
-from completesplat.weights import SUMS_FILE
 
 MODELS = {"var": "autoreconstructor", "splatter_image": "regressor"}
 
@@ -93,16 +90,6 @@ def test_blocks_run_twice_in_training_only(scenes, model):
     with torch.no_grad():
         loss(checkpointed.train(), scenes)
     assert len(calls) == 4
-
-
-def test_weights_saved_before_there_was_gradient_checkpointing_load(tmp_path):
-    tiny_generator().save_pretrained(tmp_path)
-    (tmp_path / SUMS_FILE).unlink()
-    config = json.loads((tmp_path / "config.json").read_text())
-    assert config["autoreconstructor"].pop("gradient_checkpointing") is False
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    loaded = CompleteSplat.from_pretrained(tmp_path).autoreconstructor
-    assert (loaded.encoder.gradient_checkpointing, loaded.reconstructor.gradient_checkpointing) == (False, False)
 
 
 @pytest.mark.parametrize("model", MODELS)

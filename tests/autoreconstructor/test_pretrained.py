@@ -5,9 +5,7 @@ import torch
 from hydra.utils import instantiate
 from pretrained_vaes import BIN, SAFETENSORS, build, rewrite, stable_diffusion_vae
 from safetensors.torch import load_file
-from support import compose_config, tiny_generator
-
-from completesplat.generator import CompleteSplat
+from support import compose_config
 
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
 
@@ -115,10 +113,3 @@ def test_stable_diffusions_size_is_the_published_one():
     assert round(decoder / 1e6, 2) == 49.49
     assert parameters(model.reconstructor) == decoder + 27 * (128 * 9 + 1) + parameters(model.reconstructor.skips)
     assert parameters(model.reconstructor.skips) == 128 * 256 + 256
-
-
-def test_a_generator_neither_needs_nor_records_what_its_autoreconstructor_started_from(tmp_path):
-    parts = dict(tiny_generator().architecture)
-    parts["autoreconstructor"] |= {"pretrained": str(tmp_path / "absent")}
-    CompleteSplat(**parts).save_pretrained(tmp_path / "weights")
-    assert CompleteSplat.from_pretrained(tmp_path / "weights").architecture["autoreconstructor"]["pretrained"] is None

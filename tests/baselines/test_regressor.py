@@ -1,11 +1,9 @@
 """The regression baseline: its sizes, its first prediction, and that it trains like any stage 1."""
 
-import math
-
 import pytest
 import torch
 from hydra.utils import instantiate
-from support import SMALL, compose_config, strict_json
+from support import compose_config
 
 from completesplat.baselines.regressor import SplatterImageUNet
 from completesplat.splatter_image import Parameterization
@@ -90,37 +88,9 @@ def test_the_full_size_is_upstreams_but_for_the_differences_it_states():
     assert count == upstream_count() + time + 4 * attention(256) - shortcuts - second_convolution
 
 
-def test_the_tiny_one_is_as_large_as_the_tiny_autoreconstructor():
-    config = compose_config("fit")
-    with torch.device("meta"):
-        models = [instantiate(config[name], _convert_="all") for name in ("regressor", "autoreconstructor")]
-    one, other = (sum(p.numel() for p in model.parameters()) for model in models)
-    assert one == pytest.approx(other, rel=0.05)
-
-
-@pytest.mark.parametrize("ablation", ["full", "m1", "skips_first_two"])
+@pytest.mark.parametrize("ablation", ["m1", "skips_first_two"])
 def test_it_composes_with_ablations(ablation):
     settings = ["experiment=toy_var", "model=splatter_image", "rasterizer=reference", f"ablation={ablation}"]
     module = instantiate(compose_config("fit", *settings).model, _convert_="all")
     assert isinstance(module.model, SplatterImageUNet)
     assert module.model.parameterization.layers == 1
-
-
-def test_experiments_on_real_data_take_the_full_size():
-    needed = ["data.root=x", "model.checkpoint=null"]
-    config = compose_config("fit", "experiment=paper_var_stage2", "model=splatter_image", *needed)
-    assert config.model.model.channels == [128, 256, 256, 256]
-    assert [config.data.image_size >> level for level in config.model.model.attention_levels] == [16]
-
-
-def test_it_trains_and_its_checkpoint_is_scored(command, toy_root, tmp_path):
-    run, scores = tmp_path / "run", tmp_path / "scores"
-    fit = ["fit", "experiment=toy_var", "model=splatter_image", f"data.root={toy_root}", f"out={run}"]
-    assert command(*fit, *SMALL, "trainer.precision=bf16-mixed").status == 0
-    trained = strict_json(run / "metrics.json")
-    assert trained["steps"] == 2
-    assert math.isfinite(trained["train/loss"])
-    assert trained["train/kl"] == 0
-    checkpoint = run / "checkpoints/last.ckpt"
-    assert command("test", f"ckpt={checkpoint}", f"out={scores}", "trainer.accelerator=cpu").status == 0
-    assert strict_json(scores / "metrics.json")["model"]["scenes"] > 0

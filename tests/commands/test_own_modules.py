@@ -11,7 +11,6 @@ from support import SMALL, strict_json
 from written_commands import ROOT
 
 from completesplat import compose
-from completesplat.settings.arguments import split_flags
 
 MINE = """
 from torch import nn
@@ -74,11 +73,6 @@ def test_the_packages_settings_come_first_and_those_of_the_working_folder_are_fo
     for verb in ("fit", "test", "predict", "view"):
         assert compose(verb, "rasterizer=mine").rasterizer._target_ == "mine.Mine"
     assert compose("fit", "rasterizer=reference").rasterizer._target_.startswith("completesplat.")
-
-
-def test_where_a_folder_of_settings_is_named_does_not_matter():
-    assert split_flags(["a=1", "-cd", "b", "c=2"]) == (["-cd=b"], ["a=1", "c=2"])
-    assert split_flags(["x", "--config-dir=a=b"]) == (["--config-dir=a=b"], ["x"])
 
 
 SPACE = "completesplat.viewer.space"

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from PIL import Image
 from published_weights import write_published
-from support import LIMIT, SMALL, compose_config, strict_json
+from support import SMALL, compose_config, strict_json
 
 from completesplat.baselines.splatter_image.directional import DirectionalRasterizer
 from completesplat.baselines.splatter_image.model import PublishedOneAnswer
@@ -136,15 +134,6 @@ def test_a_test_sees_objects_only_at_their_depths_and_its_figures_stand_apart(co
     assert found.means.shape == (len(depths), 32 * 32, 3)
 
 
-def test_the_option_of_fit_is_the_same_network(tmp_path):
-    weights = write_published(tmp_path, "objaverse")
-    settings = ["model=splatter_image_published", f"model.model.weights={weights}", "rasterizer=reference"]
-    module = instantiate(compose_config("fit", *settings).model, _convert_="all")
-    assert OmegaConf.is_missing(compose_config("fit", settings[0]).model.model, "weights")
-    assert (module.method, module.draws_samples) == ("PublishedSplatterImage", False)
-    assert all(parameter.requires_grad for parameter in module.model.parameters())
-
-
 def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tmp_path):
     weights = write_published(tmp_path / "captures", "hydrants", size=32)
     given = ["experiment=toy_var", "model=splatter_image_published", f"model.model.weights={weights}", *SMALL]
@@ -164,23 +153,3 @@ def test_what_is_trained_on_is_predicted_with_from_its_run(command, toy_root, tm
     finished = command("predict", str(cut_out(tmp_path / "a.png")), "weights=RUN", *quick)
     assert finished.status == 0, finished.err
     assert (tmp_path / "OUT/a/sample_00.ply").is_file()
-
-
-def test_the_page_has_no_sliders_for_one_answer(tmp_path):
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    from completesplat.commands.view import make_page
-    from completesplat.viewer.access import start_server
-
-    weights, image = write_published(tmp_path / "objects", "objaverse"), cut_out(tmp_path / "a.png")
-    export = tmp_path / "page.html"
-    settings = [f"weights={weights}", f"image={image}", f"export={export}", "rasterizer=reference"]
-    page = make_page(start_server(0), compose_config("view", *settings), tmp_path)
-    try:
-        assert page.worker.wait(LIMIT)
-        assert [sample.gaussians.count for sample in page.view.samples] == [16 * 16]
-        handles = page.server.gui._gui_input_handle_from_uuid.values()
-        shown = [getattr(handle, "label", "") for handle in handles if handle.visible]
-        assert "Samples" not in shown
-        assert "Keep earlier samples" in shown
-    finally:
-        page.close()

@@ -19,13 +19,6 @@ def sampler():
     return Sampler(FlowMatchEulerDiscreteScheduler(), steps=5)
 
 
-def test_noisy_latents_lie_on_the_line_from_latent_to_noise(sampler):
-    time = torch.tensor([250, 1000])
-    noisy = sampler.add_noise(CLEAN, NOISE, time)
-    torch.testing.assert_close(noisy[0], 0.75 * CLEAN[0] + 0.25 * NOISE[0])
-    torch.testing.assert_close(noisy[1], NOISE[1])
-
-
 def test_the_target_is_the_velocity_and_gives_the_latent_back(sampler):
     time = torch.tensor([400, 400])
     velocity = target(sampler.scheduler, CLEAN, NOISE, time)

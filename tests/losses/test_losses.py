@@ -70,14 +70,6 @@ def test_regularizers_are_means_over_all_gaussians(pair):
     assert MeanOpacity()(predicted, views(pair[1])).item() == pytest.approx(0.7)
 
 
-@pytest.mark.parametrize("name", ["scale", "opacity"])
-def test_a_regularizer_is_on_when_it_has_a_weight(name):
-    off = instantiate(compose_config("fit").loss, _convert_="all")
-    on = instantiate(compose_config("fit", f"loss.terms.{name}.weight=0.01").loss, _convert_="all")
-    assert set(on.terms) - set(off.terms) == {name}
-    assert on.terms[name].weight == 0.01
-
-
 class Constant:
     """A term that counts how often it is computed."""
 

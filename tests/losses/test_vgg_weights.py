@@ -29,12 +29,6 @@ def refusal(vgg_weights: object, sha256: str | None = None) -> str:
     return message
 
 
-def test_another_file_than_the_hash_says_is_refused(vgg_file):
-    message = refusal(vgg_file, "0" * 64)
-    assert digest(vgg_file) in message
-    assert "0" * 64 in message
-
-
 def test_a_file_that_is_no_state_dict_is_refused_and_code_in_it_not_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for content in ([1, 2], {"features.0.weight": Malicious()}):
@@ -54,10 +48,10 @@ class Malicious:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("features.28.bias", None, 'Missing key(s) in state_dict: "features.28.bias"'),
-        ("features.0.weight", torch.zeros(64, 1, 3, 3), "size mismatch for features.0.weight"),
+        ("features.28.bias", None, "features.28.bias is missing there"),
+        ("features.0.weight", torch.zeros(64, 1, 3, 3), "features.0.weight is [64, 1, 3, 3] there"),
         # vgg16_bn and vgg19 have more entries than vgg16.
-        ("features.34.weight", torch.zeros(1), 'Unexpected key(s) in state_dict: "features.34.weight"'),
+        ("features.34.weight", torch.zeros(1), "features.34.weight has no place here"),
     ],
 )
 def test_weights_of_another_layout_are_refused(key, value, said, tmp_path):

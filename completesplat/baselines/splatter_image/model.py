@@ -22,9 +22,8 @@ from completesplat.baselines.splatter_image.files import find, read_tensors
 from completesplat.baselines.splatter_image.network import SongUNet
 from completesplat.data.images.photograph import ImageLike, Photograph, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
-from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.scene_model import SceneModel, require_one
+from completesplat.scene_model import SceneModel
 from completesplat.splatter_image import CHANNELS, SH_C0, Parameterization, SplatterImage
 from completesplat.weights.checkpoint_reading import mismatch
 
@@ -180,7 +179,7 @@ class PublishedOneAnswer(SceneModel):
     def __init__(self, weights: str) -> None:
         network = PublishedSplatterImage(weights)
         super().__init__({"image_size": network.image_size})
-        self.network = network.eval().requires_grad_(False)
+        self.network: PublishedSplatterImage = network.eval().requires_grad_(False)
         self.background = network.background
         self.fov_degrees.fill_(PHONE_FOV if network.fov_degrees is None else network.fov_degrees)
         color = "white" if network.background else "black"
@@ -188,11 +187,6 @@ class PublishedOneAnswer(SceneModel):
             "Splatter Image (Szymanowicz et al., CVPR 2024), another method. It knows objects on "
             f"{color}: give images that are transparent or {color} around one, or background=remove"
         )
-
-    @property
-    def reconstruction_model(self) -> PublishedSplatterImage:
-        """Return the network."""
-        return self.network
 
     def needed_of_data(self, data: Mapping[str, object]) -> dict[str, object]:
         """Return size and background, and for weights of captures the depth range around an object.
@@ -219,8 +213,7 @@ class PublishedOneAnswer(SceneModel):
         known = self.network.fov_degrees
         if known is not None and fov_degrees is not None:
             raise CompleteSplatError(f"fov={fov_degrees:g}: these weights take every image as of {known:.0f} degrees")
-        share = None if known is None else OBJECT_SHARE
-        background = self.network.background
+        share, background = (None if known is None else OBJECT_SHARE), self.network.background
         photograph = read_photograph(
             image, self.image_size, fov_degrees, PHONE_FOV, remove_background, background, share
         )
@@ -232,23 +225,6 @@ class PublishedOneAnswer(SceneModel):
         distance = self.network.object_distance(photograph.image, focal_length)
         known = torch.tensor([0.0, distance + self.network.depths.far], device=self.up.device)
         return self.network.depths.range(known)
-
-    @torch.no_grad()
-    def generate(
-        self,
-        images: Float[Tensor, "batch 3 height width"],
-        cameras: Cameras,
-        depth_range: Float[Tensor, "batch 2"],
-        samples: int = 1,
-        visible: Float[Tensor, "batch 1 height width"] | None = None,
-        **settings: object,
-    ) -> Gaussians:
-        """Return scenes as `OneAnswer.generate`, in the colours that the cameras see; hidden pixels are background."""
-        require_one(samples)
-        if visible is not None:
-            images = images * visible + self.network.background * (1 - visible)
-        scenes: DirectionalGaussians = self.network(images).splatter_image.gaussians(cameras, depth_range)
-        return scenes.seen_from(cameras.centers)
 
     def save_pretrained(self, path: Path | str) -> None:
         """Raise WeightsError, because published weights stay in their authors' files."""
