@@ -6,7 +6,7 @@ completesplat.write_ply("scene.ply", scenes[0])
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from completesplat.export.ply import read_ply as read_ply
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _PLACES = {"CompleteSplat": "generator", "Gaussians": "gaussians", "read_ply": "export.ply", "write_ply": "export.ply"}
-_PLACES |= {"compose": "commands", "instantiate": "commands.fit"}
+_PLACES |= {"compose": "settings.composition", "instantiate": "commands.fit"}
 _PLACES |= {"LatentDiffusion": "training.latent_diffusion", "ReconstructionModule": "training.reconstruction"}
 
 
-def __getattr__(name: str) -> Any:
-    """Import what is asked for, so that the package itself is there without waiting for torch."""
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used, so that importing the package does not import torch."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)

@@ -4,21 +4,7 @@ import io
 import os
 import sys
 
-VERBS = {
-    "data": "make, check, look at, import and prepare data sets",
-    "fit": "train a model, one stage at a time",
-    "test": "score a trained model on held-out scenes",
-    "predict": "draw complete scenes from photographs (predict photo.jpg [more.jpg ...])",
-    "view": "a page in the browser: look at scenes, draw new ones from a photograph (view PATH)",
-    "report": "tables beside the paper's (report runs=DIR), a page with all (report html), samplers, ... (report NAME)",
-    "new": "start a part of your own in this folder: loss, rasterizer, dataset, ablation or experiment (new loss NAME)",
-    "bench": "time what takes time (bench rasterizers, bench data, bench startup, ...)",
-    "doctor": "what this machine has and lacks, and whether completing a photograph can work",
-}
-USAGE = "usage: completesplat VERB [key=value ...]      completesplat VERB --help\n\n" + "\n".join(
-    f"  {verb:9} {description}" for verb, description in VERBS.items()
-)
-USAGE += "\n\ncompletesplat completion bash|zsh|fish prints what makes that shell complete verbs, groups and settings"
+VERBS = ("data", "fit", "test", "predict", "view", "report", "new", "bench", "doctor")
 
 
 def main() -> None:
@@ -27,24 +13,22 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     arguments = sys.argv[1:]
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(USAGE)
-        return
-    if arguments[0] == "--version":
-        from completesplat import __version__
-
-        print(f"completesplat {__version__}")
-        return
     try:
         os.getcwd()
     except FileNotFoundError:
         sys.exit(_refuse("the working folder was removed: go to another folder"))
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        return _help()
+    if arguments[0] == "--version":
+        from completesplat import __version__
+
+        return print(f"completesplat {__version__}")
     if arguments[0] in ("--complete", "completion"):
         return _complete(arguments[1:], script=arguments[0] == "completion")
     if arguments[0] not in VERBS:
-        from completesplat.settings.options import meant
+        from completesplat.settings.options import did_you_mean
 
-        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{meant(arguments[0], VERBS)}"))
+        sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{did_you_mean(arguments[0], VERBS)}"))
 
     # This must be set before torch is loaded. By default its idle threads (GNU OpenMP's) spin for milliseconds and
     # so keep the rasterizer's threads and other processes off the cores.
@@ -63,6 +47,17 @@ def main() -> None:
         if message is None:
             raise
         sys.exit(_refuse(message, exit_status(error)))
+
+
+def _help() -> None:
+    """Print the verbs with their descriptions in `conf/`."""
+    from completesplat.settings.options import read
+
+    print("usage: completesplat VERB [key=value ...]      completesplat VERB --help\n")
+    for verb in VERBS:
+        descriptions = {setting.key: setting.value for setting in read(verb).settings}
+        print(f"  {verb:9} {descriptions['description']}")
+    print("\ncompletesplat completion bash|zsh|fish prints a script that makes this shell complete verbs and settings")
 
 
 def _complete(words: list[str], script: bool) -> None:

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from completesplat.autoreconstructor.model import Reconstruction, ReconstructionModel
-from completesplat.data.images.photograph import Photograph, Picture, picture_features, read_photograph
+from completesplat.data.images.photograph import ImageLike, Photograph, image_features, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.files import atomic_path, make_folder, write_text
 from completesplat.gaussians import Gaussians
@@ -105,7 +105,7 @@ class SceneModel(nn.Module):
         return {"image_size": self.image_size}
 
     def forward(
-        self, image: Photograph | Picture, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
+        self, image: Photograph | ImageLike, visible: Float[Tensor, "1 _ _"] | None = None, **settings: Any
     ) -> list[Gaussians]:
         """Generate complete scenes from one photo, in its camera's frame (+x right, +y down, +z forward).
 
@@ -162,14 +162,16 @@ class SceneModel(nn.Module):
             CompleteSplatError: the axes are parallel, or meet behind the first camera.
         """
         center = nearest_to_axes(cameras)
-        depth = 0.0 if center is None else transform_points(cameras[0].world_to_camera, center[None])[0, 2].item()
+        depth = (
+            0.0 if center is None else transform_points(cameras[0].world_to_camera, center.float()[None])[0, 2].item()
+        )
         if depth <= 0:
             raise CompleteSplatError("the cameras do not look at one place: where the scene lies cannot be told")
         near, far = self.depth_range.tolist()
         share = self.parameterization.first_depth
         return cameras.scale_world(torch.tensor((near + share * (far - near)) / depth))
 
-    def read(self, image: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+    def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size (`read_photograph`); an unknown field of view is the training set's."""
         return read_photograph(image, self.image_size, fov_degrees, self.fov_degrees.item(), remove_background)
 
@@ -181,13 +183,13 @@ class SceneModel(nn.Module):
     def distance(self, photograph: Photograph) -> float | None:
         """Return a photo's distance from the training images in their standard deviations; None if it is unknown.
 
-        It is the root mean square over the `picture_features`: about 1 for an image of the same kind.
+        It is the root mean square over the `image_features`: about 1 for an image of the same kind.
         """
         training = self.architecture.get("training", {})
         if not {"picture_mean", "picture_std"} <= training.keys():
             return None
         mean, std = (torch.tensor(training[name]) for name in ("picture_mean", "picture_std"))
-        return ((picture_features(photograph.image) - mean) / std).square().mean().sqrt().item()
+        return ((image_features(photograph.image) - mean) / std).square().mean().sqrt().item()
 
     def camera(self, photograph: Photograph) -> Cameras:
         """Return the camera that took a photo, at the origin of the world."""

@@ -22,7 +22,7 @@ class TensorDataclass:
     def map(self: T, function: Callable[[Tensor], Tensor]) -> T:
         """Return the same dataclass with `function` applied to every tensor, including nested ones."""
 
-        def apply(value: Any) -> Any:
+        def apply(value: object) -> object:
             if isinstance(value, Tensor):
                 return function(value)
             return value.map(function) if isinstance(value, TensorDataclass) else value
@@ -71,7 +71,7 @@ def stack(items: Sequence[T]) -> T:
 def concatenate(items: Sequence[T], axis: int = 0) -> T:
     """Concatenate the items' tensors along an existing axis; static values are those of the first item."""
 
-    def join(values: list[Any]) -> Any:
+    def join(values: list[Any]) -> object:
         if isinstance(values[0], Tensor):
             return torch.cat(values, dim=axis)
         return concatenate(values, axis) if isinstance(values[0], TensorDataclass) else values[0]
@@ -80,7 +80,7 @@ def concatenate(items: Sequence[T], axis: int = 0) -> T:
     return replace(items[0], **joined)
 
 
-def _merge(values: list[Any]) -> Any:
+def _merge(values: list[Any]) -> object:
     first = values[0]
     if isinstance(first, Tensor):
         # Like `torch.stack`, but a loader's worker process writes directly into memory that it shares with training.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from completesplat.data.sequences import Picture, PosedSequence
-from completesplat.data.validation import BadAnnotation, BadPicture
+from completesplat.data.sequences import MaskedImage, PosedSequence
+from completesplat.data.validation import BadAnnotation, BadImage
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, pinhole
 
@@ -54,14 +54,14 @@ class Source:
         depth_ranges = torch.tensor([[1.0, 2.0]]).repeat(len(frames), 1)
         return PosedSequence(name, frames, cameras, depth_ranges, partial(self._picture, name))
 
-    def _picture(self, name: str, index: int) -> Picture:
+    def _picture(self, name: str, index: int) -> MaskedImage:
         frame = self.frames[name][index]
         if self.log is not None:
             with self.log.open("a") as log:
                 log.write(f"{name} {frame}\n")
         if (name, frame) in self.broken_pictures:
-            raise BadPicture("truncated", f"{name}/{frame}.jpg")
-        return Picture(torch.full((3, SIZE, SIZE), frame % 256, dtype=torch.uint8), None)
+            raise BadImage("truncated", f"{name}/{frame}.jpg")
+        return MaskedImage(torch.full((3, SIZE, SIZE), frame % 256, dtype=torch.uint8), None)
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         # The last come first: the order of reading need not be that of the names.

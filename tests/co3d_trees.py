@@ -1,4 +1,4 @@
-"""Tiny trees in CO3D v2's layout whose cameras and pictures are known, written by PyTorch3D's conventions alone."""
+"""Tiny trees in CO3D v2's layout whose cameras and images are known, written by PyTorch3D's conventions alone."""
 
 import gzip
 import json
@@ -76,7 +76,7 @@ def splatter_image(points: np.ndarray, viewpoints: Sequence[Mapping[str, Any]]) 
 
 
 def noise(sequence: str, frame: int, size: tuple[int, int] = SIZE) -> np.ndarray:
-    """A picture that no other frame has."""
+    """An image that no other frame has."""
     return np.random.default_rng([frame, *sequence.encode()]).integers(0, 256, (*size, 3), dtype=np.uint8)
 
 

@@ -31,8 +31,8 @@ def sound_rooms(root: Path, clips: int = 5, **settings: object) -> Path:
 def broken_rooms(root: Path) -> Path:
     """Nine packed clips without what could not be used: one picture of c5, nearly all of c6 and the cameras of c7."""
     clips = [make_clip(f"c{i}", FRAMES) for i in range(9)]
-    clips[5].pictures[1] = b"<html>"
-    clips[6].pictures[1:] = [b"<html>"] * (FRAMES - 1)
+    clips[5].images[1] = b"<html>"
+    clips[6].images[1:] = [b"<html>"] * (FRAMES - 1)
     clips[7].rows[:, 6:] *= 2
     return pack(write_tree(root / "raw", "text", clips, clips[:1]))
 

@@ -7,22 +7,22 @@ from pathlib import Path
 
 import torch
 
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
-from completesplat.data.validation import BadPicture, TooFewFrames
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.validation import BadImage, TooFewFrames
 from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras, look_at
 
 SIZE = 16
 
 
-def smooth_picture(seed: int, masked: bool, size: int = SIZE) -> Picture:
+def smooth_picture(seed: int, masked: bool, size: int = SIZE) -> MaskedImage:
     """Waves of colour, and a soft disc as the mask."""
     generator = torch.Generator().manual_seed(seed)
     phase = 6 * torch.rand(3, 2, 1, 1, generator=generator)
     y, x = torch.meshgrid(*[torch.linspace(0, 3, size)] * 2, indexing="ij")
     image = (127.5 * (1 + (x + phase[:, 0]).sin() * (y + phase[:, 1]).cos())).to(torch.uint8)
     disc = (255 * (1.5 - (x - 1.5).hypot(y - 1.5)).clamp(0, 1)).to(torch.uint8)[None]
-    return Picture(image, disc if masked else None)
+    return MaskedImage(image, disc if masked else None)
 
 
 def make_sequence(name: str, frames: int = 4, masked: bool = True, bad: tuple[int, ...] = ()) -> PosedSequence:
@@ -38,9 +38,9 @@ def make_sequence(name: str, frames: int = 4, masked: bool = True, bad: tuple[in
     return PosedSequence(name, tuple(range(10, 10 + 3 * frames, 3)), cameras, ranges, read)
 
 
-def _read(name: str, seed: int, masked: bool, bad: tuple[int, ...], index: int) -> Picture:
+def _read(name: str, seed: int, masked: bool, bad: tuple[int, ...], index: int) -> MaskedImage:
     if index in bad:
-        raise BadPicture("cannot be decoded", f"{name}/{index}.jpg")
+        raise BadImage("cannot be decoded", f"{name}/{index}.jpg")
     return smooth_picture(seed + index, masked)
 
 

@@ -19,12 +19,12 @@ HEIGHT, WIDTH = 18, 32
 
 @dataclass
 class StoredClip:
-    """What a clip's files say: rows of fx fy cx cy k1 k2 and the pose, and encoded pictures."""
+    """What a clip's files say: rows of fx fy cx cy k1 k2 and the pose, and encoded images."""
 
     key: str
     timestamps: list[int]
     rows: np.ndarray
-    pictures: list[bytes]
+    images: list[bytes]
 
 
 def make_clip(key: str, frames: int = 6, seed: int = 0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> StoredClip:
@@ -37,8 +37,8 @@ def make_clip(key: str, frames: int = 6, seed: int = 0, size: tuple[int, int] = 
         rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         translation = [0.1 * frame + 0.3, -0.2, 0.05 * frame]
         rows[frame, 6:] = np.concatenate([rotation, np.array(translation)[:, None]], axis=1).ravel()
-    pictures = [encode(rng.integers(0, 256, (*size, 3), dtype=np.uint8)) for _ in range(frames)]
-    return StoredClip(key, [33_000 * (frame + 1) for frame in range(frames)], rows.astype(np.float32), pictures)
+    images = [encode(rng.integers(0, 256, (*size, 3), dtype=np.uint8)) for _ in range(frames)]
+    return StoredClip(key, [33_000 * (frame + 1) for frame in range(frames)], rows.astype(np.float32), images)
 
 
 def encode(pixels: np.ndarray, form: str = "JPEG") -> bytes:
@@ -56,8 +56,8 @@ def write_text_form(folder: Path, clips: list[StoredClip]) -> None:
         ]
         (folder / f"{clip.key}.txt").write_text("\n".join(["https://video.example/watch?v=x", *lines]) + "\n")
         (folder / clip.key).mkdir()
-        for time, picture in zip(clip.timestamps, clip.pictures, strict=True):
-            (folder / clip.key / f"{time}.jpg").write_bytes(picture)
+        for time, image in zip(clip.timestamps, clip.images, strict=True):
+            (folder / clip.key / f"{time}.jpg").write_bytes(image)
 
 
 def chunk_entry(clip: StoredClip) -> dict:
@@ -65,7 +65,7 @@ def chunk_entry(clip: StoredClip) -> dict:
         "url": "https://video.example/watch?v=x",
         "timestamps": torch.tensor(clip.timestamps, dtype=torch.int64),
         "cameras": torch.from_numpy(clip.rows),
-        "images": [torch.from_numpy(np.frombuffer(picture, np.uint8).copy()) for picture in clip.pictures],
+        "images": [torch.from_numpy(np.frombuffer(image, np.uint8).copy()) for image in clip.images],
         "key": clip.key,
     }
 

@@ -1,4 +1,4 @@
-"""What tests of commands share."""
+"""Helpers that tests of commands share."""
 
 import copy
 import functools
@@ -13,20 +13,25 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from PIL import Image
 
 from completesplat import cli
-from completesplat.commands import conf_folder, refusal
+from completesplat.commands import refusal
 from completesplat.commands.jobs import start
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
+from completesplat.settings.options import conf_folder, groups
 
 NETWORKS = ["autoreconstructor.encoder.channels=[8,8,16,16]", "denoiser.channels=[32,32,32]"]
 SMALL = ["data.image_size=32", "data.batch_size=2", "data.targets=3", "data.evaluation_targets=2", *NETWORKS]
 SMALL += ["callbacks.progress=null"]
 SMALL += [f"trainer.{s}" for s in ("max_steps=2", "accelerator=cpu", "val_check_interval=2", "limit_val_batches=1")]
+
+GROUPS = {"hydra", *groups()}
 
 LIMIT = 900.0
 """Seconds that a test waits for a state: a busy machine may take minutes for the work of a second."""
@@ -69,18 +74,24 @@ def strict_json(path: Path):
 
 
 @functools.cache
-def _composed_once(verb: str, *overrides: str) -> DictConfig:
+def _composed_once(verb: str, *choices: str) -> DictConfig:
     with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        return compose(verb, overrides=list(overrides))
+        return compose(verb, overrides=list(choices))
 
 
 def compose_config(verb: str, *overrides: str) -> DictConfig:
-    """The configuration of a verb, as the command line would compose it; a copy that a test may change."""
-    return copy.deepcopy(_composed_once(verb, *overrides))
+    """Return the config of a verb, as the command line would compose it; a choice of options is composed only once."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    chosen = [entry.key_or_group.partition("/")[0] in GROUPS for entry in parsed]
+    choices = [text for text, choice in zip(overrides, chosen, strict=True) if choice]
+    config = copy.deepcopy(_composed_once(verb, *choices))
+    values = [entry for entry, choice in zip(parsed, chosen, strict=True) if not choice]
+    ConfigLoaderImpl._apply_overrides_to_config(values, config)
+    return config
 
 
 def refused(verb: str, *overrides: object) -> str:
-    """The line with which a verb refuses its settings, without starting the command; empty for another exception."""
+    """Return the line with which a verb refuses its settings, without the command; empty for another exception."""
     with pytest.raises(Exception) as caught:  # noqa: PT011
         start(verb, compose_config(verb, *map(str, overrides)), Path("/nowhere"))
     return refusal(caught.value) or ""

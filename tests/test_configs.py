@@ -11,14 +11,11 @@ from omegaconf import OmegaConf
 from support import SMALL, call, compose_config
 
 from completesplat.cli import VERBS
-from completesplat.commands import conf_folder
 from completesplat.rasterizers import RenderingConstants
+from completesplat.settings.checks import check_image_size, check_verb
+from completesplat.settings.options import conf_folder, options
 
 CONF = conf_folder()
-
-
-def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml") if not path.stem.startswith("_"))
 
 
 GROUPS = sorted(path.name for path in CONF.iterdir() if path.is_dir())
@@ -39,9 +36,9 @@ DELTAS = ["experiment", "ablation", "posterior", "objective"]
 
 
 def needed(group: str, option: str) -> list[str]:
-    """What else has to be said for an option, so that nothing is missing in the configuration."""
+    """Return the settings that an option needs besides, so that nothing is missing in its config."""
     given = ["data.category=y"] if option == "co3d_category" else []
-    given += ["data.root=x"] if option.startswith(("co3d_", "paper_", "realestate10k")) else []
+    given += ["data.root=x"] if option.startswith(("capture", "co3d_", "paper_", "realestate10k")) else []
     given += ["autoreconstructor.pretrained=null"] if option.endswith(("_var_stage1", "stable_diffusion")) else []
     given += ["model.checkpoint=x"] if option.endswith(("_var_stage2", "_masked")) else []
     given += ["model.model.weights=x"] if option == "splatter_image_published" else []
@@ -53,7 +50,7 @@ def needed(group: str, option: str) -> list[str]:
 
 
 def complete(group: str, option: str, *more: str):
-    """A configuration with this option in which nothing is missing."""
+    """Return a config with this option in which nothing is missing."""
     chosen = {group: option}
     if group not in DELTAS:
         number = options(group).index(option)
@@ -64,9 +61,11 @@ def complete(group: str, option: str, *more: str):
 
 
 @pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
-def test_every_option_composes_and_what_it_describes_is_built(group, option):
+def test_every_option_composes_fits_the_checks_and_builds(group, option):
     config = complete(group, option)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    check_verb("fit", config)
+    check_image_size(config)
     if group == "rasterizer":
         assert instantiate(config.rasterizer.constants) == RenderingConstants()
     if group in WHOLES or (option == "cuda" and not torch.cuda.is_available()):
@@ -114,8 +113,8 @@ def test_a_paper_experiment_draws_on_the_gpu_and_saves_by_the_clock():
         if "small" not in experiment:  # the table that the test after training is for, and Inria's near plane
             assert config.evaluation.name == "co3d"
         assert config.rasterizer.constants.near_plane == 0.2
-        elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
-        assert instantiate(elsewhere.rasterizer) is not None
+    elsewhere = compose_config("fit", f"experiment={experiment}", "rasterizer=tiled")
+    assert instantiate(elsewhere.rasterizer) is not None
 
 
 REALESTATE = ["data=realestate10k", "evaluation=realestate10k_128", "evaluation.data.evaluation_index=x"]

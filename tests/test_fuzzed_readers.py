@@ -35,12 +35,12 @@ from PIL import Image, ImageCms
 from realestate10k_trees import make_clip, write_chunk_form
 from support import some_gaussians, write_capture
 
-from completesplat.data.captures import import_capture
-from completesplat.data.captures.capture import read_picture
+from completesplat.data.captures.capture import CapturedFrame, Lens
+from completesplat.data.captures.module import CaptureDataModule
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.images.crop import Square
 from completesplat.data.images.exif import ORIENTATION
-from completesplat.data.images.files import decode, picture_size, read_depth
+from completesplat.data.images.files import decode, read_depth, stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.validation import read_points
@@ -49,7 +49,10 @@ from completesplat.export.ply import read_ply, write_ply
 from completesplat.generator import CompleteSplat
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
-pytestmark = pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux tells it")
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.skipif(not CLEAR.exists(), reason="memory is measured as Linux reports it"),
+]
 PIXELS = np.random.default_rng(0).integers(0, 256, (12, 16, 4), dtype=np.uint8)
 COMPRESSIONS = (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
 MOST_MEMORY_OF_A_PICTURE = 2**31  # of 50 million pixels, which are allowed
@@ -103,9 +106,9 @@ def test_pictures(tmp_path):
         path.write_bytes(content)
         calls = [partial(decode, path, "a", mode) for mode in ("RGB", "L")]
         calls += [
-            partial(picture_size, path, "a"),
+            partial(stored_size, path, "a"),
             partial(read_depth, path, 1.0),
-            partial(read_picture, path, (12, 16)),
+            CapturedFrame(0, path, None, Lens((9.0, 9.0), (8.0, 6.0), (12, 16)), np.eye(4)).read,
         ]
         each(*calls, partial(read_photograph, path, 16))
 
@@ -218,6 +221,15 @@ def test_weights(tiny_weights, tmp_path):
     fuzz(damaged_json([json.loads(text)]).map(json_bytes) | damaged([text]), read_weights, examples=30)
 
 
+def read_all(capture) -> None:
+    """Read every frame of a capture."""
+    source = CaptureDataModule(str(capture), image_size=8).source("train")
+    for name in source.names:
+        sequence = source.read(name)
+        for index in range(len(sequence.frames)):
+            sequence.read(index)
+
+
 def test_transforms(tmp_path):
     capture = tmp_path / "capture"
     write_capture(capture, 6)
@@ -230,9 +242,7 @@ def test_transforms(tmp_path):
 
     def read_transforms(changed: bytes) -> None:
         path.write_bytes(changed)
-        out = tmp_path / "out"
-        shutil.rmtree(out, ignore_errors=True)
-        import_capture(out, "desk", transforms=path, progress=False)
+        read_all(capture)
 
     fuzz(damaged_json([content, content | lens]).map(json_bytes) | damaged([json_bytes(content)]), read_transforms)
 
@@ -240,8 +250,8 @@ def test_transforms(tmp_path):
 def test_colmap(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     write_capture(tmp_path / "images", 6)
-    model = tmp_path / "sparse"
-    model.mkdir()
+    model = tmp_path / "sparse/0"
+    model.mkdir(parents=True)
     reconstruction = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 20.0, 16, 12)
     reconstruction.add_camera_with_trivial_rig(camera)
@@ -257,9 +267,7 @@ def test_colmap(tmp_path):
     def read_models(changed: tuple[str, bytes]) -> None:
         for name, content in files.items():
             (model / name).write_bytes(changed[1] if changed[0] == name else content)
-        out = tmp_path / "out"
-        shutil.rmtree(out, ignore_errors=True)
-        import_capture(out, "desk", colmap=model, images=tmp_path / "images", progress=False)
+        read_all(tmp_path)
 
     def claimed(name: str, place: int, size: int) -> tuple[str, bytes]:
         """A file that says it has as many of something as numbers of so many bytes can say."""
@@ -267,7 +275,7 @@ def test_colmap(tmp_path):
 
     read_models(("", b""))
     tracks, records = claimed("points3D.bin", 8 + 43, 8), [claimed(name, 0, 8) for name in files]
-    cases = [tracks, *records, claimed("rigs.bin", 8 + 4, 4), claimed("frames.bin", 8 + 64, 4)]
+    cases = [tracks, *records]
     cases += [("images.bin", files["images.bin"].replace(b"frame3", b"\x80rame3"))]
     changed = st.sampled_from(sorted(files)).flatmap(lambda name: st.tuples(st.just(name), damaged([files[name]])))
     fuzz(changed, read_models, cases)

@@ -1,11 +1,14 @@
-"""What the documents and `--help` tell people to type is accepted."""
+"""Commands in the documents and in `--help` are accepted."""
+
+from importlib.util import find_spec
 
 import pytest
 import written_commands as written
-from omegaconf import OmegaConf
+from hydra.errors import HydraException
 
 from completesplat.cli import VERBS
-from completesplat.commands import conf_folder
+from completesplat.errors import CompleteSplatError
+from completesplat.settings.options import conf_folder
 
 EXPERIMENTS = [path.stem for path in sorted((conf_folder() / "experiment").glob("[!_]*.yaml"))]
 
@@ -18,17 +21,22 @@ def test_every_verb_has_examples_is_named_in_the_readme_and_shown_in_the_documen
         assert {written.arguments_of(command)[0] for command in commands} == set(VERBS)
 
 
-@pytest.mark.parametrize("command", sorted({*written.help_commands(), *written.document_commands()}))
-def test_the_command_composes(command):
-    if "hydra/sweeper=optuna" in command:
-        pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="hydra-optuna-sweeper is not installed")
-    if written.arguments_of(command)[-1] != "--help":
-        assert OmegaConf.to_container(written.composed(command))
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_command_of_a_verb_composes(verb):
+    commands = sorted({*written.help_commands(), *written.document_commands()})
+    refused = []
+    for command in [text for text in commands if written.arguments_of(text)[0] == verb and "--help" not in text]:
+        if "hydra/sweeper=optuna" not in command or find_spec("hydra_plugins.hydra_optuna_sweeper"):
+            try:
+                written.composed(command)
+            except (HydraException, CompleteSplatError) as error:
+                refused.append((command, error))
+    assert refused == []
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_lists_what_comes_before_it(experiment):
-    """Its own command comes last; what each is given as DIR, STORE or RUN is what one before it wrote."""
+    """Its own command comes last. Each folder that a command reads was written by one before it."""
     commands = written.experiment_commands(experiment)
     assert f"fit experiment={experiment} " in commands[-1]
     made = {"ROOT"} if experiment.startswith(("co3d_", "paper_")) else set()
@@ -39,6 +47,6 @@ def test_an_experiment_lists_what_comes_before_it(experiment):
         named |= {value.split("/")[0] for value in given.values() if value.startswith("RUN")}
         assert named <= made
         made.add(folder)
-        assert OmegaConf.to_container(written.composed(command))
+        written.composed(command)
     if experiment.startswith(("co3d_", "paper_")):
         assert commands[0].startswith("completesplat data prepare ")

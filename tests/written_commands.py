@@ -9,8 +9,8 @@ from hydra.core.override_parser.types import IntervalSweep
 from support import compose_config
 
 from completesplat.cli import VERBS
-from completesplat.commands import conf_folder
 from completesplat.settings.arguments import SWEEP, for_hydra
+from completesplat.settings.options import conf_folder
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"

@@ -3,18 +3,15 @@
 import logging
 import os
 import re
-import secrets
 import sys
-import time
 import warnings
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationToMissingValueError, MissingMandatoryValue, OmegaConfBaseException
 
 from completesplat.commands import jobs
@@ -22,11 +19,10 @@ from completesplat.errors import CompleteSplatError
 from completesplat.files import file_refusal
 from completesplat.settings import help
 from completesplat.settings.arguments import SWEEP, behind_dashes, for_hydra
-from completesplat.settings.checks import misspelt
-from completesplat.settings.options import conf_folder, gsplat_constants
+from completesplat.settings.composition import nearest_names, sweep_arguments, use_working_folder
+from completesplat.settings.options import conf_folder
 from completesplat.signals import end_with, ended_by_signals
 
-RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
 CALLED = re.compile(r"Error in call to target '(?:torch|lightning|diffusers|torchmetrics)\.")
 LIGHTNINGS = "MisconfigurationException"
 UNHELPFUL_WARNINGS = (
@@ -42,19 +38,11 @@ UNHELPFUL_WARNINGS = (
 
 
 def launch(verb: str, arguments: list[str]) -> None:
-    """Compose the verb's config (`conf/<verb>.yaml`) and run it, once or as a sweep.
-
-    `data toy` is short for `data data_task=toy`, `predict A B` for `predict image=[A,B]`, `view PATH` for
-    `view path=PATH`, `new KIND NAME` for `new kind=KIND name=NAME`.
-    """
-    jobs.use_working_folder()
+    """Compose the config of `conf/<verb>.yaml` with the arguments (`for_hydra`), and run it, once or as a sweep."""
+    use_working_folder()
     # Lightning starts a further process of the job for each device.
     if arguments and arguments[0].startswith(jobs.PROCESS_OF_JOB):
-        starter, _, out_name = arguments[0].partition("=")[2].partition(":")
-        out = Path(out_name)
-        end_with(int(starter))
-        with ended_by_signals():
-            return jobs.start(verb, OmegaConf.load(out / jobs.CONFIG), out)
+        return _join_job(verb, arguments[0])
     program, original = sys.argv[0], arguments
     arguments = behind_dashes(arguments)
     if any(flag in arguments for flag in help.FLAGS):
@@ -64,14 +52,16 @@ def launch(verb: str, arguments: list[str]) -> None:
     # Logging stays silent on a full disk, because the next file that is written reports it in one line.
     logging.raiseExceptions = False
     arguments = for_hydra(verb, arguments)
-    if any(flag in arguments for flag in SWEEP):
-        arguments = [*arguments, *jobs.sweep_arguments(verb, arguments, RUN_NAME)]
-    elif jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
+    sweep = any(flag in arguments for flag in SWEEP)
+    if jobs.one_of_several() and sweep:
+        message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
+        raise CompleteSplatError(message)
+    if jobs.one_of_several() and not any(argument.startswith("out=") for argument in arguments):
         raise CompleteSplatError("torchrun or srun started several processes of this run: give them one out=DIR")
-    sys.argv = [f"completesplat {verb}", *arguments]
+    sys.argv = [f"completesplat {verb}", *arguments, *(sweep_arguments(verb, arguments) if sweep else [])]
     failures: list[Exception] = []
 
-    def job(config: Any) -> float | None:
+    def job(config: DictConfig) -> float | None:
         try:
             with jobs.alone_in(Path(HydraConfig.get().runtime.output_dir)):
                 return jobs.run_job(verb, config, program, original)
@@ -81,40 +71,20 @@ def launch(verb: str, arguments: list[str]) -> None:
             failures.append(error)
             return None
 
-    try:
+    with nearest_names(verb, arguments):
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=verb)(job)()
-    except (HydraException, ValueError) as error:
-        if (clearer := misspelt(error, verb, arguments, jobs.composed)) is None:
-            raise
-        raise clearer from error
     if failures:
         raise failures[0]
 
 
-def compose(verb: str, *overrides: str) -> Any:
-    """Return the config of a verb, as `completesplat VERB OVERRIDES...` composes it: `compose("fit", "trainer=ddp")`.
-
-    Raises:
-        CompleteSplatError: an override cannot be read, or names no option.
-    """
-    arguments = for_hydra(verb, overrides)
-    try:
-        config = jobs.composed(verb, *arguments)
-    except (HydraException, ValueError) as error:
-        if (clearer := misspelt(error, verb, arguments, jobs.composed)) is None:
-            raise
-        raise clearer from error
-    OmegaConf.set_struct(config, False)
-    return config
-
-
-def best_precision() -> str:
-    """Return Lightning's precision for networks: bfloat16 where the GPU, or else the CPU, supports it, or float32."""
-    import torch
-
-    on_gpu = torch.cuda.is_available()
-    supported = torch.cuda.is_bf16_supported() if on_gpu else torch.cpu._is_avx512_bf16_supported()
-    return "bf16-mixed" if supported else "32-true"
+def _join_job(verb: str, argument: str) -> None:
+    """Work on a job whose first process has started; end when that one ends."""
+    starter, _, out = argument.partition("=")[2].partition(":")
+    end_with(int(starter))
+    with ended_by_signals():
+        config = OmegaConf.load(Path(out, jobs.CONFIG))
+        assert isinstance(config, DictConfig)
+        jobs.start(verb, config, Path(out))
 
 
 def quieten() -> None:
@@ -130,29 +100,29 @@ def quieten() -> None:
 
 def refusal(error: BaseException) -> str | None:
     """Return one line for an error that the user can put right, None for a fault of the program."""
+    message: str | None = None
     if (own_error := _own_error(error)) is not None:
-        return " ".join(str(own_error).split())
-    if isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
+        message = str(own_error)
+    elif isinstance(error, MissingMandatoryValue | InterpolationToMissingValueError):
         named = str(error).partition("Missing mandatory value: ")[2].split()  # OmegaConf has it nowhere else
         key = error.full_key if isinstance(error, MissingMandatoryValue) else named[0]
-        return f"{key} is needed: give {key}=VALUE"
-    if isinstance(error, InstantiationException):
-        # A missing module or name may be misspelt; any other error while parts are built is a fault of the program.
-        if error.__cause__ is not None and isinstance(error.__cause__.__cause__, ModuleNotFoundError):
-            return " ".join(str(error.__cause__).split())
-        return _of_a_library(error)
-    if isinstance(error, HydraException | OmegaConfBaseException):
-        return " ".join(str(error).split())
-    return None
+        message = f"{key} is needed: give {key}=VALUE"
+    elif isinstance(error, InstantiationException):
+        message = _of_a_part(error)
+    elif isinstance(error, HydraException | OmegaConfBaseException):
+        message = str(error)
+    return None if message is None else " ".join(message.split())
 
 
-def _of_a_library(error: InstantiationException) -> str | None:
-    """Return one line for an option that a library's class refuses, None for an error of the package itself."""
-    called, cause = CALLED.match(str(error)), error.__cause__
-    if called is None or not (isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS):
+def _of_a_part(error: InstantiationException) -> str | None:
+    """Return a message if a part's module is missing or a library's class refuses an option, None for a fault."""
+    cause = error.__cause__
+    if cause is not None and isinstance(cause.__cause__, ModuleNotFoundError):
+        return str(cause)
+    refused = isinstance(cause, ValueError | TypeError) or type(cause).__name__ == LIGHTNINGS
+    if CALLED.match(str(error)) is None or not refused:
         return None
-    key = str(error).rpartition("full_key: ")[2].strip()
-    return f"{key}: {' '.join(str(cause).split())}"
+    return f"{str(error).rpartition('full_key: ')[2].strip()}: {cause}"
 
 
 def exit_status(error: BaseException) -> int:
@@ -161,20 +131,11 @@ def exit_status(error: BaseException) -> int:
     return 2 if own_error is None else own_error.exit_status
 
 
-def _own_error(error: BaseException) -> CompleteSplatError | None:
+def _own_error(error: BaseException | None) -> CompleteSplatError | None:
     """Return the package's own error in a chain of causes, or a new one for a full disk or a bad file name."""
-    chain: BaseException | None = error
-    while chain is not None:
-        if isinstance(chain, CompleteSplatError):
-            return chain
-        if (refused := file_refusal(chain)) is not None:
-            return refused
-        chain = chain.__cause__
+    while error is not None:
+        own_error = error if isinstance(error, CompleteSplatError) else file_refusal(error)
+        if own_error is not None:
+            return own_error
+        error = error.__cause__
     return None
-
-
-# Resolvers used in `conf/`. They are registered here because jobs that a cluster starts import only this module.
-OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
-OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
-OmegaConf.register_new_resolver("gsplat", lambda name: gsplat_constants()[name], replace=True)
-OmegaConf.register_new_resolver("job_name", jobs.job_name, replace=True)

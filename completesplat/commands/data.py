@@ -3,13 +3,16 @@
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_text
 from completesplat.settings.schema import Entries, Positive, Range
+
+if TYPE_CHECKING:
+    from completesplat.data.sequences import PosedSequence, SequenceSource
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +73,7 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
+    """Write packed data into `out`; see `completesplat.data.packed.writing.prepare`."""
     from completesplat.data.packed.manifest import is_packed
     from completesplat.data.packed.writing import prepare as prepare_sources
 
@@ -116,10 +119,10 @@ def latents(
         store = encode_training_set(
             autoreconstructor, data, out, frames, views, precision, conditioning, batch_size, fabric.device
         )
-    logger.info("deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
+    logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
+def _sources(data: Any, splits: Sequence[str]) -> "dict[str, SequenceSource]":
     """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()
@@ -136,7 +139,7 @@ def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
     return sources
 
 
-def _readable(source: Any, names: Any) -> Iterator[Any]:
+def _readable(source: "SequenceSource", names: Iterable[str]) -> "Iterator[PosedSequence]":
     for name in names:
         try:
             yield source.read(name)

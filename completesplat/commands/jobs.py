@@ -1,44 +1,36 @@
-"""The jobs of a sweep and single runs: their folders, locks and records, and how they continue."""
+"""Jobs, single or of a sweep: their folders, locks and records, and how they continue."""
 
 import gc
-import hashlib
 import json
 import logging
 import math
 import os
 import platform
-import re
+import shlex
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock, Timeout
-from hydra import compose, initialize_config_dir
-from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 from hydra.types import RunMode
 from hydra.utils import get_method, instantiate
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from completesplat import __version__
 from completesplat.commands.protocol import git_commit, write_json
 from completesplat.errors import CompleteSplatError
 from completesplat.files import atomic_path, writing
-from completesplat.results.runs import typed
 from completesplat.settings.checks import check_verb
-from completesplat.settings.options import conf_folder, meant
+from completesplat.settings.composition import resolved_settings, use_working_folder
+from completesplat.settings.options import did_you_mean
 from completesplat.settings.schema import check_settings
 from completesplat.signals import Interrupted, ended_by_signals
 
-LONGEST_NAME = 120
 CONFIG, RECORD, METRICS = "config.yaml", "run.json", "metrics.json"
 LAST = "checkpoints/last.ckpt"
 LOCK = ".lock"
@@ -49,31 +41,6 @@ MAY_CHANGE = (
 )
 """Settings that may differ when a run continues; of the last one, also all settings below it."""
 VARIABLES_OF_PROCESSES = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
-
-
-class SettingsOfWorkingFolder(SearchPathPlugin):
-    """Hydra plugin that finds further options of the config groups in `./conf`; the package's own come first."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
-        folder = Path.cwd() / "conf"
-        if folder.is_dir() and not folder.samefile(conf_folder()):
-            search_path.append("working-folder", f"file://{folder}")
-
-
-def use_working_folder() -> None:
-    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path; each process must call this."""
-    folder = str(Path.cwd())
-    if not {"", folder} & set(sys.path):
-        sys.path.append(folder)
-    Plugins.instance().register(SettingsOfWorkingFolder)
-
-
-def composed(verb: str, *overrides: str) -> Any:
-    """Return a verb's config, as the command line would compose it in this folder, without starting anything."""
-    use_working_folder()
-    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        return compose(verb, overrides=list(overrides))
 
 
 def one_of_several() -> bool:
@@ -136,46 +103,7 @@ def at_work(out: Path) -> bool:
         return True
 
 
-def sweep_arguments(verb: str, arguments: list[str], run_name: str) -> list[str]:
-    """Return arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings.
-
-    Raises:
-        CompleteSplatError: this is one of several processes that a launcher started, each of which would sweep.
-    """
-    if one_of_several():
-        message = "a sweep (-m) starts the processes of its jobs itself: start it once, without torchrun or srun"
-        raise CompleteSplatError(message)
-    keys = [override.split("=")[0] for override in arguments]
-    added = [] if "out" in keys else [f"out=outputs/{verb}/{run_name}"]
-    if verb == "fit" and "ckpt_path" not in keys:
-        added.append("ckpt_path=last")
-    swept = swept_keys(arguments)
-    if swept and "hydra.sweep.subdir" not in keys:
-        added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}")
-    return added
-
-
-def swept_keys(arguments: list[str]) -> list[str]:
-    """Return the keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
-    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    return [override.key_or_group for override in parsed if override.is_sweep_override()]
-
-
-def job_name(*keys: str, _root_: Any) -> str:
-    """Return the directory name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
-
-    It has no equals signs and commas, so that paths into the directory need no quotes in Hydra's overrides.
-    """
-    values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
-    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values)
-    name = re.sub(r"[^\w.+-]+", "_", full)
-    if name == full and len(name) <= LONGEST_NAME:
-        return name
-    return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
-
-
-def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | None:
+def run_job(verb: str, config: DictConfig, program: str, given: list[str]) -> float | None:
     """Run one job in its own directory, record its command and config there, and return the value of `optimized`.
 
     A job with `ckpt_path=last` is not repeated if its directory holds its results; see `is_finished`. The user started
@@ -186,7 +114,7 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | N
     out = Path(hydra_config.runtime.output_dir)
     OmegaConf.set_struct(config, False)
     config.out = str(out)
-    resolved: Any = OmegaConf.to_container(config, resolve=True)
+    resolved = resolved_settings(config)
     if is_finished(out, resolved):
         print(f"{out}: finished before, not repeated")
         return optimized(config.get("optimized_metric"), out)
@@ -199,13 +127,13 @@ def run_job(verb: str, config: Any, program: str, given: list[str]) -> float | N
                 _record(out / RECORD, [f"completesplat {verb}", *given], list(hydra_config.overrides.task))
             for key in ("checkpoint", "autoreconstructor_checkpoint"):
                 # The path may refer to the job's choices (`hydra:runtime.choices`), which `start` cannot resolve.
-                if OmegaConf.select(config, f"model.{key}") is not None:
-                    config.model[key] = resolved["model"][key]
+                if (path := OmegaConf.select(config, f"model.{key}")) is not None:
+                    config.model[key] = path
             with _for_other_processes([program, verb, f"{PROCESS_OF_JOB}={os.getpid()}:{out}"]):
                 start(verb, config, out)
     except Interrupted as stop:
         if first:
-            print(_said(stop, verb, given, out), file=sys.stderr)
+            print(_how_to_continue(stop, verb, given, out), file=sys.stderr)
         raise
     print(out)
     return optimized(config.get("optimized_metric"), out)
@@ -219,36 +147,35 @@ def optimized(metric: str | None, out: Path) -> float | None:
     """
     if metric is None:
         return None
-    figures = json.loads((out / METRICS).read_text())
-    lost = {entry.partition(": ")[0] for entry in figures.get("not_finite", [])}
-    known = [name for name, x in figures.items() if name in lost or isinstance(x, float)]
+    metrics = json.loads((out / METRICS).read_text())
+    not_finite = {entry.partition(": ")[0] for entry in metrics.get("not_finite", [])}
+    known = [name for name, value in metrics.items() if name in not_finite or isinstance(value, float)]
     if metric not in known:
-        available = f"there are {', '.join(known)}{meant(metric, known)}"
+        available = f"there are {', '.join(known)}{did_you_mean(metric, known)}"
         raise CompleteSplatError(f"optimized_metric={metric}: no figure in {out / METRICS}, {available}")
-    return math.nan if metric in lost else float(figures[metric])
+    return math.nan if metric in not_finite else float(metrics[metric])
 
 
-def _said(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
+def _how_to_continue(stop: Interrupted, verb: str, given: list[str], out: Path) -> str:
     """Return one line: the signal that ended a job, its checkpoint, and the command to continue the job or sweep."""
     hydra_config, begun = HydraConfig.get(), (out / LAST).is_file()
-    of_a_sweep = hydra_config.mode == RunMode.MULTIRUN
-    dropped = ("out=", "ckpt_path=") if begun and not of_a_sweep else ("out=",)
-    again = [f"completesplat {verb}", *(argument for argument in given if not argument.startswith(dropped))]
-    again += ["ckpt_path=last"] if begun and not of_a_sweep else []
-    again.append(f"out={hydra_config.sweep.dir if of_a_sweep else out}")
+    sweep = hydra_config.mode == RunMode.MULTIRUN
+    replaced = ("out=", "ckpt_path=") if begun and not sweep else ("out=",)
+    again = ["completesplat", verb, *(argument for argument in given if not argument.startswith(replaced))]
+    again += ["ckpt_path=last"] if begun and not sweep else []
+    again.append(f"out={hydra_config.sweep.dir if sweep else out}")
     checkpoint = f"; the checkpoint is {out / LAST}" if begun else ""
-    return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {typed(again)}"
+    return f"ended by {stop.signal.name}{checkpoint}; {'go on' if begun else 'start again'} with: {shlex.join(again)}"
 
 
-def start(verb: str, config: Any, out: Path) -> None:
+def start(verb: str, config: DictConfig, out: Path) -> None:
     """Check the settings and call the function that the config names as its task, or else the verb's `run`."""
     with importing():
         check_verb(verb, config)
         if config.get("task") is None:
             run = partial(import_module(f"completesplat.commands.{verb}").run, config, out)
         else:
-            settings: Any = OmegaConf.to_container(config.task, resolve=True)
-            check_settings(get_method(settings["_target_"]), settings)
+            check_settings(get_method(config.task._target_), resolved_settings(config.task))
             run = partial(instantiate, config.task, out=out, _convert_="all")
     run()
 
@@ -269,7 +196,7 @@ def importing() -> Iterator[None]:
         gc.enable()
 
 
-def is_finished(out: Path, config: Any) -> bool:
+def is_finished(out: Path, config: Mapping[str, object]) -> bool:
     """Return whether a job's directory holds its results, for jobs that can continue a run (`ckpt_path`).
 
     Raises:
@@ -288,22 +215,19 @@ def is_finished(out: Path, config: Any) -> bool:
     return (out / METRICS).is_file()
 
 
-def _differences(one: Any, other: Any, key: str = "") -> set[str]:
+def _differences(first: object, second: object, key: str = "") -> set[str]:
     """Return the keys of the settings that differ."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return {
-            name
-            for part in one.keys() | other.keys()
-            for name in _differences(one.get(part), other.get(part), f"{key}.{part}".lstrip("."))
-        }
-    return set() if one == other else {key}
+    if not isinstance(first, dict) or not isinstance(second, dict):
+        return set() if first == second else {key}
+    parts = [(f"{key}.{part}".lstrip("."), part) for part in first.keys() | second.keys()]
+    return {name for place, part in parts for name in _differences(first.get(part), second.get(part), place)}
 
 
 def _record(path: Path, command: list[str], overrides: list[str]) -> None:
     """Write `run.json`: version, command and overrides, and the times of the start and of continuations."""
     now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    record: dict[str, Any] = {"version": __version__, "commit": git_commit()}
-    record |= {"command": command, "overrides": overrides, "started": now}
+    record = {"version": __version__, "commit": git_commit(), "command": command, "overrides": overrides}
+    record |= {"started": now}
     if path.is_file() and (path.parent / LAST).is_file():
         earlier = json.loads(path.read_text())
         record |= {"started": earlier["started"], "continued": [*earlier.get("continued", []), now]}

@@ -4,7 +4,8 @@ import keyword
 import re
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+
+from omegaconf import DictConfig
 
 from completesplat.errors import CompleteSplatError
 from completesplat.files import write_text
@@ -16,10 +17,10 @@ FILE = re.compile(r"^=== (\S+)\n", re.MULTILINE)
 """Line of a template that names the file which follows."""
 
 
-def run(config: Any, out: Path) -> None:
+def run(config: DictConfig, out: Path) -> None:
     """Write the part's files into the working folder; print their names and the next command."""
     kind, name = str(config.kind), str(config.name)
-    files = begun(kind, name)
+    files = new_files(kind, name)
     for path, text in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, text)
@@ -27,8 +28,8 @@ def run(config: Any, out: Path) -> None:
     print(f"next: python -m pytest test_{kind}_{name}.py")
 
 
-def begun(kind: str, name: str) -> dict[Path, str]:
-    """Return the texts of a new part's files, by their paths in the working folder.
+def new_files(kind: str, name: str) -> dict[Path, str]:
+    """Return the contents of a new part's files, by their paths in the working folder.
 
     Raises:
         CompleteSplatError: there is no such kind, the name is not a Python name or is taken, or a file exists.
@@ -36,17 +37,17 @@ def begun(kind: str, name: str) -> dict[Path, str]:
     if kind not in KINDS:
         raise CompleteSplatError(f"kind={kind}: choose one of {', '.join(KINDS)}")
     if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_"):
-        raise CompleteSplatError(f"name={name}: must be a name of Python's: letters, digits and underscores")
+        raise CompleteSplatError(f"name={name}: must be a Python name: letters, digits and underscores")
     classes = "".join(word.capitalize() for word in name.split("_"))
     text = (TEMPLATES / f"{kind}.txt").read_text().replace("@name@", name).replace("@Name@", classes)
     _, *parts = FILE.split(text)
     files = {Path(path): body.strip("\n") + "\n" for path, body in zip(parts[::2], parts[1::2], strict=True)}
     for path in files:
         if path.exists():
-            raise CompleteSplatError(f"{path}: is there already; choose another name")
+            raise CompleteSplatError(f"{path}: exists already; choose another name")
         if path.parts[0] == "conf" and (conf_folder().parent / path).is_file():
             raise CompleteSplatError(f"name={name}: the package has {path}; choose another name")
     # Python searches the working folder last, so it would import the other module of this name.
     if Path(f"{name}.py") in files and find_spec(name) is not None:
-        raise CompleteSplatError(f"name={name}: there is a module of this name; choose another name")
+        raise CompleteSplatError(f"name={name}: a module has this name; choose another name")
     return files

@@ -5,13 +5,13 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from hydra.utils import instantiate
 from jaxtyping import Float
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
@@ -40,19 +40,19 @@ UNLIKE = 2.0
 log = logging.getLogger(__name__)
 
 
-def run(config: Any, out: Path) -> None:
+def run(config: DictConfig, out: Path) -> None:
     """Write each photo's files into `out/<its name>/`."""
-    pictures = find_pictures(config.image)
-    if config.mask is not None and len(pictures) > 1:
-        raise CompleteSplatError("mask=FILE belongs to one picture; box=[x0,y0,x1,y1] goes for several")
+    images = find_images(config.image)
+    if config.mask is not None and len(images) > 1:
+        raise CompleteSplatError("mask=FILE belongs to one image; box=[x0,y0,x1,y1] goes for several")
     wanted = wanted_files(config)  # before the model runs, because the converter may be missing
     if config.cameras is not None:
-        predict_from_views(config, pictures, wanted, out)
+        predict_from_views(config, images, wanted, out)
     else:
-        predict_pictures(config, open_generator(config), pictures, wanted, out)
+        predict_images(config, open_generator(config), images, wanted, out)
 
 
-def find_pictures(image: Any) -> list[Path]:
+def find_images(image: object) -> list[Path]:
     """Return the files of `image=FILE`, `image=FOLDER` or a list of both; of a folder its images, by suffix, sorted.
 
     Files that are named one by one are not checked here, even missing ones, because reading them reports the fault.
@@ -62,32 +62,26 @@ def find_pictures(image: Any) -> list[Path]:
     """
     entries = image if isinstance(image, Sequence) and not isinstance(image, str) else [image]
     if not entries:
-        raise CompleteSplatError("image=[]: name at least one picture")
-    paths: list[Path] = []
-    for entry in entries:
-        if entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int):
-            raise CompleteSplatError(f"image={image}: give a picture, a folder, or a list of them")
-        paths += _pictures_of(Path(str(entry)))
-    return paths
+        raise CompleteSplatError("image=[]: name at least one image")
+    if any(entry == "" or isinstance(entry, bool) or not isinstance(entry, str | int) for entry in entries):
+        raise CompleteSplatError(f"image={image}: give an image, a folder, or a list of them")
+    return [path for entry in entries for path in _images_of(Path(str(entry)))]
 
 
-def _pictures_of(path: Path) -> list[Path]:
+def _images_of(path: Path) -> list[Path]:
     # `os.path`, because the methods of `Path` raise an error if a name is too long.
     if not os.path.isdir(path):
         return [path]
     try:
-        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        images = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     except OSError as error:
         raise CompleteSplatError(f"{path}: {error.strerror}") from error
-    pictures = [file for file in images if os.path.isfile(file)]
-    if left_out := [printable(file.name) for file in images if not os.path.isfile(file)]:
-        log.warning("%s: left out, because they are no files: %s", printable(str(path)), ", ".join(left_out))
-    if not pictures:
-        raise CompleteSplatError(f"{path}: no picture in this folder ({', '.join(SUFFIXES)})")
-    return pictures
+    if not images:
+        raise CompleteSplatError(f"{path}: no image in this folder ({', '.join(SUFFIXES)})")
+    return images
 
 
-def wanted_files(config: Any) -> Wanted:
+def wanted_files(config: DictConfig) -> Wanted:
     """Return the outputs to write for each image.
 
     Raises:
@@ -98,7 +92,7 @@ def wanted_files(config: Any) -> Wanted:
         raise CompleteSplatError(f"formats=[]: choose from {', '.join(FORMATS)}")
     return Wanted(
         formats=formats,
-        videos=_chosen("video", config.video, tuple(PATHS)),
+        videos=_chosen("video", config.video, PATHS),
         frames=config.frames,
         background=Wanted.background if config.background == REMOVE else config.background,
         maps=config.maps,
@@ -107,17 +101,16 @@ def wanted_files(config: Any) -> Wanted:
     )
 
 
-def _chosen(name: str, value: Any, choice: Sequence[str]) -> tuple[str, ...]:
-    """Return one name, or the names of a list without duplicates; refuse those that are not in `choice`."""
-    several = not value or (isinstance(value, Sequence) and not isinstance(value, str))
-    names = list(value or []) if several else [value]
+def _chosen(name: str, value: object, choices: Collection[str]) -> tuple[str, ...]:
+    """Return one name, or the names of a list without duplicates; refuse those that are not in `choices`."""
+    names = value if isinstance(value, Sequence) and not isinstance(value, str) else [value] if value else []
     for entry in names:
-        if entry not in choice:
-            raise CompleteSplatError(f"{name}={entry}: choose from {', '.join(choice)}")
-    return tuple(dict.fromkeys(names))
+        if entry not in choices:
+            raise CompleteSplatError(f"{name}={entry}: choose from {', '.join(choices)}")
+    return tuple(dict.fromkeys(map(str, names)))
 
 
-def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_images(config: DictConfig, model: SceneModel, images: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write each image's files into a folder below `out`, with a progress bar, or a line per image without a terminal.
 
     Raises:
@@ -127,48 +120,43 @@ def predict_pictures(config: Any, model: SceneModel, pictures: Sequence[Path], w
     console, failed = Console(), []
     if (config.mask is not None or config.box is not None) and not model.knows_hidden:
         log.warning(
-            "%s: these weights were not trained with parts of the picture hidden (data.box_masks, conf/experiment/"
-            "*_masked.yaml): what is hidden may come out black or grey",
+            "%s: these weights were not trained with parts of the image hidden (data.box_masks, conf/experiment/"
+            "*_masked.yaml): hidden parts may come out black or grey",
             "mask" if config.mask is not None else "box",
         )
     rasterizer = instantiate(config.rasterizer, _convert_="all")
-    folders = folder_names(picture.stem for picture in pictures)
+    folders = folder_names(image.stem for image in images)
     with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(pictures) * config.samples)
-        for index, (picture, folder) in enumerate(zip(pictures, folders, strict=True)):
-            name = printable(picture.name)
+        task = bar.add_task("", total=len(images) * config.samples)
+        for index, (image, folder) in enumerate(zip(images, folders, strict=True)):
+            name, start = printable(image.name), time.perf_counter()
             bar.update(task, description=escape(name), completed=index * config.samples)
-            start = time.perf_counter()
             try:
-                _predict(config, model, rasterizer, wanted, picture, out / folder, lambda: bar.advance(task))
+                _predict(config, model, rasterizer, wanted, image, out / folder, lambda: bar.advance(task))
             except DiskError:  # the other images would fail, too
                 raise
             except Exception as error:
-                message, expected = _told(error, picture), isinstance(error, CompleteSplatError | OSError)
-                if len(pictures) == 1 and expected:
-                    raise CompleteSplatError(message) from error
-                if len(pictures) == 1:
+                fault = not isinstance(error, CompleteSplatError | OSError)
+                message = " ".join(str(error).split()) or type(error).__name__
+                message = printable(message if image.name in message else f"{image}: {message}")
+                if len(images) == 1 and fault:
                     raise
-                if not expected:
-                    log.error("a fault of the program, not of the picture", exc_info=error)
-                failed.append(name)
+                if len(images) == 1:
+                    raise CompleteSplatError(message) from error
+                if fault:
+                    log.error("a fault of the program, not of the image", exc_info=error)
                 print(f"error: {message}", file=sys.stderr, flush=True)
+                failed.append(name)
                 continue
             if not console.is_terminal:
-                took = f"{time.perf_counter() - start:.0f} s"
-                print(f"{index + 1}/{len(pictures)} {name}: {out / folder} ({took})", flush=True)
+                seconds = f"{time.perf_counter() - start:.0f} s"
+                print(f"{index + 1}/{len(images)} {name}: {out / folder} ({seconds})", flush=True)
     if failed:
-        share = f"{len(failed)} of {len(pictures)} pictures failed ({', '.join(failed)})"
-        raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(pictures) else share)
+        share = f"{len(failed)} of {len(images)} images failed ({', '.join(failed)})"
+        raise CompleteSplatError(f"{share}; the others are in {out}" if len(failed) < len(images) else share)
 
 
-def _told(error: Exception, picture: Path) -> str:
-    """Return the error of an image in one line that names the image."""
-    message = " ".join(str(error).split()) or type(error).__name__
-    return printable(message if picture.name in message else f"{picture}: {message}")
-
-
-def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, out: Path) -> None:
+def predict_from_views(config: DictConfig, images: Sequence[Path], wanted: Wanted, out: Path) -> None:
     """Write the files of one scene that all images show, into a folder with the name of the first image.
 
     Raises:
@@ -177,31 +165,31 @@ def predict_from_views(config: Any, pictures: Sequence[Path], wanted: Wanted, ou
     """
     from completesplat.data.captures.transforms_json import read_photographs
 
-    if len(pictures) < 2:
-        raise CompleteSplatError("cameras=FILE goes with two pictures or more: image=[A,B]")
-    beside = [name for name in ("mask", "box", "fov") if config[name] is not None]
-    beside += ["background=remove"] if config.background == REMOVE else []
-    if beside:
-        raise CompleteSplatError(f"{beside[0]} does not go with cameras=FILE")
+    if len(images) < 2:
+        raise CompleteSplatError("cameras=FILE goes with two images or more: image=[A,B]")
+    others = [name for name in ("mask", "box", "fov") if config[name] is not None]
+    others += ["background=remove"] if config.background == REMOVE else []
+    if others:
+        raise CompleteSplatError(f"{others[0]} does not go with cameras=FILE")
     model = open_generator(config)
-    views = read_photographs(pictures, Path(config.cameras), model.image_size)
+    views = read_photographs(images, Path(config.cameras), model.image_size)
     views = replace(views, cameras=model.in_model_units(views.cameras))
     scene = model.reconstruct(views)
     recorded = {
         "seed": config.seed,
-        "image": printable(pictures[0].name),
-        "images": [printable(picture.name) for picture in pictures],
+        "image": printable(images[0].name),
+        "images": [printable(image.name) for image in images],
         "cameras": printable(Path(config.cameras).name),
         "screen_space_dilation": config.screen_space_dilation,
         "depth_range": model.depth_range.tolist(),
     }
-    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(pictures[0].stem)
+    rasterizer, folder = instantiate(config.rasterizer, _convert_="all"), out / safe_name(images[0].stem)
     write_prediction(folder, views.images[0], [scene], views.cameras[0], rasterizer, model.up, wanted, recorded)
-    print(f"one scene of {len(pictures)} pictures, at the posterior's mean: {folder}")
+    print(f"one scene of {len(images)} images, at the posterior's mean: {folder}")
 
 
 def _predict(
-    config: Any,
+    config: DictConfig,
     model: SceneModel,
     rasterizer: Rasterizer,
     wanted: Wanted,
@@ -214,16 +202,16 @@ def _predict(
     if warnings := remarks(photograph, model, whole=visible is None):
         log.warning("%s: %s", printable(image.name), "; ".join(warnings))
     settings = {name: config[name] for name in ("samples", "seed")}
-    how = {}
+    sampler = {}
     if isinstance(model, CompleteSplat):
         settings["guidance_weight"] = config.guidance_weight
         settings["skip_weight"] = allowed_skip_weight(config.skip_weight, visible)
         settings["steps"] = model.sampler.steps if config.steps is None else config.steps
-        how = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
+        sampler = {"sampler": model.architecture["sampler"]["scheduler"]["_target_"].rpartition(".")[2]}
     scenes = model(photograph, visible, batch=config.batch, **settings)
     recorded = {
         **settings,
-        **how,
+        **sampler,
         "image": printable(image.name),
         "screen_space_dilation": config.screen_space_dilation,
         "mask": None if config.mask is None else printable(Path(config.mask).name),
@@ -245,10 +233,10 @@ def remarks(photograph: Photograph, model: SceneModel, whole: bool) -> list[str]
     distance = model.distance(photograph) if whole else None
     if distance is not None and distance > UNLIKE:
         warnings.append(
-            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training pictures'"
+            f"colours, contrast or detail lie {distance:.1f} standard deviations from the training images'"
             f" ({UNLIKE:g} is far): expect little of it in the scenes"
         )
-    return [remark for remark in warnings if remark]
+    return [warning for warning in warnings if warning]
 
 
 def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str | None:
@@ -269,19 +257,15 @@ def unusual_field_of_view(photograph: Photograph, trained_degrees: float) -> str
     )
 
 
-def visible_part(config: Any, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
+def visible_part(config: DictConfig, image: Path, size: int) -> Float[Tensor, "1 size size"] | None:
     """Return 0 where `mask` or `box` hides the photo and 1 elsewhere; None without them.
 
     Raises:
         ImageError: the mask is not a readable image.
-        CompleteSplatError: mask and box at once, a box without four numbers, or a mask that hides nothing.
+        CompleteSplatError: mask and box at once, an impossible box, or a mask that hides nothing.
     """
     if config.mask is not None and config.box is not None:
         raise CompleteSplatError("give mask=FILE or box=[x0,y0,x1,y1], not both")
     if config.mask is not None:
         return outside_of_mask(image, Path(config.mask), size)
-    if config.box is None:
-        return None
-    if isinstance(config.box, str | int | float) or not all(isinstance(edge, int | float) for edge in config.box):
-        raise CompleteSplatError(f"box={config.box}: give [x0,y0,x1,y1]")
-    return outside_of_box(image, list(config.box), size)
+    return None if config.box is None else outside_of_box(image, list(config.box), size)

@@ -7,6 +7,8 @@ from pathlib import Path
 from signal import SIGINT
 from typing import Any
 
+from omegaconf import DictConfig
+
 from completesplat.commands.jobs import at_work, importing
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import printable
@@ -22,7 +24,7 @@ SCENE_FILES = ("sample_*.ply", "scene.ply")
 LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
 
 
-def run(config: Any, out: Path) -> None:
+def run(config: DictConfig, out: Path) -> None:
     """Open the page, fill it and stay until Ctrl-C; with `export`, write it to a file instead.
 
     The page first says that it is loading, because importing torch takes a second and loading the model longer.
@@ -35,8 +37,8 @@ def run(config: Any, out: Path) -> None:
     from completesplat.viewer.access import start_server, stop_server
 
     config.update(settings_of(Path(config.path)) if config.path is not None else {})
-    background = {} if config.background == REMOVE else {"background": config.background}
-    server = start_server(0 if config.export is not None else config.port, **background)
+    background = 0.5 if config.background == REMOVE else config.background
+    server = start_server(0 if config.export is not None else config.port, background)
     page = None
     try:
         if config.export is None:
@@ -85,7 +87,7 @@ def settings_of(path: Path) -> dict[str, str]:
     )
 
 
-def make_page(server: Any, config: Any, out: Path) -> Any:
+def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     """Create a server's page and fill it with what the settings name."""
     with importing():
         import torch
@@ -121,7 +123,7 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
     saver = Saver(out, splats, rasterizer, config.frames, background)
     if model is None:
         page = Page(server, splats, saver, max(sample.layers for sample in samples))
-        page.show(samples, step_of(samples) if config.watch is not None else "")
+        page.show(samples, "" if config.watch is None else step_of(samples))
         return page
     page = Page(server, splats, saver, model.parameterization.layers)
     steps = model.default_steps if config.steps is None else config.steps
@@ -132,7 +134,7 @@ def make_page(server: Any, config: Any, out: Path) -> Any:
     return page
 
 
-def newest_scenes(run: Path) -> tuple[list[Any], tuple[float, ...]]:
+def newest_scenes(run: Path) -> tuple[Sequence[Any], Sequence[float]]:
     """Return the newest fixed scenes of a run and the up direction; wait until there are scenes.
 
     Raises:
@@ -170,7 +172,7 @@ def show_newest(page: Any, run: Path) -> None:
         page.show(samples, step_of(samples))
 
 
-def data_cameras(config: Any) -> Any:
+def data_cameras(config: DictConfig) -> Any:
     """Return at most 24 evenly spaced cameras of the first readable training sequence, relative to its first camera.
 
     Raises:
@@ -202,5 +204,5 @@ def export(page: Any, path: Path) -> None:
 
     page.worker.wait()
     if not page.view.samples:
-        raise CompleteSplatError("there is nothing to export: give a scene, or a picture and weights")
+        raise CompleteSplatError("there is nothing to export: give a scene, or an image and weights")
     print(write_page(page.server, path))

@@ -15,7 +15,7 @@ from completesplat.geometry.cameras import Cameras
 SPLITS = ("train", "val", "test")
 
 
-class Picture(NamedTuple):
+class MaskedImage(NamedTuple):
     """Square image (sRGB) and its foreground probability (0 to 255), if the data set has one."""
 
     image: UInt8[Tensor, "3 size size"]
@@ -39,7 +39,7 @@ class PosedSequence:
     frames: tuple[int, ...]
     cameras: Cameras
     depth_ranges: Float[Tensor, "view 2"]
-    read: Callable[[int], Picture]
+    read: Callable[[int], MaskedImage]
     read_depth: Callable[[int], Float[Tensor, "1 size size"]] | None = None
 
 

@@ -10,6 +10,7 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from completesplat.errors import DataError, PlyError
 from completesplat.ply_files import read_vertices
@@ -45,7 +46,7 @@ class BadCamera(DataError, kind="impossible camera"):
     """Pose or intrinsics that no camera can have."""
 
 
-class BadPicture(DataError, kind="unusable picture"):
+class BadImage(DataError, kind="unusable image"):
     """Image, mask or depth map that is damaged, too large, of another size or ambiguous."""
 
 
@@ -138,14 +139,14 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
         raise UnreadableFile(f"not a text file ({type(error).__name__})", str(path)) from None
 
 
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a PLY file's vertices (`read_vertices`) and their positions [n 3] in float64; errors as in `read_json`."""
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Read the positions of a PLY file's vertices in float64; errors as in `read_json`."""
     require_file(path)
     try:
         vertices = read_vertices(path, "xyz")
     except PlyError as error:
         raise UnreadableFile(f"not a point cloud ({error})", str(path)) from None
-    return vertices, np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
 def field(entry: object, key: str, kind: type[T]) -> T:

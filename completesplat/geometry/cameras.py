@@ -114,14 +114,14 @@ def pinhole(fov_degrees: float, size: int) -> Float[Tensor, "3 3"]:
 
 
 def nearest_to_axes(cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """Return the point with the least sum of squared distances to all optical axes; None if they are parallel."""
+    """Return the point (float64) with the least squared distances to all optical axes; None if they are parallel."""
     axes, centers = cameras.camera_to_world[:, :3, 2].double(), cameras.centers.double()
     across = torch.eye(3, dtype=axes.dtype, device=axes.device) - axes[:, :, None] * axes[:, None]
     total = across.sum(0)
     if torch.linalg.eigvalsh(total)[0] < PARALLEL * len(axes):
         return None
     point: Tensor = torch.linalg.solve(total, (across @ centers[..., None]).sum(0))[:, 0]
-    return point.float()
+    return point
 
 
 def crop_resize(cameras: Cameras, left: float, top: float, side: float, size: int) -> Cameras:

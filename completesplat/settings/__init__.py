@@ -1,1 +1,5 @@
-"""Options in `conf/`, the checks of their values, and the arguments and help of commands."""
+"""Settings, from the command line to a checked config.
+
+`arguments` rewrites what users type for Hydra, `composition` composes the config with the options of `conf/`, which
+`options` and `help` explain, and `checks` holds each setting against `schema`.
+"""

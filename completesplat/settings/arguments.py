@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -10,12 +10,14 @@ from hydra.errors import HydraException
 
 from completesplat.errors import CompleteSplatError
 from completesplat.files import printable
-from completesplat.settings.options import TASKS, groups, meant, options
+from completesplat.settings.options import TASKS, did_you_mean, groups, options
 
 EXPORT = "--export"
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--info", "-i", "--config-dir", "-cd")
 """Hydra's flags that take the next argument as their value."""
 SWEEP = ("-m", "--multirun")
+WORDS = {"predict": ("image",), "view": ("path",), "new": ("kind", "name")}
+"""Settings that words without `=` give, by verb."""
 MOST_SHOWN = 120  # characters of a value
 
 
@@ -33,91 +35,60 @@ def behind_dashes(arguments: Sequence[str]) -> list[str]:
 
 
 def split_flags(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate Hydra's flags and their values from the other arguments, because Hydra takes no flags between them."""
+    """Separate Hydra's flags and their values from the other arguments, because Hydra takes no flags between them.
+
+    `--export FILE`, which is not Hydra's, becomes the setting `export='FILE'`.
+    """
     flags, others, remaining = [], [], iter(arguments)
     for argument in remaining:
         name, equals, value = argument.partition("=")
-        if name == EXPORT or not name.startswith("-"):
+        if not name.startswith("-"):
             others.append(argument)
-        elif name not in WITH_VALUE:
+        elif name not in (*WITH_VALUE, EXPORT):
             flags.append(argument)
-        elif value := value if equals else next(remaining, ""):
-            flags.append(f"{name}={value}")
-        else:
+        elif not (value := value if equals else next(remaining, "")):
             raise CompleteSplatError(f"{name}: lacks its value; give {name} VALUE")
+        elif name == EXPORT:
+            others.append(f"export={quoted(value)}")
+        else:
+            flags.append(f"{name}={value}")
     return flags, others
-
-
-def of_predict(arguments: Sequence[str]) -> list[str]:
-    """Rewrite `a.jpg b.jpg` as `image=['a.jpg','b.jpg']`."""
-    words, others = _split(arguments)
-    if not words:
-        return others
-    if any(argument.startswith("image=") for argument in others):
-        raise CompleteSplatError(f"give pictures by their names or as image=, not both: {_shown(words[0])}")
-    pictures = ",".join(map(quoted, words))
-    return [f"image=[{pictures}]" if len(words) > 1 else f"image={pictures}", *others]
-
-
-def of_view(arguments: Sequence[str]) -> list[str]:
-    """Rewrite `PATH` as `path='PATH'`, and `--export FILE` as `export='FILE'`."""
-    plain, exported, remaining = [], [], iter(arguments)
-    for argument in remaining:
-        if argument.partition("=")[0] != EXPORT:
-            plain.append(argument)
-            continue
-        file = argument.partition("=")[2] or next(remaining, "")
-        if not file:
-            raise CompleteSplatError(f"{EXPORT} needs a file: {EXPORT} page.html")
-        exported.append(f"export={quoted(file)}")
-    words, others = _split(plain)
-    if len(words) > 1:
-        raise CompleteSplatError(f"give one path to look at, not {' '.join(map(_shown, words))}")
-    return [*(f"path={quoted(word)}" for word in words), *exported, *others]
-
-
-def of_new(arguments: Sequence[str]) -> list[str]:
-    """Rewrite `KIND NAME` as `kind='KIND' name='NAME'`."""
-    words, others = _split(arguments)
-    if len(words) > 2:
-        raise CompleteSplatError(f"give one kind and one name, not {' '.join(map(_shown, words))}")
-    return [f"{key}={quoted(word)}" for key, word in zip(("kind", "name"), words, strict=False)] + others
-
-
-def of_task(verb: str) -> Callable[[Sequence[str]], list[str]]:
-    """Return the function that rewrites a first argument `TASK` as `VERB_task=TASK`, for a verb with tasks."""
-
-    def overrides(arguments: Sequence[str]) -> list[str]:
-        if not arguments or "=" in arguments[0]:
-            return list(arguments)
-        return [f"{verb}_task={arguments[0]}", *arguments[1:]]
-
-    return overrides
-
-
-SHORT_FORMS = {"predict": of_predict, "view": of_view, "new": of_new, **{verb: of_task(verb) for verb in TASKS}}
 
 
 def for_hydra(verb: str, arguments: Sequence[str]) -> list[str]:
     """Return flags and settings as Hydra reads them, the flags first.
 
-    A value that is the name of an existing file or folder is taken literally, whatever it contains: `a,b.jpg`.
+    `data TASK` is short for `data_task=TASK`, `predict A B` for `image=[A,B]`, `view PATH` for `path=PATH`, and
+    `new KIND NAME` for `kind=KIND name=NAME`. The name of an existing file or folder is taken literally, as `a,b.jpg`.
 
     Raises:
-        CompleteSplatError: a flag lacks its value, there are too many words, images are given by name and by `image=`,
-            a word is no setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
+        CompleteSplatError: a flag lacks its value, there are too many words, a setting is given both ways, a word is no
+            setting, a value cannot be read, several values come without `-m`, or `out=` is empty.
     """
     flags, others = split_flags(arguments)
-    settings = [_with_file(argument) for argument in SHORT_FORMS.get(verb, list)(others)]
+    if verb in WORDS:
+        others = _with_words(verb, others)
+    elif verb in TASKS and others and "=" not in others[0]:
+        others = [f"{verb}_task={others[0]}", *others[1:]]
+    settings = [_with_file(argument) for argument in others]
     for argument in settings:
         _refuse_unreadable(argument, any(flag in SWEEP for flag in flags))
     return [*flags, *settings]
 
 
-def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Separate words, which contain no `=` or name a file, from the other arguments."""
+def _with_words(verb: str, arguments: Sequence[str]) -> list[str]:
+    """Rewrite words, which contain no `=` or name a file, as values of the settings in `WORDS`."""
     words = [word for word in arguments if ("=" not in word and not word.startswith("~")) or os.path.isfile(word)]
-    return words, [argument for argument in arguments if argument not in words]
+    settings = [argument for argument in arguments if argument not in words]
+    keys = WORDS[verb]
+    if twice := [key for key in keys if words and any(setting.startswith(f"{key}=") for setting in settings)]:
+        raise CompleteSplatError(f"give files by their names or as {twice[0]}=, not both: {_short(words[0])}")
+    if verb == "predict" and len(words) > 1:
+        return [f"image=[{','.join(map(quoted, words))}]", *settings]
+    if len(words) > len(keys):
+        wanted = " and ".join(f"one {key}" for key in keys)
+        raise CompleteSplatError(f"give {wanted}, not {' '.join(map(_short, words))}")
+    return [f"{key}={quoted(word)}" for key, word in zip(keys, words, strict=False)] + settings
 
 
 def _with_file(argument: str) -> str:
@@ -137,17 +108,17 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     key, equals, value = argument.partition("=")
     if not equals and not argument.startswith("~"):
         chosen = [f"{group}={argument}" for group in groups() if argument in options(group)]
-        nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else meant(argument, groups())
-        raise CompleteSplatError(f"{_shown(argument)}: no setting, which are given as key=value{nearest}")
+        nearest = f"; did you mean {' or '.join(chosen)}?" if chosen else did_you_mean(argument, groups())
+        raise CompleteSplatError(f"{_short(argument)}: no setting, which are given as key=value{nearest}")
     try:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
         example = f'"{key}={_readable(value)}"'
         message = "cannot be read; a text with such characters wants quotes"
-        raise CompleteSplatError(f"{_shown(argument)}: {message}: {_shown(example)}") from None
+        raise CompleteSplatError(f"{_short(argument)}: {message}: {_short(example)}") from None
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
-        raise CompleteSplatError(f"{_shown(argument)}: {_shown(message)}")
+        raise CompleteSplatError(f"{_short(argument)}: {_short(message)}")
     if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
 
@@ -160,6 +131,6 @@ def _readable(value: str) -> str:
     return f"[{','.join(quoted(entry.strip()) for entry in entries)}]"
 
 
-def _shown(text: str) -> str:
+def _short(text: str) -> str:
     preview = printable(text)
     return preview if len(preview) <= MOST_SHOWN else f"{preview[:MOST_SHOWN]}..."

@@ -3,14 +3,13 @@
 import inspect
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
-from typing import Any
 
 from omegaconf import OmegaConf
 
 from completesplat.errors import CompleteSplatError
-from completesplat.settings.checks import OF_VERBS
+from completesplat.settings.checks import VERBS
 from completesplat.settings.options import (
     TASKS,
     Choice,
@@ -18,7 +17,7 @@ from completesplat.settings.options import (
     about_groups,
     choices_of_verb,
     conf_folder,
-    meant,
+    did_you_mean,
     options,
     read,
     settings_of_option,
@@ -53,32 +52,25 @@ def page(verb: str, arguments: Sequence[str]) -> str:
             return part_page(verb, groups[group], option or groups[group].option)
         if "=" not in word:
             tasks = options(f"{verb}_task") if verb in TASKS else []
-            raise CompleteSplatError(f"nothing to say on {word!r}{meant(word, [*groups, *tasks])}")
-    return "\n\n".join(
-        [str(OmegaConf.load(conf_folder() / f"{verb}.yaml").hydra.help.header).strip(), *_body(verb, task)]
-    )
+            raise CompleteSplatError(f"nothing to say on {word!r}{did_you_mean(word, [*groups, *tasks])}")
+    header = str(OmegaConf.load(conf_folder() / f"{verb}.yaml").hydra.help.header).strip()
+    return "\n\n".join([header, *_body(verb, task)])
 
 
-def _body(verb: str, task: str | None) -> list[str]:
-    parts = []
+def _body(verb: str, task: str | None) -> Iterator[str]:
+    command = verb if task is None else f"{verb} {task}"
     if task is not None:
         rows = [(name, _first_sentence(read(f"{verb}_task/{name}").about)) for name in options(f"{verb}_task")]
-        parts.append(f"Tasks (completesplat {verb} TASK --help shows one):\n\n" + "\n".join(_row(*row) for row in rows))
-    of_task = f" of {verb} {task}" if task is not None else ""
+        yield _table(f"Tasks (completesplat {verb} TASK --help shows one):", rows)
     hints = _hints(verb, task)
-    lines = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
-    parts.append(f"Settings{of_task} (key=value):\n\n" + "\n".join(lines))
-    groups, about = choices_of_verb(verb, task), about_groups()
-    if groups:
-        rows = [(_chosen(group), _about(group, about)) for group in groups]
-        heading = (
-            f"Parts (group=option chooses; completesplat {f'{verb} {task}' if task else verb} --help GROUP shows one):"
-        )
-        parts.append(f"{heading}\n\n" + "\n".join(_row(*row) for row in rows))
-    return [
-        *parts,
-        "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'.",
-    ]
+    rows = [_line(setting, hints.get(setting.key), {}, verb) for setting in settings_of_verb(verb, task)]
+    yield _table(f"Settings{'' if task is None else f' of {command}'} (key=value):", rows)
+    about = about_groups()
+    if choices := choices_of_verb(verb, task):
+        keys = [entry.place if entry.option == "null" else f"{entry.place}={entry.option}" for entry in choices]
+        rows = [(key, _about(choice, about)) for key, choice in zip(keys, choices, strict=True)]
+        yield _table(f"Parts (group=option chooses; completesplat {command} --help GROUP shows one):", rows)
+    yield "A sweep over values: -m key=a,b. Lists and values with spaces want the shell's quotes: 'key=[a,b]'."
 
 
 def part_page(verb: str, choice: Choice, option: str) -> str:
@@ -87,29 +79,27 @@ def part_page(verb: str, choice: Choice, option: str) -> str:
     Raises:
         CompleteSplatError: the group has no option of this name.
     """
-    named = options(choice.group)
+    known = options(choice.group)
     if option == "null":
         message = f"{choice.place}: {_about(choice, about_groups())}"
         return f"{_wrapped(message)}\nTo see one: completesplat {verb} --help {choice.place}=OPTION"
-    if option not in named:
-        raise CompleteSplatError(f"no {choice.group} {option!r}: there are {', '.join(named)}{meant(option, named)}")
+    if option not in known:
+        nearest = did_you_mean(option, known)
+        raise CompleteSplatError(f"no {choice.group} {option!r}: there are {', '.join(known)}{nearest}")
     place = None if choice.place == choice.group else choice.place
     settings = settings_of_option(choice.group, option, place)
     targets = {key.removesuffix("._target_"): value for key, value, _ in settings if key.endswith("._target_")}
-    settings = [setting for setting in settings if not setting.key.rpartition(".")[2].startswith("_")]
-    known = {key: _of_target(target) for key, target in targets.items()}
-    lines = []
+    arguments = {key: _of_target(target) for key, target in targets.items()}
+    rows = []
     for setting in settings:
         above, _, name = setting.key.rpartition(".")
-        if not re.fullmatch(r"\$\{\w+\}", setting.value):
-            hints, documented = known.get(above, ({}, {}))
-            lines.append(_line(setting, hints.get(name), documented))
+        if not name.startswith("_") and not re.fullmatch(r"\$\{\w+\}", setting.value):
+            hints, documented = arguments.get(above, ({}, {}))
+            rows.append(_line(setting, hints.get(name), documented))
     about = with_bases(choice.group, option).about.strip()
-    head = f"{choice.place}={option}" + (f"\n{_wrapped(about)}" if about else "")
     made = [f"Made by {target}." for key, target in targets.items() if key == choice.place]
-    return "\n\n".join(
-        [head, "\n".join(lines) or "No settings of its own.", *made, _wrapped(f"Others: {', '.join(named)}")]
-    )
+    parts = [_table(f"{choice.place}={option}" + (f"\n{_wrapped(about)}" if about else ""), rows), *made]
+    return "\n\n".join([*parts, _wrapped(f"Others: {', '.join(known)}")])
 
 
 def _wrapped(text: str) -> str:
@@ -122,15 +112,15 @@ def _first_sentence(text: str) -> str:
     return re.split(r"(?<=[.:])\s", text.replace("\n", " ").partition(": ")[2] or text)[0].rstrip(":")
 
 
-def _hints(verb: str, task: str | None) -> Mapping[str, Any]:
+def _hints(verb: str, task: str | None) -> Mapping[str, object]:
     """Return the annotations of a verb's own settings, where the function that takes them can be imported."""
-    if verb in OF_VERBS:
-        return hints_of(OF_VERBS[verb])
+    if verb in VERBS:
+        return hints_of(VERBS[verb])
     named = {setting.key: setting.value for setting in with_bases(f"{verb}_task", task).settings} if task else {}
     return _of_target(named.get("task._target_", ""))[0]
 
 
-def _of_target(target: str) -> tuple[Mapping[str, Any], Mapping[str, str]]:
+def _of_target(target: str) -> tuple[Mapping[str, object], Mapping[str, str]]:
     """Return annotations and descriptions (from docstrings) of a class's or function's arguments, by name."""
     module, _, name = target.rpartition(".")
     try:
@@ -145,7 +135,7 @@ def _of_target(target: str) -> tuple[Mapping[str, Any], Mapping[str, str]]:
     return hints, descriptions
 
 
-def _line(setting: Setting, hint: Any, documented: Mapping[str, str], verb: str = "") -> str:
+def _line(setting: Setting, hint: object, documented: Mapping[str, str], verb: str = "") -> tuple[str, str]:
     value = setting.value.replace("${verb}", verb).replace("${run_name:}", "TIME")
     key = setting.key if value in ("", NEEDED) or "${" in value else f"{setting.key}={value}"
     kind = described(hint) or _kind_of(value)
@@ -153,7 +143,7 @@ def _line(setting: Setting, hint: Any, documented: Mapping[str, str], verb: str 
     # A remark on the paper follows the description; any other comment replaces it.
     text = f"{documentation} {setting.comment}" if REMARK in setting.comment[:20] else setting.comment or documentation
     parts = ["needed;" if value == NEEDED else "", text.strip(), f"[{kind}]" if kind else ""]
-    return _row(key, " ".join(filter(None, parts)))
+    return key, " ".join(filter(None, parts))
 
 
 def _kind_of(value: str) -> str:
@@ -163,19 +153,21 @@ def _kind_of(value: str) -> str:
     return next((kind for pattern, kind in kinds.items() if re.fullmatch(pattern, value)), "")
 
 
-def _chosen(choice: Choice) -> str:
-    return choice.place if choice.option == "null" else f"{choice.place}={choice.option}"
-
-
 def _about(choice: Choice, about: Mapping[str, str]) -> str:
     text = (choice.comment or about.get(choice.group, "")).replace("`", "").rstrip(".")
     return f"{text} [{', '.join(options(choice.group))}]".strip()
 
 
-def _row(key: str, text: str) -> str:
-    """Format a key with a text beside it, in lines of at most 120 columns."""
+def _table(heading: str, rows: Iterable[tuple[str, str]]) -> str:
+    """Format keys with a text beside each, in lines of at most 120 columns."""
+    lines = [heading, ""]
     indent = " " * COLUMN
-    lines = textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_long_words=False) or [""]
-    if len(key) + 3 <= COLUMN:
-        return f"  {key}".ljust(COLUMN) + "\n".join(lines)[COLUMN:]
-    return "\n".join([f"  {key}", *(line for line in lines if line)])
+    for key, text in rows:
+        wrapped = textwrap.wrap(text, WIDTH, initial_indent=indent, subsequent_indent=indent, break_long_words=False)
+        if len(key) + 3 <= COLUMN:
+            first, *wrapped = wrapped or [""]
+            lines.append(f"  {key}".ljust(COLUMN) + first[COLUMN:])
+        else:
+            lines.append(f"  {key}")
+        lines += wrapped
+    return "\n".join(lines)

@@ -1,19 +1,19 @@
-"""Options and settings in `conf/`: a reader of its files and their comments that imports neither Hydra nor OmegaConf.
+"""Options and settings in `conf/` with their comments, for help texts and for completion in shells.
 
-A comment above a key or behind its value explains the key; the first comment of a file explains the file. This module
-answers `completesplat --complete WORDS`, which shells call to complete the command line, so it has to be quick.
+A comment above a key or behind its value explains the key; the first comment of a file explains the file. Neither Hydra
+nor OmegaConf is imported, because shells call `completesplat --complete WORDS` at each press of the tab key.
 """
 
 import re
-import runpy
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from difflib import get_close_matches
-from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-KEY = re.compile(r"( *)([\w.]+):(?:\s+(.*))?")
-CHOICE = re.compile(r"\s+- (override )?/?([\w./]+)(?:@([\w.]+))?: ([\w.]+)")
+import yaml
+
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 NAMED = re.compile(r"^\| (`[^|]*`) \| ([^|]*) \|$", re.MULTILINE)
 PACKAGE = "# @package "
 TASKS = ("data", "bench", "report")
@@ -41,11 +41,11 @@ complete -o default -F _completesplat completesplat
 ZSH = r"""#compdef completesplat
 # eval "$(completesplat completion zsh)"   in ~/.zshrc, below compinit
 _completesplat() {
-    local -a found
-    found=("${(@f)$("${words[1]}" --complete "${(@)words[2,CURRENT]}" 2>/dev/null)}")
-    found=(${found:#})
-    if (( ${#found} )); then
-        compadd -S '' -- "${found[@]}"
+    local -a matches
+    matches=("${(@f)$("${words[1]}" --complete "${(@)words[2,CURRENT]}" 2>/dev/null)}")
+    matches=(${matches:#})
+    if (( ${#matches} )); then
+        compadd -S '' -- "${matches[@]}"
     else
         compset -P '*='
         _files
@@ -110,8 +110,7 @@ def groups() -> list[str]:
 
 def options(group: str) -> list[str]:
     """Return the options of a group; an empty list if there is no such group."""
-    files = [file for folder in folders() for file in (folder / group).glob("[!_]*.yaml")]
-    return sorted({file.stem for file in files})
+    return sorted({file.stem for folder in folders() for file in (folder / group).glob("[!_]*.yaml")})
 
 
 def about_groups() -> dict[str, str]:
@@ -134,35 +133,39 @@ def read(name: str) -> ConfFile:
 
 def parse(text: str) -> ConfFile:
     """Parse the text of a file."""
-    head: list[str] = []
-    comments: list[str] = []
-    package, above = None, [""]
-    parsed = ConfFile("", None, [], [], [])
     lines = text.splitlines()
-    while lines and (lines[0].startswith("#") or not lines[0]):
-        line = lines.pop(0)
-        if not line:
-            break
-        if line.startswith(PACKAGE):
-            package = line.removeprefix(PACKAGE).strip()
-        else:
-            head.append(line[1:])
-    for line in lines:
-        content, _, remark = line.partition(" #") if not line.strip().startswith("#") else ("", "", line.strip()[1:])
-        if not content.strip():
-            comments = [*comments, remark.strip()] if remark else []
+    head = list(takewhile(lambda line: line.startswith("#"), lines))
+    packages = [line.removeprefix(PACKAGE).strip() for line in head if line.startswith(PACKAGE)]
+    about = "\n".join(line[1:].removeprefix(" ") for line in head if not line.startswith(PACKAGE))
+
+    def comment(node: yaml.Node) -> str:
+        number = node.start_mark.line
+        above = takewhile(lambda line: line.lstrip().startswith("#"), lines[len(head) : number][::-1])
+        behind = lines[number][node.start_mark.column :].partition(" #")[2]
+        return " ".join(filter(None, [*(line.strip()[1:].strip() for line in [*above][::-1]), behind.strip()]))
+
+    root = yaml.compose(text, Loader=LOADER) or yaml.compose("{}", Loader=LOADER)  # an empty file has no root
+    entries = {key.value: value for key, value in root.value}
+    choices, bases = [], []
+    for entry in entries["defaults"].value if "defaults" in entries else []:
+        if isinstance(entry, yaml.MappingNode):
+            ((name, option),) = entry.value
+            group, _, place = name.value.removeprefix("override ").removeprefix("/").partition("@")
+            choices.append(Choice(group, place or group, option.value, comment(entry)))
+        elif entry.value != "_self_":
+            bases.append(entry.value)
+    settings = [setting for setting in _settings(root, text, comment) if not setting.key.startswith("defaults")]
+    return ConfFile(about, packages[0] if packages else None, settings, choices, bases)
+
+
+def _settings(parent: yaml.MappingNode, text: str, comment: Callable[[yaml.Node], str]) -> Iterator[Setting]:
+    for key, node in parent.value:
+        if isinstance(node, yaml.MappingNode) and not node.flow_style:
+            yield from (inner._replace(key=f"{key.value}.{inner.key}") for inner in _settings(node, text, comment))
             continue
-        comment, comments = " ".join([*comments, remark.strip()]).strip(), []
-        if above[0] == "defaults" and content.startswith(" "):
-            if chosen := CHOICE.fullmatch(content.rstrip()):
-                parsed.choices.append(Choice(chosen[2], chosen[3] or chosen[2], chosen[4], comment))
-            elif (base := content.strip()[2:]) != "_self_":
-                parsed.bases.append(base)
-        elif key := KEY.fullmatch(content.rstrip()):
-            above = [*above[: len(key[1]) // 2], key[2]]
-            parsed.settings.append(Setting(".".join(above), key[3] or "", comment))
-    about = "\n".join(line[1:] if line.startswith(" ") else line for line in head)
-    return parsed._replace(about=about, package=package)
+        block = isinstance(node, yaml.SequenceNode) and not node.flow_style
+        value = "" if block else text[node.start_mark.index : node.end_mark.index]
+        yield Setting(key.value, " ".join(value.split()), comment(key))
 
 
 def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[Setting]:
@@ -171,7 +174,7 @@ def own_settings(written: ConfFile, without: tuple[str, ...] = ()) -> Iterator[S
     for setting in written.settings:
         inner = any(key.startswith(f"{setting.key}.") for key in keys)
         hydras = setting.key.rpartition(".")[2].startswith("_") and without
-        if not inner and not hydras and setting.key.partition(".")[0] not in (*without, "defaults"):
+        if not inner and not hydras and setting.key.partition(".")[0] not in without:
             yield setting
 
 
@@ -208,9 +211,9 @@ def choices_of_verb(verb: str, task: str | None = None) -> list[Choice]:
     return choices + ([] if task is None else with_bases(f"{verb}_task", task).choices)
 
 
-def meant(name: str, names: Any, most: int = 3) -> str:
+def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Return an ending for a message about an unknown name: the nearest of `names`, or nothing if none is near."""
-    nearest = get_close_matches(name, list(names), n=most, cutoff=LEAST_LIKE)
+    nearest = get_close_matches(name, list(names), cutoff=LEAST_LIKE)
     return f"; did you mean {' or '.join(nearest)}?" if nearest else ""
 
 
@@ -251,18 +254,3 @@ def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
     # Nested keys are offered once their dots, or three characters, are typed.
     near = [name for name in keys if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
     return [*(tasks if len(words) == 1 else []), *near, "--help"]
-
-
-def gsplat_constants() -> dict[str, float]:
-    """Return the constants compiled into the kernels of the installed gsplat, without importing it.
-
-    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. Release 1.5.3 has them in its kernels only
-    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); its values are the defaults, also where gsplat is not installed.
-    """
-    spec = find_spec("gsplat")
-    files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]
-    stated = {"MAX_ALPHA": 0.999, "ALPHA_THRESHOLD": 1 / 255, "TRANSMITTANCE_THRESHOLD": 1e-4}
-    for file in filter(Path.is_file, files):
-        stated |= runpy.run_path(str(file))
-    names = {"max_alpha": "MAX_ALPHA", "min_alpha": "ALPHA_THRESHOLD", "min_transmittance": "TRANSMITTANCE_THRESHOLD"}
-    return {name: stated[constant] for name, constant in names.items()}

@@ -2,16 +2,21 @@
 
 import inspect
 import math
-import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints
+from typing import Annotated, Literal, NamedTuple, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
 
 from completesplat.errors import CompleteSplatError
 
 MOST_SHOWN = 1e6  # help texts leave out larger bounds
-KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", NoneType: "null"}
+KINDS: dict[object, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    str: "a text",
+    NoneType: "null",
+}
 
 
 @dataclass(frozen=True)
@@ -21,14 +26,15 @@ class Range:
     least: float
     most: float = math.inf
 
-    def refusal(self, value: Any) -> str | None:
+    def refusal(self, value: float) -> str | None:
         """Return why the value is refused, None if it is accepted."""
         if value == math.inf:
             return "must be finite"
         if self.least <= value <= self.most:
             return None
-        limited = f"lie between {self.least:g} and {self.most:g}"
-        return f"must be at least {self.least:g}" if math.isinf(self.most) else f"must {limited}"
+        if math.isinf(self.most):
+            return f"must be at least {self.least:g}"
+        return f"must lie between {self.least:g} and {self.most:g}"
 
     def words(self) -> str:
         """Describe the range in a few words."""
@@ -39,9 +45,9 @@ class Range:
 class OneOf:
     """Rule for `Annotated`: one of several values."""
 
-    choices: tuple[Any, ...]
+    choices: tuple[object, ...]
 
-    def refusal(self, value: Any) -> str | None:
+    def refusal(self, value: object) -> str | None:
         """Return why the value is refused, None if it is accepted."""
         return None if value in self.choices else f"choose one of {', '.join(map(str, self.choices))}"
 
@@ -53,7 +59,7 @@ class Entries:
     least: int = 0
     most: float = math.inf
 
-    def refusal(self, value: Any) -> str | None:
+    def refusal(self, value: Sequence[object]) -> str | None:
         """Return why the value is refused, None if it is accepted."""
         if self.least <= len(value) <= self.most:
             return None
@@ -74,16 +80,19 @@ Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
 Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
+Target = Callable[..., object] | type
+"""A function or class, or a `TypedDict`, whose annotations are the schema of settings."""
+
 
 class Refused(NamedTuple):
     """A refused value: its place inside the setting (`.key`, empty for the setting itself) and the reason."""
 
     place: str
-    value: Any
+    value: object
     reason: str
 
 
-def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
+def check_settings(function: Target, settings: Mapping[str, object]) -> None:
     """Check settings against the annotations of the same names, of a function's arguments or in a `TypedDict`.
 
     Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Entries`; any
@@ -97,14 +106,14 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
         check_value(name, hints[name], settings[name])
 
 
-def check_value(key: str, annotation: Any, value: Any) -> None:
+def check_value(key: str, annotation: object, value: object) -> None:
     """Raise CompleteSplatError, with the values that are allowed, if a setting does not fit an annotation."""
     for place, part, reason in refused(annotation, value):
         example = f", such as {key}{place}=[{part}]" if reason == "must be a list" else ""
         raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
 
 
-def hints_of(function: Any) -> dict[str, Any]:
+def hints_of(function: Target) -> dict[str, object]:
     """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
     hints = get_type_hints(function, include_extras=True)
     for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
@@ -112,14 +121,14 @@ def hints_of(function: Any) -> dict[str, Any]:
     return hints
 
 
-def arguments_of(target: Any) -> tuple[dict[str, Any], bool]:
+def arguments_of(target: Target) -> tuple[dict[str, object], bool]:
     """Return annotations of a class's or function's arguments, by name, and whether these are all the arguments.
 
-    If a class passes `**settings: Any` on to its base class, the arguments of the base class are included.
+    If a class passes further settings on to its base class, the arguments of the base class are included.
     """
     kinds = target.__mro__ if isinstance(target, type) else ()
     functions = [vars(kind)["__init__"] for kind in kinds if "__init__" in vars(kind)] or [target]
-    annotations: dict[str, Any] = {}
+    annotations: dict[str, object] = {}
     for function in functions:
         try:
             hints, parameters = hints_of(function), inspect.signature(function).parameters.values()
@@ -128,49 +137,45 @@ def arguments_of(target: Any) -> tuple[dict[str, Any], bool]:
         named = {param.name for param in parameters if param.kind in (param.POSITIONAL_OR_KEYWORD, param.KEYWORD_ONLY)}
         more = [param for param in parameters if param.kind is param.VAR_KEYWORD]
         named |= {name for name in hints if name != "return"} - {param.name for param in parameters}
-        annotations = {name: hints.get(name, Any) for name in named - {"self"}} | annotations
+        annotations = {name: hints.get(name, object) for name in named - {"self"}} | annotations
         if not more or get_origin(get_type_hints(function).get(more[0].name)) is Unpack:
             return annotations, True
     return annotations, False
 
 
-def refused(annotation: Any, value: Any) -> list[Refused]:
+def refused(annotation: object, value: object) -> list[Refused]:
     """Return the parts of a value that do not fit an annotation, with the reasons."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         kind, *rules = arguments
         unfit = refused(kind, value)
         return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
+    members = arguments if origin in (Union, UnionType) else (annotation,)
+    if all(get_origin(member) is Literal or member is NoneType for member in members):
+        choices = OneOf(tuple(choice for member in members for choice in get_args(member) or (None,)))
+        return refused(Annotated[object, choices], value)
     if origin in (Union, UnionType):
-        literals = [literal for member in arguments for literal in get_args(member) if get_origin(member) is Literal]
-        if literals and all(get_origin(member) is Literal or member is NoneType for member in arguments):
-            choices = (*literals, None) if NoneType in arguments else tuple(literals)
-            return refused(Annotated[Any, OneOf(choices)], value)
         # A setting is never a `Tensor`, so `float | Tensor` means float. Without numbers, other classes accept all.
         plain = [member for member in arguments if not isinstance(member, type) or member in KINDS]
         numbers = {int, float} & set(arguments) and isinstance(value, str | int | float | Sequence)
         attempts = [refused(member, value) for member in (plain if numbers else arguments)]
         return [] if [] in attempts else attempts[0]
-    if origin is Literal:
-        return refused(Annotated[Any, OneOf(arguments)], value)
     if origin is Sequence:  # if an entry does not fit, the whole list is reported
         if isinstance(value, str) or not isinstance(value, Sequence):
             return [Refused("", value, "must be a list")]
         return [Refused("", value, bad.reason) for entry in value for bad in refused(arguments[0], entry)]
-    if origin is Mapping or typing.is_typeddict(annotation):
+    if origin is Mapping or is_typeddict(annotation):
         if not isinstance(value, Mapping):
             return [Refused("", value, "must be a mapping")]
-        typed = get_type_hints(annotation, include_extras=True) if typing.is_typeddict(annotation) else {}
-        kinds = {key: typed.get(key, Any) if typed else arguments[1] for key in value}
-        return [
-            bad._replace(place=f".{key}{bad.place}") for key, kind in kinds.items() for bad in refused(kind, value[key])
-        ]
-    if annotation in KINDS and not _is_a(annotation, value):
+        typed = get_type_hints(annotation, include_extras=True) if is_typeddict(annotation) else {}
+        kinds = [(key, part, typed.get(key, object) if typed else arguments[1]) for key, part in value.items()]
+        return [bad._replace(place=f".{key}{bad.place}") for key, part, kind in kinds for bad in refused(kind, part)]
+    if isinstance(annotation, type) and annotation in KINDS and not _is_a(annotation, value):
         return [Refused("", value, f"must be {KINDS[annotation]}")]
     return []
 
 
-def described(annotation: Any) -> str:
+def described(annotation: object) -> str:
     """Describe the values that an annotation allows in a few words; return an empty text if unknown."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
@@ -184,17 +189,17 @@ def described(annotation: Any) -> str:
         return ", ".join(map(str, arguments))
     if origin is Sequence:
         return "list"
-    if origin is Mapping or typing.is_typeddict(annotation):
+    if origin is Mapping or is_typeddict(annotation):
         return "mapping"
     return KINDS.get(annotation, "").removeprefix("a ") if isinstance(annotation, type) else ""
 
 
-def _is_a(kind: type, value: Any) -> bool:
+def _is_a(kind: type, value: object) -> bool:
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, int | float if kind is float else kind)
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Shorten a stranger's value for a message, and escape characters that would move a terminal's cursor."""
     return str(value).encode("unicode_escape").decode()[:80]

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from completesplat.data.loading.training_statistics import world_up
-from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.errors import DataError
 from completesplat.export.images import INK, MARGIN, PAPER, SheetCell, image_sheet, write_png
 from completesplat.geometry.cameras import Cameras, project, transform_points, unproject
@@ -229,7 +229,7 @@ def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
     return SheetCell(_tensor(cell), label + ("" if inside else ": cross outside" if arms else ": cross behind"))
 
 
-def _with_outline(picture: Picture) -> Image.Image:
+def _with_outline(picture: MaskedImage) -> Image.Image:
     """Resize an image to a cell, with a line where the mask crosses one half."""
     pixels = _resized(picture.image.permute(1, 2, 0).numpy()).copy()
     if picture.mask is not None:

@@ -14,6 +14,7 @@ def python(program: str, **settings) -> str:
     return subprocess.run(started, capture_output=True, text=True, check=True, **settings).stdout
 
 
+@pytest.mark.processes
 def test_help_needs_no_heavy_import():
     program = "import sys; sys.argv = ['completesplat', '--help']; from completesplat.cli import main; main(); "
     program += "print([m for m in ('torch', 'lightning', 'hydra', 'diffusers', 'numpy') if m in sys.modules])"
@@ -24,6 +25,7 @@ def test_help_needs_no_heavy_import():
     assert python(of_a_verb).splitlines()[-1] == "[]"
 
 
+@pytest.mark.processes
 def test_a_reader_that_goes_away_is_no_fault_of_the_program():
     program = "import sys; sys.argv = ['completesplat', 'fit', '--help']; from completesplat.cli import main; main()"
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -32,6 +34,7 @@ def test_a_reader_that_goes_away_is_no_fault_of_the_program():
     assert process.wait() == 1
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("given", [None, "7"])
 def test_torch_is_loaded_with_short_waits_of_its_threads(given):
     """In a process of its own, which ends where torch would be loaded: what counts is the setting at that moment."""
@@ -77,6 +80,7 @@ def test_refusals_are_one_line_and_status_two(command, arguments, said):
     assert said in finished.err
 
 
+@pytest.mark.processes
 def test_two_launches_in_one_second_do_not_share_a_directory():
-    program = "import os, hydra; os.fork(); from completesplat.commands import RUN_NAME; print(RUN_NAME)"
+    program = "import os, hydra; os.fork(); from completesplat.settings.composition import RUN_NAME; print(RUN_NAME)"
     assert len(set(python(program).splitlines())) == 2

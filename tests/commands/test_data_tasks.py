@@ -7,9 +7,9 @@ import pytest
 from omegaconf import OmegaConf
 from support import refused, strict_json, write_capture
 
-from completesplat.commands.jobs import conf_folder
 from completesplat.data.toy import write_rooms
 from completesplat.data.toy.module import OWN_PLACE
+from completesplat.settings.options import conf_folder
 
 
 @pytest.fixture(scope="module")
@@ -87,15 +87,15 @@ def test_prepared_data_pass_the_check_until_a_bit_flips_and_are_not_prepared_aga
     assert "changed file" in found["counts"]
 
 
-def test_an_imported_capture_can_be_shown(command, tmp_path):
+def test_a_capture_can_be_shown_where_it_is_and_prepared(command, tmp_path):
     write_capture(tmp_path / "capture", frames=8)
-    given = [f"transforms={tmp_path / 'capture/transforms.json'}", f"out={tmp_path / 'out'}", "category=thing"]
-    assert command("data", "import", *given).status == 0
-    assert (tmp_path / "out/thing/frame_annotations.jgz").is_file()
-    settings = ["data=co3d_category", f"data.root={tmp_path / 'out'}", "data.category=thing", "data.subset=imported"]
-    settings += ["data.allow_shared_sequences=true"]
-    assert command("data", "show", *settings, "data.image_size=12", f"out={tmp_path / 'show'}").status == 0
-    assert (tmp_path / "show/show.png").is_file()
+    settings, store = ["data=capture", "data.image_size=12"], tmp_path / "store"
+    given = [*settings, f"data.root={tmp_path / 'capture'}"]
+    assert command("data", "prepare", *given, "workers=1", f"out={store}").status == 0
+    for root in (tmp_path / "capture", store):
+        out = tmp_path / f"shown/{root.name}"
+        assert command("data", "show", *settings, f"data.root={root}", f"out={out}").status == 0
+        assert (out / "show.png").is_file()
 
 
 @pytest.mark.parametrize("data", ["toy_objects", "toy_rooms", "toy_minis"])

@@ -1,4 +1,4 @@
-"""What is left by commands that a signal ends: a line that says how to go on, a checkpoint, nothing half written."""
+"""Commands that a signal ends: they print how to continue, leave a checkpoint, and no unfinished files."""
 
 import os
 import shlex
@@ -13,7 +13,7 @@ from completesplat.training import encoding
 from completesplat.training.checkpoints import read_checkpoint
 from completesplat.training.reconstruction import ReconstructionModule
 
-pytestmark = pytest.mark.usefixtures("plain_signals")
+pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("plain_signals")]
 
 
 @pytest.fixture

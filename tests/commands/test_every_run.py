@@ -1,10 +1,9 @@
-"""Whatever a run trained, its folder and its checkpoints give scenes, or say why not."""
+"""Runs of every kind of model: their folders, weights and checkpoints give scenes, or say why not."""
 
 import copy
 import json
 import shutil
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +20,6 @@ from completesplat.export.ply import read_ply
 from completesplat.generator import CompleteSplat, OneAnswer
 from completesplat.weights import CONFIG_FILE, SUMS_FILE
 
-FEW = ["frames=4", "video=[]"]
 QUICK = [*SMALL, "callbacks.pictures=null"]
 
 
@@ -41,24 +39,25 @@ def run(pipeline, request):
     )
 
 
-def scenes(folder: Path) -> list[bytes]:
-    return [path.read_bytes() for path in sorted(folder.glob("sample_*.ply"))]
-
-
 @pytest.mark.parametrize(("run", "samples"), [("var", 1), ("splatter", 1), ("diffusion", 2)], indirect=["run"])
-def test_a_runs_folder_and_its_checkpoint_give_the_same_scenes(command, pipeline, tmp_path, run, samples):
-    photograph = pipeline.photograph()
-    found = []
-    for weights in (run, run / "checkpoints/last.ckpt"):
-        out = tmp_path / str(len(found))
-        finished = command("predict", f"image={photograph}", f"weights={weights}", "samples=2", f"out={out}", *FEW)
-        assert finished.status == 0, finished.err
-        assert ("one answer for each image" in finished.out) == (samples == 1)
-        found.append(scenes(out / photograph.stem))
-        assert strict_json(out / photograph.stem / "scene.json")["settings"]["samples"] == samples
+def test_a_runs_folder_its_weights_and_its_checkpoint_give_the_same_scenes(pipeline, run, samples):
+    scenes = []
+    for weights in (run, run / "weights", run / "checkpoints/last.ckpt"):
+        scenes.append(CompleteSplat.from_pretrained(weights)(pipeline.photograph(), samples=samples))
         assert settings_of(weights) == {"weights": str(run / "weights" if weights.is_dir() else weights)}
-    assert len(found[0]) == samples
-    assert found[0] == found[1]
+    for others in scenes[1:]:
+        for scene, other in zip(scenes[0], others, strict=True):
+            assert all(torch.equal(value, getattr(other, name)) for name, value in vars(scene).items())
+
+
+def test_a_prediction_of_stage_one_gives_one_answer(command, pipeline, tmp_path):
+    photograph = pipeline.photograph()
+    given = [f"image={photograph}", f"weights={pipeline.var}", "samples=2", f"out={tmp_path}", "video=[]"]
+    finished = command("predict", *given)
+    assert finished.status == 0, finished.err
+    assert "draws no samples" in finished.out
+    assert len(list(tmp_path.glob(f"{photograph.stem}/sample_*.ply"))) == 1
+    assert strict_json(tmp_path / photograph.stem / "scene.json")["settings"]["samples"] == 1
 
 
 @pytest.mark.parametrize("run", ["var", "splatter"], indirect=True)

@@ -1,12 +1,10 @@
-"""Sweeps whose jobs other programs start: SLURM's (a `sbatch` that runs what it is given), joblib's."""
+"""A sweep whose jobs SLURM starts, here a `sbatch` that runs its script at once."""
 
 import csv
 import os
 import stat
 import subprocess
 import sys
-from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 from support import LIMIT, SMALL, script, strict_json
@@ -63,39 +61,20 @@ def cluster(tmp_path, monkeypatch):
     return folder
 
 
-def sweep(root: Path, folder: Path, *settings: str) -> Path:
-    """Two jobs, started as by a shell."""
-    given = [f"data.root={root}", *SMALL, "data.workers=0", "trainer.max_steps=1", "callbacks.pictures=null"]
-    given += ["experiment=toy_var", "rasterizer=reference", f"out={folder / 'sweep'}", *settings]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    program = [sys.executable, str(script(folder)), "fit", "-m", *given]
-    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=LIMIT, cwd=folder)
-    logs = "".join(path.read_text()[-2000:] for path in folder.glob("sweep/.submitit/*/*_log.err"))
-    assert done.returncode == 0, done.stderr[-3000:] + logs
-    return folder / "sweep"
-
-
-def assert_finished(folder: Path, *jobs: str) -> None:
-    assert sorted(path.parent.name for path in folder.glob("*/metrics.json")) == sorted(jobs)
-    with (folder / "summary.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["seeds"]]
-    assert [row["seeds"] for row in rows] == [str(len(jobs))]
-
-
 @pytest.mark.slow
 def test_slurm_runs_the_jobs_of_a_sweep_each_with_two_processes(toy_root, tmp_path, cluster):
-    launched = ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "trainer=slurm", "seed=0,1"]
-    out = sweep(toy_root, tmp_path, *launched, "hydra.launcher.tasks_per_node=2", "trainer.precision=32-true")
-    assert_finished(out, "seed-0", "seed-1")
+    out = tmp_path / "sweep"
+    given = ["fit", "-m", "experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.workers=0", f"out={out}"]
+    given += ["trainer.max_steps=1", "callbacks.pictures=null", "rasterizer=reference", "trainer=slurm", "seed=0,1"]
+    given += ["hydra/launcher=submitit_slurm", "hydra.launcher.timeout_min=10", "hydra.launcher.tasks_per_node=2"]
+    program = [sys.executable, str(script(tmp_path)), *given, "trainer.precision=32-true"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=LIMIT, cwd=tmp_path)
+    logs = "".join(path.read_text()[-2000:] for path in out.glob(".submitit/*/*_log.err"))
+    assert done.returncode == 0, done.stderr[-3000:] + logs
+    with (out / "summary.csv").open(newline="") as file:
+        assert [row["seeds"] for row in csv.DictReader(file) if row["seeds"]] == ["2"]
     for seed in (0, 1):
-        found = strict_json(out / f"seed-{seed}/metrics.json")
-        assert (found["steps"], found["data.batch_per_process"]) == (1, 1)
+        metrics = strict_json(out / f"seed-{seed}/metrics.json")
+        assert (metrics["steps"], metrics["data.batch_per_process"]) == (1, 1)
     assert len(list(out.glob(".submitit/*/*_result.pkl"))) == 4
-
-
-@pytest.mark.slow
-def test_joblib_runs_the_jobs_of_a_sweep_at_once(toy_root, tmp_path):
-    if find_spec("hydra_plugins.hydra_joblib_launcher") is None:  # no extra of this package has it
-        pytest.skip("hydra-joblib-launcher is not installed")
-    out = sweep(toy_root, tmp_path, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1")
-    assert_finished(out, "seed-0", "seed-1")

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from support import SMALL, strict_json
 from written_commands import ROOT
 
-from completesplat.commands.jobs import composed
+from completesplat import compose
 
 MINE = """
 from torch import nn
@@ -71,8 +71,8 @@ def test_the_packages_settings_come_first_and_those_of_the_working_folder_are_fo
     (own / "conf/rasterizer/mine.yaml").write_text("_target_: mine.Mine\n")
     (own / "conf/rasterizer/reference.yaml").write_text("_target_: mine.Mine\n")
     for verb in ("fit", "test", "predict", "view"):
-        assert composed(verb, "rasterizer=mine").rasterizer._target_ == "mine.Mine"
-    assert composed("fit", "rasterizer=reference").rasterizer._target_.startswith("completesplat.")
+        assert compose(verb, "rasterizer=mine").rasterizer._target_ == "mine.Mine"
+    assert compose("fit", "rasterizer=reference").rasterizer._target_.startswith("completesplat.")
 
 
 SPACE = "completesplat.viewer.space"
@@ -110,7 +110,7 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
     assert "6 passed" in done.stdout
     again = command("new", "loss", "my_loss", "out=OUT")
     assert (again.status, again.err.count("\n")) == (2, 1)
-    assert "is there already" in again.err
+    assert "exists already" in again.err
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_what_is_begun_runs_as_it_is_written(command, own):
     [
         (["loss"], "name is needed: give name=VALUE"),
         (["thing", "mine"], "kind=thing: choose one of loss, rasterizer, dataset, ablation, experiment"),
-        (["loss", "a-b"], "name=a-b: must be a name of Python's"),
-        (["loss", "json"], "name=json: there is a module of this name"),
+        (["loss", "a-b"], "name=a-b: must be a Python name"),
+        (["loss", "json"], "name=json: a module has this name"),
         (["ablation", "full"], "name=full: the package has conf/ablation/full.yaml"),
         (["loss", "a", "b"], "give one kind and one name"),
     ],

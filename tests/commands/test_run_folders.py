@@ -44,6 +44,7 @@ def holder(tmp_path):
     process.stdout.close()
 
 
+@pytest.mark.processes
 def test_a_second_process_is_refused_until_the_first_is_gone(command, toy_root, tmp_path, holder):
     given = ["data", "stats", "data=toy_objects", f"data.root={toy_root}", f"out={tmp_path}/run"]
     refused = command(*given)

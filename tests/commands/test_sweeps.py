@@ -11,9 +11,10 @@ from omegaconf import OmegaConf
 from support import SMALL, call, script, strict_json
 from vgg_weights import blank, saved
 
-from completesplat.commands.jobs import LONGEST_NAME, is_finished, job_name, sweep_arguments, swept_keys
+from completesplat.commands.jobs import is_finished
 from completesplat.errors import CompleteSplatError
 from completesplat.losses.lpips import load_vgg16
+from completesplat.settings.composition import LONGEST_NAME, job_name, swept_keys
 
 LAST = "checkpoints/last.ckpt"
 
@@ -63,13 +64,12 @@ def test_a_sweep_that_is_started_again_repeats_no_finished_job(command, toy_root
     assert any(not torch.equal(value, weights(jobs[1])[name]) for name, value in weights(jobs[0]).items())
 
 
-def test_a_job_that_fails_does_not_stop_the_others(command, toy_root, tmp_path):
-    sweep = tmp_path / "sweep"
-    finished = command(*settings(toy_root), "data.batch_size=0,2", "test=false", f"out={sweep}")
+def test_a_job_that_fails_does_not_stop_the_others(command, tmp_path):
+    given = ["data", "toy", "-m", "scenes=1", "frames=2", "workers=1", "size=4,16", f"out={tmp_path / 'sweep'}"]
+    finished = command(*given)
     assert finished.status == 2
-    assert "batch_size" in finished.err.splitlines()[-1]
-    assert not (sweep / "data.batch_size-0/metrics.json").exists()
-    assert (sweep / "data.batch_size-2/metrics.json").is_file()
+    assert "size=4: must lie between 8 and 4096" in finished.err.splitlines()[-1]
+    assert {path.parent.name for path in tmp_path.glob("sweep/*/toy_*")} == {"size-16"}
 
 
 def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
@@ -85,12 +85,10 @@ def test_a_finished_run_is_not_overwritten_and_not_repeated(whole):
 
 
 @pytest.mark.parametrize(("name", "value"), [("LOCAL_RANK", "0"), ("SLURM_STEP_NUM_TASKS", "2")])
-def test_a_sweep_is_not_started_by_each_process_of_a_launcher(monkeypatch, name, value):
-    given = ["-m", "experiment=toy_var", "seed=0,1"]
-    assert sweep_arguments("fit", given, "run")
+def test_a_sweep_is_not_started_by_each_process_of_a_launcher(command, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    with pytest.raises(CompleteSplatError, match="start it once"):
-        sweep_arguments("fit", given, "run")
+    refused = command("fit", "-m", "experiment=toy_var", "seed=0,1")
+    assert (refused.status, "start it once" in refused.err) == (2, True)
 
 
 def in_a_process_of_its_own(arguments: list[str], folder: Path) -> None:
@@ -134,16 +132,6 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
         assert set(notes.values()) == {notes["0"]}
         assert notes["0"].startswith(f"{seed} 2 ")
         assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
-
-
-@pytest.mark.slow
-def test_submitit_runs_the_jobs_of_a_sweep_in_processes_of_their_own(toy_root, tmp_path):
-    sweep = tmp_path / "sweep"
-    launched = [f"out={sweep}", "hydra/launcher=submitit_local"]
-    in_a_process_of_its_own([*settings(toy_root), "seed=0,1", *launched], tmp_path)
-    for seed in (0, 1):
-        assert strict_json(sweep / f"seed-{seed}" / "metrics.json")["steps"] == 1
-    assert list(sweep.glob(".submitit/**/*_log.out"))
 
 
 @pytest.mark.slow

@@ -84,7 +84,7 @@ def test_the_protocol_records_the_measurement(scored, pipeline, monkeypatch):
     assert SSIM_NOTE in " ".join(printed.split())
     assert model["seconds"].keys() == {"inference", "rendering"}
     assert model["full"]["novel"]["swd"] > 0
-    # Toy objects have true depth; predictors that are pictures alone have none to compare.
+    # Toy objects have true depth; predictors that are images alone have none to compare.
     assert 0 < model["object"]["novel"]["depth_abs_rel"] < 10
     assert "depth_abs_rel" not in metrics["mean_image"]["full"]["novel"]
     for name, reason in described["missing"].items():
@@ -116,7 +116,7 @@ def test_a_larger_size_is_reached_by_upsampling_renders_from_images_of_the_train
         return draw(self, scenes, *others)
 
     monkeypatch.setattr(Stage, "draw", watched)
-    root = tmp_path / "larger"  # its pictures are larger than both sizes
+    root = tmp_path / "larger"  # its images are larger than both sizes
     write_objects(root, scenes=4, frames=3, size=96, seed=0, workers=1, progress=False)
     described = scored("var", "evaluation.resolution=48", f"overrides=['data.root={root}']")[1]["protocol"]
     assert (described["image_size"], described["resolution"]) == (32, 48)

@@ -18,7 +18,6 @@ from completesplat.commands.jobs import alone_in
 from completesplat.commands.view import LOADING, data_cameras, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
-from completesplat.scene_model import SceneModel
 from completesplat.settings.checks import View
 from completesplat.settings.schema import check_settings
 from completesplat.training.fixed_scenes import write_newest
@@ -106,19 +105,6 @@ def test_a_run_without_scenes_is_waited_for(tmp_path, capsys, monkeypatch):
     assert "no scenes yet; waiting" in capsys.readouterr().out
 
 
-def test_the_background_is_removed_from_the_picture_that_is_given(command, pipeline, tmp_path, monkeypatch):
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    seen, read = [], SceneModel.read
-    monkeypatch.setattr(
-        SceneModel, "read", lambda self, file, fov, remove: seen.append(remove) or read(self, file, fov)
-    )
-    given = [pipeline.photograph(), f"weights={pipeline.weights}", "samples=1", "steps=2", "export=drawn.html"]
-    for setting in ("background=remove", "background=0.25"):
-        finished = command("view", *given, setting, f"out={tmp_path / 'out'}")
-        assert finished.status == 0, finished.err
-    assert seen == [True, False]
-
-
 def test_settings_out_of_their_ranges_are_refused():
     for setting, said in (("samples=9", "between 1 and 8"), ("port=99999", "between 1 and 65535")):
         with pytest.raises(CompleteSplatError, match=f"{setting}: must lie {said}"):
@@ -132,6 +118,7 @@ def test_without_viser_the_way_to_get_it_is_said(command, monkeypatch, tmp_path)
     assert finished.err == 'error: the viewer needs viser: pip install "completesplat[view]"\n'
 
 
+@pytest.mark.processes
 def test_the_page_is_there_before_torch_and_says_that_it_is_loading(tmp_path):
     """In a process of its own, in which torch is a module that never comes to an end."""
     viser = pytest.importorskip("viser", reason="the viewer's extra is not installed")

@@ -1,4 +1,4 @@
-"""Objects cut out of their background, by a stand-in for rembg; what tells pictures of one kind from others."""
+"""Objects cut out of their background, by a stand-in for rembg; what tells images of one kind from others."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ import skimage
 import torch
 from PIL import Image
 
-from completesplat.data.images.photograph import picture_features, read_photograph
+from completesplat.data.images.photograph import image_features, read_photograph
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.errors import CompleteSplatError, ImageError
 
@@ -35,7 +35,7 @@ def test_the_object_stands_on_white_the_right_way_up(rembg, tmp_path):
     assert read_photograph(tmp_path / "a.png", 32).image[1, 0, 0] == 0
 
 
-def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_square(rembg, tmp_path):
+def test_the_object_is_sought_in_all_of_the_image_and_fills_its_share_of_the_square(rembg, tmp_path):
     image = Image.new("RGB", (64, 32), "red")
     image.paste("blue", (2, 4, 14, 10))  # left of the central square
     image.save(tmp_path / "a.png")
@@ -47,7 +47,7 @@ def test_the_object_is_sought_in_all_of_the_picture_and_fills_its_share_of_the_s
     assert torch.equal(found, expected)
 
 
-def test_an_object_as_long_as_a_picture_may_be_is_reduced_before_its_square_is_made(tmp_path):
+def test_an_object_as_long_as_a_image_may_be_is_reduced_before_its_square_is_made(tmp_path):
     Image.new("RGBA", (100_000, 8), (0, 0, 255, 254)).save(tmp_path / "a.png")
     found = read_photograph(tmp_path / "a.png", 16, object_share=1.0).image
     assert found[0, 0].min() > 0.9  # white above the line
@@ -70,7 +70,7 @@ def test_without_rembg_or_its_network_it_is_said_what_to_do(rembg, tmp_path, mon
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
 
 
-def test_a_picture_without_an_object_is_refused(rembg, tmp_path):
+def test_a_image_without_an_object_is_refused(rembg, tmp_path):
     Image.new("RGB", (32, 32), "red").save(tmp_path / "a.png")
     with pytest.raises(ImageError, match=r"a\.png: background=remove leaves nothing"):
         read_photograph(tmp_path / "a.png", 16, remove_background=True)
@@ -80,8 +80,8 @@ def test_features_are_colours_their_spread_and_how_fine_they_are():
     image = torch.zeros(3, 4, 4)
     image[0], image[1, :, 2:], image[2, 1::2] = 0.25, 1, 1
     expected = [0.25, 0.5, 0.5, 0, 0.5, 0.5, 1 / 9, 1 / 3]  # green has one step in three, blue three of three
-    torch.testing.assert_close(picture_features(image), torch.tensor(expected))
-    assert picture_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
+    torch.testing.assert_close(image_features(image), torch.tensor(expected))
+    assert image_features(image.expand(2, 3, 4, 4)).shape == (2, 8)
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_data_say_what_weights_are_to_know_of_them(toys):
     store = toys.store("train")
     sequences = [toys.source("train").read(name) for name in store.names]
     pictures = torch.stack([store.image(s, frame) for s in sequences for frame in range(4)]).double() / 255
-    features = picture_features(pictures)
+    features = image_features(pictures)
     assert facts["picture_mean"] == pytest.approx(features.mean(0).tolist())
     assert facts["picture_std"] == pytest.approx(features.std(0, correction=0).clamp(min=1e-3).tolist())
 
@@ -121,6 +121,6 @@ def test_photographs_lie_far_from_toy_objects_and_other_toy_objects_near(tmp_pat
     ]
     photographs = torch.stack([read_photograph(folder / name, 64).image for name in names])
     near, far = (
-        ((picture_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
+        ((image_features(images) - mean) / deviation).square().mean(-1).sqrt() for images in (own, photographs)
     )
     assert near.max() < 2 < far.min()

@@ -40,11 +40,11 @@ PLANTED = {
     ("left out", "x", None),
     ("left out", "y", None),
     ("changed file", None, None),
-    ("unusable picture", "a", 2),
-    ("unusable picture", "c", 6),
+    ("unusable image", "a", 2),
+    ("unusable image", "c", 6),
     ("malformed annotation", "d", None),
     ("too few frames", "e", None),
-    ("unusable picture", "b", 50),
+    ("unusable image", "b", 50),
 }
 
 
@@ -62,11 +62,11 @@ def test_every_planted_fault_is_found_once_written_and_shown(tmp_path: Path, cap
     assert {"sequence": "a", "frame": 2, "file": "a/2.jpg", "reason": "truncated"} in written["refused"]
     assert {"sequence": "x", "frame": None, "file": None, "reason": "score below 0.5"} in written["refused"]
     others = dict.fromkeys(("missing file", "changed file", "malformed annotation", "too few frames"), 1)
-    assert written["counts"] == {"unusable picture": 3, "left out: score below 0.5": 2, **others}
+    assert written["counts"] == {"unusable image": 3, "left out: score below 0.5": 2, **others}
     show(findings)
     shown = capsys.readouterr().out
     assert "1 sequences are in both train and val: b\n" in shown
-    for text in ("left out: score below 0.5", "unusable picture", "a/2.jpg, a, frame 2: truncated"):
+    for text in ("left out: score below 0.5", "unusable image", "a/2.jpg, a, frame 2: truncated"):
         assert text in shown
     assert shown.splitlines()[-1] == "usable sequences: 3, their usable frames: 8 (train 2 and 5, val 2 and 5)"
 
@@ -77,7 +77,7 @@ def test_pictures_in_several_splits_are_read_once(tmp_path: Path) -> None:
     val = Source({"a": (2, 3, 4)}, broken_pictures={("a", 3)}, log=log)
     findings = check_quietly(train=train, val=val)
     assert sorted(log.read_text().splitlines()) == ["a 1", "a 2", "a 3", "a 4", "b 1", "b 2"]
-    assert places(findings) == {("unusable picture", "a", 3)}
+    assert places(findings) == {("unusable image", "a", 3)}
     assert findings.frames == 5
     assert findings.splits["val"] == {"sequences": 1, "frames": 2}
 
@@ -87,7 +87,7 @@ def test_splits_are_read_by_themselves_and_too_few_frames_reported_only_where_no
     assert places(findings) == {("malformed annotation", "a", None)}
     assert findings.splits == {"train": {"sequences": 0, "frames": 0}, "val": {"sequences": 1, "frames": 2}}
     findings = check_quietly(train=Source({"a": (1, 2), "b": (1,)}, broken_pictures={("a", 1)}))
-    assert places(findings) == {("unusable picture", "a", 1), ("too few frames", "b", None)}
+    assert places(findings) == {("unusable image", "a", 1), ("too few frames", "b", None)}
     assert (findings.sequences, findings.frames) == (0, 0)
     with pytest.raises(ZeroDivisionError, match="a mistake in the reader"):
         check_quietly(train=Source(dict.fromkeys("abcd", (1, 2)), bugs={"c"}))

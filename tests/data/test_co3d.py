@@ -85,7 +85,7 @@ def test_the_object_is_at_the_common_scale_and_inside_the_depth_range(toy_root):
     assert 0 < near < far
 
 
-def test_pictures_are_the_files_and_masks_may_be_cut_at_a_probability(toy_root):
+def test_images_are_the_files_and_masks_may_be_cut_at_a_probability(toy_root):
     seen = scene(module(toy_root, image_size=32), "train", 1, 2, [0]).reference
     frames = list(members(toy_root, "train").frames.values())[1]
     expected, soft = (torch.from_numpy(np.array(Image.open(file))) / 255 for file in (frames[2].image, frames[2].mask))
@@ -166,7 +166,7 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
     assert len(set(found)) == 4
 
 
-def test_without_targets_one_picture_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
+def test_without_targets_one_image_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
     read, picture = [], SceneStore._picture
     monkeypatch.setattr(SceneStore, "_picture", lambda *given: read.append(given) or picture(*given))
     settings = {"references_per_sequence": 4, "horizontal_flip": True, "box_masks": {"probability": 0.5}}

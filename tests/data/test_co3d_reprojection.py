@@ -35,7 +35,7 @@ LAYOUTS = ["ndc_norm_image_bounds", "ndc_isotropic"]
 PRINCIPAL_POINTS = {"central": [0.0, 0.0], "off_centre": [0.12, -0.2]}
 
 
-def picture(pixel: np.ndarray, size: tuple[int, int], number: int) -> np.ndarray:
+def blob_image(pixel: np.ndarray, size: tuple[int, int], number: int) -> np.ndarray:
     """Red: a blob at `pixel`. Green: the frame's number. Blue: rises to the right, so that mirroring is seen."""
     y, x = np.mgrid[: size[0], : size[1]] + 0.5
     blob = 255 * np.exp(-((x - pixel[0]) ** 2 + (y - pixel[1]) ** 2) / (2 * SPREAD**2))
@@ -54,7 +54,7 @@ def viewpoints(name: str, layout: str, principal_point: list[float]) -> list[dic
 
 
 def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[float]) -> None:
-    """Three sequences of pictures of the point, without depth maps."""
+    """Three sequences of images of the point, without depth maps."""
     entries = []
     for name in "abc":
         for part in ("images", "masks"):
@@ -62,7 +62,7 @@ def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[
         for number, viewpoint in enumerate(viewpoints(name, layout, principal_point)):
             entry = frame_entry(name, number, viewpoint, size)
             (pixel,), _ = pytorch3d_pixels(viewpoint, size, POINT[None])
-            pixels = picture(pixel, size, number)
+            pixels = blob_image(pixel, size, number)
             Image.fromarray(pixels).save(root / entry["image"]["path"])
             Image.fromarray(pixels[..., 0]).save(root / entry["mask"]["path"])
             entries.append({**entry, "depth": None})
@@ -71,7 +71,7 @@ def write(root: Path, size: tuple[int, int], layout: str, principal_point: list[
 
 
 def centroid(values: Tensor) -> Tensor:
-    """(x, y) of the blob in a picture [height width], in pixels."""
+    """(x, y) of the blob in an image [height width], in pixels."""
     weights = (values - 0.05).clamp(min=0)
     y, x = (torch.arange(n) + 0.5 for n in values.shape)
     return torch.stack([(weights.sum(0) * x).sum(), (weights.sum(1) * y).sum()]) / weights.sum()

@@ -59,14 +59,6 @@ def test_a_list_that_validates_on_test_sequences_is_refused_unless_asked_for(tmp
     assert module(tmp_path, allow_shared_sequences=True).source("val").names == list(val)
 
 
-def test_a_refusal_names_the_overlap_of_all_three(tmp_path):
-    write_tree(tmp_path, COUNTS, {"train": "abc", "val": "cde", "test": "aef"})
-    with pytest.raises(DataError) as caught:
-        module(tmp_path).setup("fit")
-    for pair in ("train and val: c", "train and test: a", "val and test: e"):
-        assert f"1 sequences are in both {pair}" in caught.value.reason
-
-
 def test_validation_leaves_out_what_is_trained_on(tmp_path):
     write_tree(tmp_path, COUNTS, APART | {"val": "abg"})
     source = module(tmp_path).source("val")

@@ -14,7 +14,7 @@ from completesplat.data.images.crop import Square
 from completesplat.data.loading.scenes import Loaded, collate
 from completesplat.data.toy.module import ToyObjectsDataModule
 from completesplat.data.toy.objects import SUBSET
-from completesplat.data.validation import BadPicture
+from completesplat.data.validation import BadImage
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.scene import SceneBatch
 
@@ -55,7 +55,7 @@ def test_the_cloud_lies_on_what_is_seen_or_behind_it(data, toy_root):
 def test_only_the_test_reads_depths_and_what_has_none_costs_no_scene(data, monkeypatch):
     for loader in (data.train_dataloader(), data.val_dataloader()):
         assert next(iter(loader)).all_views().depths is None
-    source, error = data.source("test"), BadPicture("no finite depth in it", "depth.png")
+    source, error = data.source("test"), BadImage("no finite depth in it", "depth.png")
     sequence = source.read(data.store("test").names[0])
     for reader, refused in ((None, []), (Mock(side_effect=error), ["depth.png"])):
         monkeypatch.setattr(type(source), "read", lambda *_, reader=reader: replace(sequence, read_depth=reader))

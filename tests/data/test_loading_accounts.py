@@ -5,7 +5,7 @@ import pytest
 from lightning import LightningModule, Trainer
 from realestate10k_trees import assert_refusal, epoch, make_clip, module, write_tree
 
-from completesplat.data.validation import BadCamera, BadPicture
+from completesplat.data.validation import BadCamera, BadImage
 from completesplat.errors import CompleteSplatError, DataError
 
 KEYS = [f"c{i}" for i in range(9)]
@@ -15,7 +15,7 @@ def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
     """Clips of which some have broken pictures, others broken cameras."""
     clips = {key: make_clip(key, frames=3) for key in KEYS}
     for key in pictures:
-        clips[key].pictures[1:] = [b"<html>", b"<html>"]
+        clips[key].images[1:] = [b"<html>", b"<html>"]
     for key in cameras:
         clips[key].rows[1, 0] = 0
     clips = list(clips.values())
@@ -41,10 +41,10 @@ def test_an_epoch_tells_what_it_skipped_by_kind_and_counts_anew(tmp_path, caplog
         caplog.clear()
         epoch(loader, number)
         kinds = [type(error) for error in loader.refused]
-        assert kinds.count(BadPicture) >= 1 <= kinds.count(BadCamera)
+        assert kinds.count(BadImage) >= 1 <= kinds.count(BadCamera)
         (message,) = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
         assert message.startswith(f"skipped {len(kinds)} of 8 items (")
-        assert f"{kinds.count(BadPicture)} {BadPicture.kind}" in message
+        assert f"{kinds.count(BadImage)} {BadImage.kind}" in message
         assert f"{kinds.count(BadCamera)} {BadCamera.kind}" in message
         assert message.endswith(f"the first: {loader.refused[0]}")
 

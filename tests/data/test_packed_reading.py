@@ -22,7 +22,7 @@ from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import (
     BadAnnotation,
-    BadPicture,
+    BadImage,
     ChangedFile,
     MissingFile,
     OutsidePath,
@@ -214,7 +214,7 @@ def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
         pictures = [EncodedPicture(image, None), EncodedPicture(wrong, None)]
         sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "shard.arrow", "s")
         sequence.read(0)
-        with pytest.raises(BadPicture) as caught:
+        with pytest.raises(BadImage) as caught:
             sequence.read(1)
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
@@ -222,7 +222,7 @@ def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
     row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedPicture(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
-    with pytest.raises(BadPicture, match="no longer"):
+    with pytest.raises(BadImage, match="no longer"):
         read(1)
 
 

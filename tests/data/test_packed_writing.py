@@ -12,7 +12,7 @@ from completesplat.data.packed import writing
 from completesplat.data.packed.manifest import read_manifest
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import prepare
-from completesplat.data.validation import BadPicture, TooFewFrames
+from completesplat.data.validation import BadImage, TooFewFrames
 from completesplat.errors import CompleteSplatError, DataError
 
 SETTINGS = {"image_size": 16, "category": "chair", "crop": None}
@@ -111,8 +111,8 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
     found = [(entry.kind, entry.file, entry.sequence, entry.frame) for entry in split.refused]
     assert found == [
         ("not as expected", "x.json", "s9", None),
-        (BadPicture.kind, "s1/2.jpg", "s1", 16),
-        *[(BadPicture.kind, f"s4/{index}.jpg", "s4", 10 + 3 * index) for index in (0, 1, 3)],
+        (BadImage.kind, "s1/2.jpg", "s1", 16),
+        *[(BadImage.kind, f"s4/{index}.jpg", "s4", 10 + 3 * index) for index in (0, 1, 3)],
         (TooFewFrames.kind, None, "s4", None),
         (TooFewFrames.kind, "s6.txt", "s6", None),
     ]
@@ -122,7 +122,7 @@ def test_bad_frames_and_sequences_are_left_out_and_recorded(tmp_path: Path) -> N
 def test_a_bad_frame_is_raised_with_its_place_if_that_is_asked_for_even_after_it_was_skipped(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="are bad"):
         make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", max_bad_fraction=0)
-    with pytest.raises(BadPicture) as caught:
+    with pytest.raises(BadImage) as caught:
         make(ListedSource(NAMES[:4], bad_frames={"s1": [2]}), tmp_path / "store", on_bad="raise")
     # Worker processes send their refusals as pickles.
     for error in (caught.value, pickle.loads(pickle.dumps(caught.value))):

@@ -3,7 +3,6 @@
 import json
 import logging
 import weakref
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,14 +25,14 @@ from realestate10k_trees import (
 
 from completesplat.data.audit import check
 from completesplat.data.images.crop import Square
-from completesplat.data.realestate10k import chunks, clips
+from completesplat.data.realestate10k import chunks
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
 from completesplat.data.realestate10k.clips import TextClips
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    BadPicture,
+    BadImage,
     MissingFile,
     OutsidePath,
     TooFewFrames,
@@ -67,8 +66,8 @@ def entry(row: int, column: int | slice, value: float) -> Callable[[StoredClip],
     return lambda clip: clip.rows[row].__setitem__(column, value)
 
 
-def picture(frame: int, make: Callable[[bytes], bytes]) -> Callable[[StoredClip], object]:
-    return lambda clip: clip.pictures.__setitem__(frame, make(clip.pictures[frame]))
+def stored_image(frame: int, make: Callable[[bytes], bytes]) -> Callable[[StoredClip], object]:
+    return lambda clip: clip.images.__setitem__(frame, make(clip.images[frame]))
 
 
 def mirrored(clip: StoredClip) -> None:
@@ -87,9 +86,9 @@ BAD_CLIPS: dict[str, tuple[Callable[[StoredClip], object], type[DataError], int 
     "zero_focal_length": (entry(3, 1, 0), BadCamera, 3),
     "lens_distortion": (entry(2, 4, 0.1), BadCamera, 2),
     "one_frame": (first(1), TooFewFrames, None),
-    "cut_jpeg": (picture(2, lambda data: data[: len(data) // 2]), BadPicture, 2),
-    "html_instead_of_the_first_picture": (picture(0, lambda _: b"<html>404</html>"), BadPicture, 0),
-    "another_size_in_the_middle": (picture(2, lambda _: make_clip("x", size=(32, 18)).pictures[0]), BadPicture, 2),
+    "cut_jpeg": (stored_image(2, lambda data: data[: len(data) // 2]), BadImage, 2),
+    "html_instead_of_the_first_image": (stored_image(0, lambda _: b"<html>404</html>"), BadImage, 0),
+    "another_size_in_the_middle": (stored_image(2, lambda _: make_clip("x", size=(32, 18)).images[0]), BadImage, 2),
 }  # fmt: skip
 
 
@@ -103,7 +102,7 @@ def broken(name: str) -> list[StoredClip]:
 @pytest.mark.parametrize("name", BAD_CLIPS)
 def test_a_broken_clip_is_refused_with_its_place(name, form, tmp_path):
     _, kind, frame = BAD_CLIPS[name]
-    of_text = f"{BAD}/{33_000 * ((frame or 0) + 1)}.jpg" if kind is BadPicture else TEXT
+    of_text = f"{BAD}/{33_000 * ((frame or 0) + 1)}.jpg" if kind is BadImage else TEXT
     assert_only_refusal(
         write(tmp_path / "train", form, broken(name)), kind, of_text if form == "text" else CHUNK, frame
     )
@@ -126,12 +125,12 @@ def replaced(file: str, make: Callable[[Path], object]) -> Damage:
 
 # name: (damage, kind, file, frame)
 BAD_TEXTS: dict[str, tuple[Damage, type[DataError], str, int | None]] = {
-    "a_picture": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].pictures[0])), UnreadableFile, TEXT, None),
+    "an_image": (replaced(TEXT, lambda path: path.write_bytes(CLIPS[0].images[0])), UnreadableFile, TEXT, None),
     "a_folder": (replaced(TEXT, Path.mkdir), MissingFile, TEXT, None),
     "column_too_many": (line_of(1, lambda columns: [*columns, "0"]), BadAnnotation, TEXT, 1),
     "letters": (line_of(2, lambda columns: [*columns[:5], "k1", *columns[6:]]), BadAnnotation, TEXT, 2),
     "timestamp_twice": (line_of(2, lambda columns: ["66000", *columns[1:]]), BadAnnotation, TEXT, 1),
-    "no_picture": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
+    "no_image": (line_of(2, lambda columns: ["98999", *columns[1:]]), MissingFile, f"{BAD}/98999.jpg", 2),
 }
 
 
@@ -140,15 +139,6 @@ def test_a_broken_text_is_refused_with_its_place(name, tmp_path):
     damage, *expected = BAD_TEXTS[name]
     damage(write(tmp_path / "train", "text"))
     assert_only_refusal(tmp_path / "train", *expected)
-
-
-def test_a_text_may_be_large_but_not_endless(tmp_path, monkeypatch):
-    texts = TextClips(write(tmp_path, "text"))
-    monkeypatch.setattr(clips, "MOST_BYTES", (tmp_path / TEXT).stat().st_size)
-    assert len(texts.clip(BAD).timestamps) == 4
-    monkeypatch.setattr(clips, "MOST_BYTES", clips.MOST_BYTES - 1)
-    with pytest.raises(UnreadableFile, match="more than"):
-        texts.clip(BAD)
 
 
 def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
@@ -160,12 +150,9 @@ def large(*shape: int, dtype: torch.dtype = torch.uint8) -> torch.Tensor:
     ("fields", "part"),
     [
         ({"cameras": torch.zeros(4, 17)}, "18 columns"),
-        ({"cameras": [[0.5] * 18] * 4}, "18 columns"),
         ({"cameras": torch.zeros(3, 18)}, "4 images, 3 cameras and 4 timestamps"),
         ({"timestamps": torch.arange(4.0)}, "timestamps are not int64"),
-        ({"timestamps": large(10**6, dtype=torch.int64)}, "1000000 timestamps"),
         ({"timestamps": torch.tensor([0, 1, 2, 1])}, "another frame has its timestamp"),
-        ({"images": [torch.zeros(9)] * 4}, "images are not a list"),
         ({"images": [large(10**6)] * 4}, "images are not a list"),
     ],
 )
@@ -186,11 +173,10 @@ class Runs:
         return self.call[0], self.call[1:]
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_a_chunk_runs_no_code(tmp_path, legacy):
+def test_a_chunk_runs_no_code(tmp_path):
     path, canary = tmp_path / CHUNK, tmp_path / "canary"
     harmful = chunk_entry(CLIPS[0]) | {"url": Runs(exec, f"open({str(canary)!r}, 'w')")}
-    torch.save([harmful], path, _use_new_zipfile_serialization=not legacy)
+    torch.save([harmful], path)
     with pytest.raises(UnreadableFile):
         read_chunk(path)
     assert not canary.exists()
@@ -198,50 +184,13 @@ def test_a_chunk_runs_no_code(tmp_path, legacy):
     assert canary.exists()
 
 
-def saved(make: Callable[[dict[str, Any]], object], **options: Any) -> Damage:
-    return lambda path: torch.save(make(chunk_entry(CLIPS[0])), path, **options)
-
-
-def flipped(data: bytes) -> Damage:
-    """One bit in the middle of these bytes of the file."""
-
-    def damage(path: Path) -> None:
-        whole = bytearray(path.read_bytes())
-        whole[whole.index(data) + len(data) // 2] ^= 1
-        path.write_bytes(whole)
-
-    return damage
-
-
-def bomb(path: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in {**records, f"{next(iter(records)).split('/')[0]}/data/9999": bytes(10**7)}.items():
-            archive.writestr(name, data)
-
-
-def bytes_from_nothing(path: Path) -> None:
-    """A pickle of 30 bytes for 2 GiB."""
-    with zipfile.ZipFile(path) as archive:
-        records = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in records.items():
-            asks = b"\x80\x02cbuiltins\nbytearray\n\x8a\x05" + (2**31).to_bytes(5, "little") + b"\x85R."
-            archive.writestr(name, asks if name.endswith("data.pkl") else data)
+def saved(make: Callable[[dict[str, Any]], object]) -> Damage:
+    return lambda path: torch.save(make(chunk_entry(CLIPS[0])), path)
 
 
 # name: (damage of the broken clip's chunk, kind)
 BAD_CHUNKS: dict[str, tuple[Damage, type[DataError]]] = {
-    "empty": (lambda path: path.write_bytes(b""), UnreadableFile),
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:-500]), UnreadableFile),
-    "flipped_bit_in_a_camera": (flipped(CLIPS[0].rows.tobytes()), UnreadableFile),
-    "zip_of_something_else": (
-        lambda path: zipfile.ZipFile(path, "w").writestr("readme.txt", "nothing"), UnreadableFile,
-    ),
-    "legacy_form": (saved(lambda entry: [entry], _use_new_zipfile_serialization=False), UnreadableFile),
-    "bomb": (bomb, UnreadableFile),
-    "bytes_from_nothing": (bytes_from_nothing, UnreadableFile),
     "list_of_tensors": (saved(lambda entry: list(entry["images"])), BadAnnotation),
     "key_twice": (saved(lambda entry: [entry, entry]), BadAnnotation),
     "another_clip": (saved(lambda entry: [entry | {"key": "other"}]), BadAnnotation),

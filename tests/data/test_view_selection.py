@@ -47,7 +47,7 @@ def test_a_subset_of_targets_is_evenly_spaced(frames, targets):
     assert np.ptp(np.diff([chosen[-1] - frames, *chosen])) <= 2
 
 
-@pytest.mark.parametrize(("frames", "min_gap", "max_gap"), [(40, 1, 5), (40, 3, 10), (6, 5, 9), (12, 8, 9), (40, 4, 4)])
+@pytest.mark.parametrize(("frames", "min_gap", "max_gap"), [(40, 3, 10), (12, 8, 9)])
 def test_nearby_views_keep_both_gaps_and_reach_everything_that_does(frames, min_gap, max_gap):
     pairs = set()
     for index in range(3000):

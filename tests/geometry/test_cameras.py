@@ -140,7 +140,7 @@ def test_the_place_that_cameras_look_at_is_nearest_to_their_axes(count: int) -> 
     cameras = Cameras(poses, random_cameras(count).intrinsics, (48, 64))
     found = nearest_to_axes(cameras)
     assert found is not None
-    assert_close(found, target.float())
+    assert_close(found, target)
     parallel = replace(cameras, world_to_camera=poses[:1].repeat(count, 1, 1))
     parallel.world_to_camera[:, 0, 3] += torch.arange(count)
     assert nearest_to_axes(parallel) is None

@@ -1,10 +1,9 @@
-"""Odd settings and mistyped names are refused in one line, before anything is imported for long, read or trained."""
+"""Refusals of odd values and mistyped names, in one line and before anything is read or trained."""
 
 import re
 
 import pytest
 from support import compose_config, refused
-from test_configs import EVERY_OPTION, complete
 
 from completesplat.cli import VERBS
 from completesplat.errors import CompleteSplatError
@@ -13,100 +12,63 @@ from completesplat.settings.checks import check_image_size, check_parts, check_v
 WHOLE, NUMBER = "must be a whole number", "must be a number"
 ODD = [
     ("predict", "samples=abc", f"samples=abc: {WHOLE}"),
-    ("predict", "samples=[1,2]", f"samples=[1, 2]: {WHOLE}"),
     ("predict", "samples=-1", "samples=-1: must lie between 1 and 1000"),
-    ("predict", "guidance_weight=nan", "guidance_weight=nan: must lie between 0 and 1"),
     ("predict", "maps=perhaps", "maps=perhaps: must be true or false"),
+    ("predict", "box=[a,b,c,d]", f"box=['a', 'b', 'c', 'd']: {NUMBER}"),
     ("predict", "weights=[a]", "weights=['a']: must be a text"),
-    ("view", "port=none", f"port=none: {WHOLE}"),
-    ("view", "samples=1.5", f"samples=1.5: {WHOLE}"),
     ("predict", "video=1", "video=1: choose from orbit, swipe, wobble"),
     ("predict", "formats=5", "formats=5: choose from ply, "),
     ("data", "scenes=many", f"scenes=many: {WHOLE}"),
-    ("data", "seed=-1", "seed=-1: must be at least 0"),
     ("data", "size=1000000", "size=1000000: must lie between 8 and 4096"),
     ("test", "overrides=5", "overrides=5: must be a list, such as overrides=[5]"),
-    ("test", "overrides=[5]", "overrides=[5]: must be a text"),
-    ("fit", "seed=abc", f"seed=abc: {WHOLE}"),
     ("fit", "seed=-1", "seed=-1: must lie between 0 and"),
     ("fit", "test=1", "test=1: must be true or false"),
     ("fit", "data.image_size=50", "data.image_size=50: must be a multiple of 8 for the levels of these networks"),
-    ("fit", "data.image_size=abc", f"data.image_size=abc: {WHOLE}"),
-    ("fit", "data.image_size=[64,64]", f"data.image_size=[64, 64]: {WHOLE}"),
     ("fit", "data.batch_size=0", "data.batch_size=0: must be at least 1"),
-    ("fit", "data.workers=-1", "data.workers=-1: must be at least 0"),
-    ("fit", "data.max_bad_fraction=2", "data.max_bad_fraction=2: must lie between 0 and 1"),
     ("fit", "data.color_jitter=1", "data.color_jitter=1: must be a mapping"),
-    ("fit", "data.root=null", "data.root=None: must be a text"),
     ("fit", "+data.rot=x", "ToyObjectsDataModule has no setting rot (data.rot); did you mean root?"),
-    ("fit", "optimizer.lr=abc", f"optimizer.lr=abc: {NUMBER}"),
-    ("fit", "optimizer.lr=[1e-3]", f"optimizer.lr=[0.001]: {NUMBER}"),
     ("fit", "optimizer.lr=nan", f"optimizer.lr=nan: {NUMBER}"),
     ("fit", "optimizer.lr=-1", "optimizer: Invalid learning rate: -1"),
-    ("fit", "trainer.max_steps=abc", f"trainer.max_steps=abc: {WHOLE}"),
     ("fit", "trainer.val_check_interval=0", "trainer.val_check_interval=0: must be at least "),
     ("fit", "trainer.accumulate_grad_batches=0", "trainer.accumulate_grad_batches=0: must be at least 1"),
-    ("fit", "trainer.accumulate_grad_batches=-1", "trainer.accumulate_grad_batches=-1: must be at least 1"),
-    ("fit", "trainer.check_val_every_n_epoch=0", "trainer.check_val_every_n_epoch=0: must be at least 1"),
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
     ("fit", "trainer.accelerator=abacus", "trainer: "),
-    ("fit", "loss.terms.mse.weight=abc", f"loss.terms.mse.weight=abc: {NUMBER}"),
-    ("fit", "loss.terms.kl.weight=-1", "loss.terms.kl.weight=-1: must be at least 0"),
     ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
-    ("fit", "model=preoptimized_vae model.kl_weight=-1", "model.kl_weight=-1: must be at least 0"),
-    ("fit", "trainer.gradient_clip_val=-1", "trainer.gradient_clip_val=-1: must be at least 0"),
     ("fit", "data.workers=4000", "data.workers=4000: must not be above 4 for each of "),
-    ("data", "workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
-    ("data", "data_task=import hold_out=1", "hold_out=1: must be at least 2"),
-    ("data", "data_task=import quality=101", "quality=101: must lie between 1 and 100"),
-    ("data", "data_task=import most_missing=1.5", "most_missing=1.5: must lie between 0 and 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),
-    ("data", "kind=rooms frames=1001 size=8 scenes=2", "toy_rooms: frames=1001: must lie between 2 and 1000"),
     ("fit", "loss.terms=null", "loss.terms=None: must be a mapping"),
     ("fit", "autoreconstructor.encoder.channels=8", "autoreconstructor.encoder.channels=8: must be a list, such as "),
     ("fit", "sampler.steps=0", "sampler.steps=0: must lie between 1 and 10000"),
-    ("fit", "model.background=2", "model.background=2: must lie between 0 and 1"),
     ("fit", "callbacks.checkpoint.every_n_train_steps=0", "every_n_train_steps=0: must be at least 1"),
-    ("fit", "callbacks.bad_steps.most_bad_steps=0", "most_bad_steps=0: must be at least 1"),
     (
         "fit",
         "data=co3d_category data.root=x data.category=y data.min_frames=1",
         "data.min_frames=1: must be at least 2",
     ),
     ("fit", "data=toy_rooms data.crop=top", "data.crop=top: choose one of center, principal"),
-    ("fit", "evaluation.scoring.samples=abc", f"evaluation.scoring.samples=abc: {WHOLE}"),
 ]
 
 
-@pytest.mark.parametrize(("verb", "setting", "said"), ODD, ids=lambda one: one[:40])
-def test_an_odd_value_is_named_with_what_it_may_be(verb, setting, said):
+@pytest.mark.parametrize(("verb", "setting", "message"), ODD, ids=lambda text: text[:40])
+def test_an_odd_value_is_named_with_the_values_allowed(verb, setting, message):
     given = {
         "predict": ["image=a.png", "weights=nowhere"],
         "data": ["data_task=toy"],
         "test": ["ckpt=nowhere"],
         "view": ["scene=nowhere"],
     }
-    assert said in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
+    assert message in refused(verb, *given.get(verb, ["trainer.max_steps=1"]), *setting.split())
 
 
-@pytest.mark.parametrize(("group", "option"), EVERY_OPTION)
-def test_what_the_configuration_tree_offers_fits(group, option):
-    config = complete(group, option)
-    check_verb("fit", config)
-    check_image_size(config)
-
-
-@pytest.mark.parametrize(
-    "chosen", [*VERBS, "data_task=check", "data_task=import", "bench_task=paper", "report_task=html"]
-)
-def test_what_each_verb_starts_from_fits(chosen):
+@pytest.mark.parametrize("chosen", [*VERBS, "data_task=check", "bench_task=paper", "report_task=html"])
+def test_the_defaults_of_each_verb_fit(chosen):
     verb = chosen.partition("_")[0]
     check_verb(verb, compose_config(verb, *([chosen] if "=" in chosen else [])))
 
 
-def test_stage_2_halves_pictures_more_often():
+def test_stage_2_halves_images_more_often():
     stage2 = ["model=latent_diffusion", "model.autoreconstructor_checkpoint=null"]
     check_image_size(compose_config("fit", "data.image_size=72"))
     with pytest.raises(CompleteSplatError, match=r"data\.image_size=72: must be a multiple of 32 .* such as 64$"):
@@ -119,7 +81,7 @@ def test_a_value_is_named_where_it_was_set():
 
 
 @pytest.mark.parametrize(
-    ("typed", "said"),
+    ("typed", "message"),
     [
         ("fit optimzer.lr=1", r"no setting 'optimzer.lr' of completesplat fit; did you mean optimizer.lr\?"),
         ("fit data.rot=x", r"no setting 'data.rot' of completesplat fit; did you mean data.root\?"),
@@ -132,7 +94,7 @@ def test_a_value_is_named_where_it_was_set():
         ("fit ablation=no_skip", r"no ablation 'no_skip': there are full, .*; did you mean no_skips"),
         ("fit data=toy_object", r"no data 'toy_object': there are .*; did you mean toy_objects"),
         ("fit -m loss=stge1,stage2", r"no loss 'stge1': there are stage1, stage2; did you mean stage1"),
-        ("fit data=null", r"data=null: choose one of co3d_category, "),
+        ("fit data=null", r"data=null: choose one of capture, co3d_category, "),
         ("fit toy_var", r"toy_var: no setting, which are given as key=value; did you mean experiment=toy_var\?"),
         ("data chck", r"no task of completesplat data 'chck': there are check, .*; did you mean check\?"),
         ("predict sampels=1", r"no setting 'sampels' of completesplat predict; did you mean samples\?"),
@@ -140,16 +102,15 @@ def test_a_value_is_named_where_it_was_set():
         ("predict image=a.png weights=toy_object", r"toy_object: no such folder.*toy_objects"),
     ],
 )
-def test_a_mistyped_name_is_answered_with_the_nearest(command, typed, said):
+def test_a_mistyped_name_is_answered_with_the_nearest(command, typed, message):
     finished = command(*typed.split())
     assert (finished.status, finished.err.count("\n")) == (2, 1)
-    assert re.match(f"error: {said}", finished.err), finished.err
+    assert re.match(f"error: {message}", finished.err), finished.err
     assert len(finished.err) < 700
 
 
 @pytest.mark.parametrize("empty", ["out=", "out=''", "out=null"])
 def test_an_empty_folder_to_write_into_is_refused_and_the_working_folder_stays_empty(command, tmp_path, empty):
-    for verb in ("fit", "data toy"):
-        finished = command(*verb.split(), empty)
-        assert (finished.status, finished.err) == (2, f"error: {empty}: names no folder; give out=DIR\n")
+    finished = command("fit", empty)
+    assert (finished.status, finished.err) == (2, f"error: {empty}: names no folder; give out=DIR\n")
     assert not list(tmp_path.iterdir())

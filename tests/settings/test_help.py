@@ -1,4 +1,4 @@
-"""What `VERB --help` says: each setting with its comment, its kind and choices, in lines that fit."""
+"""`VERB --help`: each setting with its comment, its kind and choices, in lines that fit."""
 
 import re
 
@@ -45,13 +45,13 @@ def test_a_page_has_examples_settings_and_parts_and_fits(verb, task):
 
 def test_kinds_ranges_and_choices_are_shown():
     text = " ".join(page("predict", []).split())
-    assert "samples=4 Drawn of each photograph. [whole number, 1 to 1000]" in text
+    assert "samples=4 Number of samples of each photo. [whole number, 1 to 1000]" in text
     assert "[number, 0 to 1 or null]" in text
-    assert "image needed; A photograph" in text
+    assert "image needed; A photo" in text
     assert "rasterizer=auto what draws Gaussians [auto, cuda, reference, tiled]" in text
 
 
-def test_a_part_shows_its_settings_with_what_its_class_says_of_them():
+def test_a_part_shows_its_settings_with_the_docstring_of_its_class():
     text = " ".join(page("fit", ["data=co3d_hydrants"]).split())
     assert "data.evaluation_batch_size=4 scenes of an evaluation batch; 1 is used if" in text
     assert "data.on_bad=skip What cannot be read: skip" in text
@@ -64,7 +64,7 @@ def test_a_part_shows_its_settings_with_what_its_class_says_of_them():
     assert max(len(line) for text in pages for line in text.splitlines()) <= WIDTH
 
 
-def test_what_there_is_no_help_on_is_answered_with_the_nearest():
+def test_unknown_parts_are_answered_with_the_nearest():
     with pytest.raises(CompleteSplatError, match=r"no data 'toy_object': there are .*; did you mean toy_objects"):
         page("fit", ["data=toy_object"])
     with pytest.raises(CompleteSplatError, match=r"nothing to say on 'modle'; did you mean model\?"):
@@ -80,15 +80,16 @@ def test_every_group_is_explained_and_every_option_is_read():
 
 def test_a_files_lines_are_read_as_they_explain_themselves():
     written = parse(
-        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n# Of all.\npart:\n"
+        "# @package _global_\n# About it.\n\n# Of the first.\na: 1\nb: [1, 2] # of the second\n"
+        "e: # With entries.\n  - 1\n# Of all.\npart:\n"
         "  # Of the inner\n  # one.\n  c: x\n  d: null\n"
         "defaults:\n  - _base\n  - override /data@here: toy # why\n  - _self_\n"
     )
     assert (written.about, written.package) == ("About it.", "_global_")
-    assert [tuple(one) for one in written.settings if one.key != "defaults"] == [
+    assert [tuple(setting) for setting in written.settings] == [
         ("a", "1", "Of the first."),
         ("b", "[1, 2]", "of the second"),
-        ("part", "", "Of all."),
+        ("e", "", "With entries."),
         ("part.c", "x", "Of the inner one."),
         ("part.d", "null", ""),
     ]

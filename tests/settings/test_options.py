@@ -30,6 +30,7 @@ def test_verbs_tasks_groups_options_and_settings_are_completed():
     assert not any("_target_" in word or "hydra" in word for word in completed("fit", "model."))
 
 
+@pytest.mark.processes
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
 @pytest.mark.parametrize(
     ("line", "replies"),

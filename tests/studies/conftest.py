@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from completesplat.data.sequences import Picture, PosedSequence
+from completesplat.data.sequences import MaskedImage, PosedSequence
 from completesplat.geometry.cameras import Cameras, look_at, pinhole
 
 SIZE = 24
@@ -19,8 +19,8 @@ def posed(world_to_camera, read, fov=50.0, depth_range=(1.0, 3.0), name="sequenc
     return PosedSequence(name, frames, cameras, torch.tensor(depth_range).float().repeat(count, 1), read)
 
 
-def grey_picture(index: int) -> Picture:
-    return Picture(torch.full((3, SIZE, SIZE), 120, dtype=torch.uint8), None)
+def grey_picture(index: int) -> MaskedImage:
+    return MaskedImage(torch.full((3, SIZE, SIZE), 120, dtype=torch.uint8), None)
 
 
 @pytest.fixture

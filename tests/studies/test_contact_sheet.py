@@ -2,8 +2,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from completesplat.data.sequences import Picture
-from completesplat.data.validation import BadPicture, OutsidePath
+from completesplat.data.sequences import MaskedImage
+from completesplat.data.validation import BadImage, OutsidePath
 from completesplat.export.images import GAP, MARGIN
 from completesplat.geometry.cameras import project
 from completesplat.studies.contact_sheet import CELL, CROSS_COLORS, MASK, place_cross, show
@@ -26,7 +26,7 @@ def cells(sheet, sequences, images):
 
 
 def test_images_are_evenly_spaced_in_time(orbit, tmp_path):
-    sequence = orbit(24, read=lambda i: Picture(torch.full((3, SIZE, SIZE), 10 * i, dtype=torch.uint8), None))
+    sequence = orbit(24, read=lambda i: MaskedImage(torch.full((3, SIZE, SIZE), 10 * i, dtype=torch.uint8), None))
     shown = cells(sheet_of([sequence], tmp_path, 6), 1, 6)[0]
     indices = [int(cell[0, 0, 0]) // 10 for cell in shown]
     assert (indices[0], indices[-1]) == (0, 23)
@@ -36,7 +36,7 @@ def test_images_are_evenly_spaced_in_time(orbit, tmp_path):
 def test_an_image_is_shown_upright_and_unmirrored_with_the_outline_of_its_mask(orbit, tmp_path):
     picture, mask = (torch.rand(3, SIZE, SIZE) * 255).byte(), torch.zeros(1, SIZE, SIZE, dtype=torch.uint8)
     mask[:, :, : SIZE // 4], mask[:, :, SIZE // 4 : SIZE // 3] = 255, 100  # it crosses one half
-    shown = cells(sheet_of([orbit(1, read=lambda i: Picture(picture, mask))], tmp_path, 1), 1, 1)[0, 0]
+    shown = cells(sheet_of([orbit(1, read=lambda i: MaskedImage(picture, mask))], tmp_path, 1), 1, 1)[0, 0]
     yellow = (shown == MASK).all(-1)
     assert set(np.flatnonzero(yellow.any(0))) == {CELL // 4 - 1}
     assert yellow[:, CELL // 4 - 1].mean() > 0.9
@@ -68,8 +68,8 @@ def test_the_cross_is_drawn_where_it_projects_and_not_behind_the_camera(orbit, w
 def test_a_refused_image_is_a_grey_cell_with_the_reason(orbit, tmp_path):
     def read(index):
         if index in (1, 2):
-            raise (BadPicture if index == 1 else OutsidePath)("this one", "file.jpg")
-        return Picture(torch.full((3, SIZE, SIZE), 120, dtype=torch.uint8), None)
+            raise (BadImage if index == 1 else OutsidePath)("this one", "file.jpg")
+        return MaskedImage(torch.full((3, SIZE, SIZE), 120, dtype=torch.uint8), None)
 
     shown = cells(sheet_of([orbit(4, read=read)], tmp_path, 4), 1, 4)[0]
     for cell in shown[1:3]:

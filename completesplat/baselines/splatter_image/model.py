@@ -20,7 +20,7 @@ from completesplat.autoreconstructor.model import Reconstruction, Reconstruction
 from completesplat.baselines.splatter_image.directional import DirectionalGaussians
 from completesplat.baselines.splatter_image.files import find, read_tensors
 from completesplat.baselines.splatter_image.network import SongUNet
-from completesplat.data.images.photograph import Photograph, Picture, read_photograph
+from completesplat.data.images.photograph import ImageLike, Photograph, read_photograph
 from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.geometry.cameras import Cameras
 from completesplat.scene_model import SceneModel
@@ -201,7 +201,7 @@ class PublishedOneAnswer(SceneModel):
             raise CompleteSplatError(f"{self.network.file}: knows objects; these data do not say where objects are")
         return needed | {"depth_after": self.network.depths.far}
 
-    def read(self, image: Picture, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
+    def read(self, image: ImageLike, fov_degrees: float | None = None, remove_background: bool = False) -> Photograph:
         """Read an image at the model's size, on the background that the weights know (`read_photograph`).
 
         If the weights know only one camera, the image counts as that camera's, and a cut-out object is put into the

@@ -1,13 +1,14 @@
-"""Common form of captures, independent of their files and conventions, and reading of their images."""
+"""Common form of captures, independent of their files and conventions, and undistorted reading of their images."""
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, UInt8
+import torch
+from jaxtyping import Float
 from PIL import Image
 
 from completesplat.data.images.exif import ORIENTATION, read_exif
@@ -18,14 +19,19 @@ from completesplat.data.images.files import (
     check_sums,
     decode,
     opened,
-    over_white,
+    over_grey,
     refused_as_bad,
 )
-from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, require_file
-from completesplat.errors import ImageError
+from completesplat.data.validation import BadAnnotation, BadCamera, TooFewFrames, at, require_file
+from completesplat.errors import CompleteSplatError, ImageError
+from completesplat.geometry.cameras import Cameras
+
+if TYPE_CHECKING:
+    from pycolmap import Camera
 
 FEWEST_FRAMES = 6
-PNG_BIT_DEPTH = 24  # index of the byte in the file
+# Limits for an undistorted image's area and sides, relative to the distorted image's. Wrong coefficients exceed them.
+SMALLEST_AREA, LARGEST_SIDE = 0.5, 2.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,15 @@ class Lens:
     center: tuple[float, float]  # the principal point (x, y)
     image_size: tuple[int, int]  # (height, width)
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)  # k1, k2, p1, p2, k3
+
+    def __post_init__(self) -> None:
+        (height, width), (x, y) = self.image_size, self.center
+        if not np.isfinite([*self.focal, *self.center, *self.distortion]).all():
+            raise BadCamera(f"intrinsics are not finite: {self.focal}, {self.center}, {self.distortion}")
+        if min(height, width) <= 0 or min(self.focal) <= 0:
+            raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {self.focal}")
+        if not (0 < x < width and 0 < y < height):
+            raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} image")
 
 
 @dataclass(frozen=True)
@@ -48,110 +63,122 @@ class CapturedFrame:
     lens: Lens
     world_to_camera: Float[np.ndarray, "4 4"]
 
+    def camera(self) -> Cameras:
+        """Return the pinhole camera (float64) of the undistorted image; errors as in `undistorted_lens`."""
+        with at(self.image, frame=self.number):
+            lens = undistorted_lens(self.lens)
+        (fx, fy), (x, y) = lens.focal, lens.center
+        intrinsics = torch.tensor([[fx, 0, x], [0, fy, y], [0, 0, 1]], dtype=torch.float64)
+        return Cameras(torch.from_numpy(self.world_to_camera), intrinsics, lens.image_size)
 
-@dataclass(frozen=True)
-class PointCloud:
-    """Points in the world of the poses, with their sRGB colours."""
+    def read(self) -> tuple[Image.Image, Image.Image]:
+        """Return the undistorted RGB image and its mask: of the mask file, else the alpha channel, else white.
 
-    points: Float[np.ndarray, "n 3"]
-    colors: UInt8[np.ndarray, "n 3"]
+        Raises:
+            DataError: a file is missing, unusable or of another size, or its EXIF orientation turns the image.
+        """
+        with at(self.image, frame=self.number):
+            image, mask = _read_upright(self.image, self.lens.image_size)
+            if self.mask is not None:
+                mask = decode(self.mask, str(self.mask), "L", self.lens.image_size)
+            image = undistort(image, self.lens)
+            return image, Image.new("L", image.size, 255) if mask is None else undistort(mask, self.lens)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Frames of one capture in the order of their file names, the name of its folder, and the file of its cameras."""
+    """Frames of one capture in the order of their file names.
 
-    name: str
-    file: Path
+    Attributes:
+        files: files of the cameras and points.
+        points: in the world of the poses; None if there are none.
+    """
+
+    files: tuple[Path, ...]
     frames: tuple[CapturedFrame, ...]
-    cloud: PointCloud | None
+    points: Float[np.ndarray, "n 3"] | None
 
 
 def in_order(frames: Sequence[CapturedFrame]) -> tuple[CapturedFrame, ...]:
-    """Sort frames by file name, and refuse fewer than 6 frames or an image that occurs twice."""
+    """Sort frames by file name, `r_2` before `r_10`; refuse fewer than 6 frames, or an image that occurs twice."""
     if len(frames) < FEWEST_FRAMES:
         raise TooFewFrames(f"{len(frames)} frames; a capture needs at least {FEWEST_FRAMES}")
     seen: dict[Path, int] = {}
     for frame in frames:
         first = seen.setdefault(frame.image.resolve(), frame.number)
         if first != frame.number:
-            raise BadAnnotation(f"the same picture as frame {first}: {frame.image}", frame=frame.number)
-    return tuple(sorted(frames, key=lambda frame: _natural(str(frame.image))))
+            raise BadAnnotation(f"the same image as frame {first}: {frame.image}", frame=frame.number)
+    return tuple(
+        sorted(
+            frames,
+            key=lambda frame: [
+                (len(part), part) if part.isdecimal() else (-1, part)
+                for part in re.split(r"([0-9]+)", str(frame.image))
+            ],
+        )
+    )
 
 
-def check_lens(lens: Lens) -> Lens:
-    """Return the lens itself, if it is valid.
+def _read_upright(path: Path, image_size: tuple[int, int]) -> tuple[Image.Image, Image.Image | None]:
+    """Return the RGB image over white, and its opacity if it has transparency data.
 
-    Raises:
-        BadCamera: a size or focal length is not positive, a number is not finite, or the principal point is outside.
-    """
-    (height, width), (x, y) = lens.image_size, lens.center
-    if not np.isfinite([*lens.focal, *lens.center, *lens.distortion]).all():
-        raise BadCamera(f"intrinsics are not finite: {lens.focal}, {lens.center}, {lens.distortion}")
-    if min(height, width) <= 0 or min(lens.focal) <= 0:
-        raise BadCamera(f"sizes and focal lengths must be positive, not {width} x {height} and {lens.focal}")
-    if not (0 < x < width and 0 < y < height):
-        raise BadCamera(f"principal point ({x:g}, {y:g}) lies outside of the {width} x {height} picture")
-    return lens
-
-
-def make_cloud(points: Any, colors: Any, file: Path) -> PointCloud | None:
-    """Return a point cloud, or None if there are no points; refuse coordinates that are not finite."""
-    if not len(points):
-        return None
-    if not np.isfinite(points).all():
-        raise BadAnnotation("points that are not finite", str(file))
-    return PointCloud(np.asarray(points, dtype=np.float64), np.asarray(colors, dtype=np.uint8))
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sorting key that puts `r_2` before `r_10`."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
-
-
-class CapturedPicture(NamedTuple):
-    """Decoded RGB image, composited over white, and its opacity (grey) if it has transparency data.
-
-    Attributes:
-        lossy: whether the file is a JPEG.
-        plain: whether the file is a JPEG or PNG with exactly these 8-bit RGB pixels.
-    """
-
-    image: Image.Image
-    alpha: Image.Image | None
-    lossy: bool
-    plain: bool
-
-
-def read_picture(path: Path, image_size: tuple[int, int]) -> CapturedPicture:
-    """Decode an image of (height, width). Alpha is straight and mixed in sRGB, as in the images of NeRF (synthetic).
-
-    Raises:
-        MissingFile: the file does not exist.
-        BadPicture: it is damaged, too large, of another size, or its EXIF orientation turns it. Programs that estimate
-            poses use the pixels as they are stored, so the pose would not fit the upright image.
+    Alpha is straight and mixed in sRGB, as in the images of NeRF (synthetic). An EXIF orientation is refused, because
+    programs that estimate poses use the pixels as they are stored, so the pose would not fit the upright image.
     """
     require_file(path)
-    with refused_as_bad(str(path)), opened(path, FORMATS) as picture:
-        orientations = {read_exif(picture).get(ORIENTATION)}  # Decoding a TIFF removes its orientation.
-        check_sums(picture, path)
-        picture.load()
-        orientations.add(read_exif(picture).get(ORIENTATION))
+    with refused_as_bad(str(path)), opened(path, FORMATS) as image:
+        orientations = {read_exif(image).get(ORIENTATION)}  # Decoding a TIFF removes its orientation.
+        check_sums(image, path)
+        image.load()
+        orientations.add(read_exif(image).get(ORIENTATION))
         if turned := orientations - {None, 0, 1}:
             raise ImageError(
                 f"is to be turned (EXIF orientation {turned.pop()}), its camera's pose is not: save the pixels "
                 "as the pose sees them, without that tag"
             )
-        lossy, plain = picture.format in ("JPEG", "MPO"), _is_plain(path, picture)
-        if picture.has_transparency_data and picture.mode in EIGHT_BIT_MODES:
-            check_annotated_size(picture, image_size)
-            alpha = picture.convert("RGBA").getchannel("A")
-            return CapturedPicture(over_white(picture), alpha, lossy, plain=False)
-    return CapturedPicture(decode(path, str(path), "RGB", image_size), None, lossy, plain)
+        if image.has_transparency_data and image.mode in EIGHT_BIT_MODES:
+            check_annotated_size(image, image_size)
+            return over_grey(image, 1.0), image.convert("RGBA").getchannel("A")
+    return decode(path, str(path), "RGB", image_size), None
 
 
-def _is_plain(path: Path, picture: Image.Image) -> bool:
-    if picture.mode != "RGB" or picture.format not in ("JPEG", "PNG") or picture.has_transparency_data:
-        return False
-    with path.open("rb") as file:
-        return picture.format == "JPEG" or file.read(PNG_BIT_DEPTH + 1)[-1] == 8
+def undistorted_lens(lens: Lens) -> Lens:
+    """Return the pinhole lens of undistorted images, which are larger or smaller and show no unseen pixels.
+
+    Raises:
+        CompleteSplatError: the lens distorts, and pycolmap is missing.
+        BadCamera: the distortion leaves no usable image.
+    """
+    if not any(lens.distortion):
+        return lens
+    camera, (height, width) = _distorted(lens), lens.image_size
+    from pycolmap import UndistortCameraOptions, undistort_camera
+
+    pinhole = undistort_camera(UndistortCameraOptions(), camera)
+    size = pinhole.height, pinhole.width
+    sides = size[0] / height, size[1] / width
+    if sides[0] * sides[1] < SMALLEST_AREA or max(sides) >= LARGEST_SIDE:
+        raise BadCamera(f"distortion {lens.distortion} leaves no usable image")
+    fx, fy, x, y = map(float, pinhole.params)
+    return replace(lens, focal=(fx, fy), center=(x, y), image_size=size, distortion=(0.0,) * 5)
+
+
+def undistort(image: Image.Image, lens: Lens) -> Image.Image:
+    """Return the image of `undistorted_lens`, resampled bilinearly."""
+    if not any(lens.distortion):
+        return image
+    camera = _distorted(lens)
+    from pycolmap import Bitmap, UndistortCameraOptions, undistort_image
+
+    bitmap = Bitmap.from_array(np.array(image))
+    return Image.fromarray(undistort_image(UndistortCameraOptions(), bitmap, camera)[0].to_array())
+
+
+def _distorted(lens: Lens) -> "Camera":
+    try:
+        from pycolmap import Camera
+    except ImportError:
+        message = "images of a lens with distortion need pycolmap: pip install completesplat[colmap]"
+        raise CompleteSplatError(message) from None
+    (height, width), params = lens.image_size, [*lens.focal, *lens.center, *lens.distortion, 0.0, 0.0, 0.0]
+    return Camera(model="FULL_OPENCV", width=width, height=height, params=params)

@@ -1,13 +1,15 @@
-"""Reader of captures as a COLMAP model (sparse reconstruction) with its images."""
+"""Reader of captures as a COLMAP model (sparse reconstruction), binary or text, with its images."""
 
 import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from os.path import isfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import torch
 
-from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, check_lens, in_order, make_cloud
+from completesplat.data.captures.capture import Capture, CapturedFrame, Lens, in_order
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -16,12 +18,16 @@ from completesplat.data.validation import (
     at,
     finite_array,
     inside,
+    read_text,
     require_file,
 )
-from completesplat.errors import CompleteSplatError
+from completesplat.geometry.rotations import quaternion_to_matrix
 
-# Number of parameters by camera model id in binary files (colmap, `src/colmap/sensor/models.h`); others are refused.
-PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8}
+# Names and numbers of parameters by model id (colmap, `src/colmap/sensor/models.h`); other models are refused.
+MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+
+Row = Sequence[float | str]
+T = TypeVar("T")
 
 
 def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture:
@@ -36,44 +42,68 @@ def read_colmap(model: Path, images: Path, masks: Path | None = None) -> Capture
         images: folder of the images; their names in the model are relative to it.
 
     Raises:
-        CompleteSplatError: pycolmap is not installed.
         DataError: something is missing, damaged or impossible; the error has the file and COLMAP's image number.
     """
-    try:
-        import pycolmap
-    except ImportError:
-        raise CompleteSplatError("COLMAP models need pycolmap: pip install completesplat[colmap]") from None
-    for folder in (model, images, masks):
-        if folder is not None and not folder.is_dir():
-            raise MissingFile("no such folder", str(folder))
-    _check_complete(model)
-    try:
-        reconstruction = pycolmap.Reconstruction(str(model))
-        numbers = list(reconstruction.reg_image_ids())
-    except Exception as error:  # such as ValueError, IndexError and RuntimeError
-        raise UnreadableFile(f"not a COLMAP model ({' '.join(str(error).split())})", str(model)) from None
-    frames = []
-    with at(model):
-        for number in numbers:
-            with at(frame=number):
-                frames.append(_read_frame(reconstruction, number, images, masks))
-        ordered = in_order(frames)
-    points = list(reconstruction.points3D.values())
-    positions, colors = [point.xyz for point in points], [point.color for point in points]
-    return Capture(images.resolve().parent.name, model, ordered, make_cloud(positions, colors, model))
+    suffix, read = ("bin", _binary_rows) if (model / "images.bin").is_file() else ("txt", _text_rows)
+    files = tuple(require_file(model / f"{name}.{suffix}") for name in ("cameras", "images", "points3D"))
+    lenses = dict(_parsed(_camera_of, read, files[0]))
+    with at(files[1]):
+        frames = in_order([_frame_of(*entry, lenses, images, masks) for entry in _parsed(_image_of, read, files[1])])
+    points = np.array(_parsed(_position_of, read, files[2]))
+    return Capture(files, frames, points if len(points) else None)
 
 
-def _read_frame(reconstruction: Any, number: int, images: Path, masks: Path | None) -> CapturedFrame:
-    image = reconstruction.images[number]
+def _parsed(parse: Callable[[Row], T], read: Callable[[Path], Iterator[Row]], path: Path) -> list[T]:
     try:
-        name = image.name
-    except UnicodeDecodeError:
-        raise BadAnnotation("the name of its picture is not UTF-8") from None
-    path = require_file(inside(images, name))
-    mask = None if masks is None else _find_mask(masks, name)
-    pose = np.eye(4)
-    pose[:3] = finite_array(image.cam_from_world().matrix(), (3, 4), "the pose")
-    return CapturedFrame(number, path, mask, _lens_of(reconstruction.cameras[image.camera_id]), pose)
+        with at(path):
+            return [parse(row) for row in read(path)]
+    except (struct.error, ValueError, IndexError, OverflowError):
+        raise UnreadableFile("cut off, or not COLMAP's", str(path)) from None
+
+
+def _camera_of(row: Row) -> tuple[int, Lens]:
+    """Return a camera's number and lens; the parameters have the order of colmap.github.io/cameras.html."""
+    number, kind, width, height, *rest = row
+    size, parameters = (int(height), int(width)), tuple(map(float, rest))
+    match kind, parameters:
+        case "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", (f, cx, cy, *radial):
+            k1, k2 = [*radial, 0.0, 0.0][:2]
+            return int(number), Lens((f, f), (cx, cy), size, (k1, k2, 0.0, 0.0, 0.0))
+        case "PINHOLE" | "OPENCV", (fx, fy, cx, cy, *distortion):
+            k1, k2, p1, p2 = distortion or (0.0,) * 4
+            return int(number), Lens((fx, fy), (cx, cy), size, (k1, k2, p1, p2, 0.0))
+    raise BadCamera(f"camera model {kind} is not supported; undistort the images with COLMAP's image_undistorter")
+
+
+def _image_of(row: Row) -> tuple[int, tuple[float, ...], int, str]:
+    """Return an image's number, pose (qw, qx, qy, qz, tx, ty, tz), camera and name."""
+    return int(row[0]), tuple(map(float, row[1:8])), int(row[8]), " ".join(map(str, row[9:]))
+
+
+def _position_of(row: Row) -> tuple[float, ...]:
+    return tuple(map(float, row[1:4]))
+
+
+def _frame_of(
+    number: int,
+    pose: tuple[float, ...],
+    camera: int,
+    name: str,
+    lenses: Mapping[int, Lens],
+    images: Path,
+    masks: Path | None,
+) -> CapturedFrame:
+    with at(frame=number):
+        if camera not in lenses:
+            raise BadAnnotation(f"no camera {camera}")
+        values = finite_array(pose, (7,), "the pose")
+        if not values[:4].any():
+            raise BadCamera("the quaternion of the pose is zero")
+        world_to_camera = np.eye(4)
+        world_to_camera[:3, :3] = quaternion_to_matrix(torch.from_numpy(values[:4])).numpy()
+        world_to_camera[:3, 3] = values[4:]
+        mask = None if masks is None else _find_mask(masks, name)
+        return CapturedFrame(number, require_file(inside(images, name)), mask, lenses[camera], world_to_camera)
 
 
 def _find_mask(masks: Path, name: str) -> Path:
@@ -84,71 +114,36 @@ def _find_mask(masks: Path, name: str) -> Path:
     return appended if isfile(appended) else replaced
 
 
-def _lens_of(camera: Any) -> Lens:
-    """Convert a COLMAP camera, whose parameters have the order of colmap.github.io/cameras.html."""
-    name, size = camera.model_name, (camera.height, camera.width)
-    values = [float(value) for value in camera.params]
-    match name, values:
-        case "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL", [f, cx, cy, *radial]:
-            k1, k2 = [*radial, 0.0, 0.0][:2]
-            return check_lens(Lens((f, f), (cx, cy), size, (k1, k2, 0.0, 0.0, 0.0)))
-        case "PINHOLE", [fx, fy, cx, cy]:
-            return check_lens(Lens((fx, fy), (cx, cy), size))
-        case "OPENCV", [fx, fy, cx, cy, k1, k2, p1, p2]:
-            return check_lens(Lens((fx, fy), (cx, cy), size, (k1, k2, p1, p2, 0.0)))
-    raise BadCamera(f"camera model {name} is not supported; undistort the pictures with COLMAP's image_undistorter")
+def _text_rows(path: Path) -> Iterator[Row]:
+    """Yield the entries of a text file; those of images have a second line for their features, which may be empty."""
+    lines = [line for line in read_text(path).split("\n") if not line.startswith("#")]
+    for line in lines[:: 2 if path.stem == "images" else 1]:
+        if line.strip():
+            yield line.split()
 
 
-def _check_complete(model: Path) -> None:
-    """Check the length of binary files, because pycolmap reads wrong numbers, or forever, from truncated ones."""
-    for name, skip in RECORDS.items():
-        path = model / f"{name}.bin"
-        if not path.is_file():
-            continue
-        content = path.read_bytes()
-        try:
-            (count,), offset = struct.unpack_from("<Q", content), 8
-            for _ in range(count):
-                offset = skip(content, offset)
-        except (struct.error, ValueError, OverflowError):  # OverflowError: an offset that no file has
-            offset = -1
-        if offset != len(content):
-            raise UnreadableFile("cut off, or not COLMAP's", str(path))
+def _binary_rows(path: Path) -> Iterator[Row]:
+    """Yield the entries of a binary file, without the features of images and points."""
+    content, offset = path.read_bytes(), 0
 
+    def take(layout: str) -> tuple[Any, ...]:
+        nonlocal offset
+        values = struct.unpack_from(f"<{layout}", content, offset)
+        offset += struct.calcsize(f"<{layout}")
+        return values
 
-def _after_camera(content: bytes, offset: int) -> int:
-    _, model, _, _ = struct.unpack_from("<IiQQ", content, offset)
-    if model not in PARAMETERS:
-        raise BadCamera(f"COLMAP's camera model number {model} is not supported; undistort with its image_undistorter")
-    return offset + 24 + 8 * PARAMETERS[model]
-
-
-def _after_image(content: bytes, offset: int) -> int:
-    end_of_name = content.index(b"\0", offset + 64)  # after id, pose and camera
-    return end_of_name + 9 + 24 * int(struct.unpack_from("<Q", content, end_of_name + 1)[0])
-
-
-def _after_point(content: bytes, offset: int) -> int:
-    return offset + 51 + 8 * int(struct.unpack_from("<Q", content, offset + 43)[0])  # after id, xyz, colour, error
-
-
-def _after_rig(content: bytes, offset: int) -> int:
-    (sensors,), offset = struct.unpack_from("<I", content, offset + 4), offset + 8  # after id
-    for number in range(sensors):  # kind and id; all but the first sensor also have a flag, and a pose if it is set
-        has_pose = bool(number) and struct.unpack_from("<B", content, offset + 8)[0]
-        offset += 8 + bool(number) + (56 if has_pose else 0)
-    return offset
-
-
-def _after_frame(content: bytes, offset: int) -> int:
-    return offset + 68 + 16 * int(struct.unpack_from("<I", content, offset + 64)[0])  # after ids, pose
-
-
-RECORDS = {
-    "cameras": _after_camera,
-    "images": _after_image,
-    "points3D": _after_point,
-    "rigs": _after_rig,
-    "frames": _after_frame,
-}
-"""Functions that skip one record of each binary file; the records follow their number."""
+    for _ in range(take("Q")[0]):
+        if path.stem == "cameras":
+            number, model, width, height = take("IiQQ")
+            kind, count = list(MODELS.items())[model] if 0 <= model < len(MODELS) else (model, 0)
+            yield number, kind, width, height, *take(f"{count}d")
+        elif path.stem == "images":
+            numbers, end = take("I7dI"), content.index(b"\0", offset)
+            name = take(f"{end - offset}sx")[0].decode()
+            yield *numbers, name
+            take(f"{24 * take('Q')[0]}x")
+        else:
+            yield take("Q3d11x")  # the rest is colour and error
+            take(f"{8 * take('Q')[0]}x")
+    if offset != len(content):
+        raise ValueError

@@ -2,11 +2,10 @@
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from os.path import isfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,13 +15,9 @@ from completesplat.data.captures.capture import (
     Capture,
     CapturedFrame,
     Lens,
-    PointCloud,
-    check_lens,
     in_order,
-    make_cloud,
-    read_picture,
 )
-from completesplat.data.images.files import picture_size
+from completesplat.data.images.files import stored_size
 from completesplat.data.images.photograph import read_photograph
 from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
@@ -39,7 +34,7 @@ from completesplat.data.validation import (
     require_rotation,
 )
 from completesplat.errors import CompleteSplatError
-from completesplat.geometry.cameras import Cameras, crop_resize
+from completesplat.geometry.cameras import crop_resize
 from completesplat.scene import Views
 from completesplat.tensors import stack
 
@@ -50,8 +45,8 @@ COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 RADIAL = {"SIMPLE_RADIAL": ("k1",), "RADIAL": ("k1", "k2")}
 USED = {"SIMPLE_PINHOLE": (), "PINHOLE": (), **RADIAL, "OPENCV": COEFFICIENTS}
 OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+Entry = Mapping[str, object]
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
-SCALE_TOLERANCE = 1e-3
 
 
 def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
@@ -73,86 +68,69 @@ def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
     frames, content = _read_frames(path, most_missing)
     with at(path):
         ordered = in_order(frames)
-        cloud = None if content.get("ply_file_path") is None else field(content, "ply_file_path", str)
-        points = None if cloud is None else _read_cloud(inside(path.parent, cloud))
-    return Capture(path.resolve().parent.name, path, ordered, points)
+        if content.get("ply_file_path") is None:
+            return Capture((path,), ordered, None)
+        cloud = inside(path.parent, field(content, "ply_file_path", str))
+        points = read_points(cloud)
+    return Capture((path, cloud), ordered, points if len(points) else None)
 
 
-def read_photographs(pictures: Sequence[Path], path: Path, size: int) -> Views:
-    """Read photos as `read_photograph` crops and resizes them, with their cameras in `transforms.json`.
+def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
+    """Read photos as `read_photograph` crops and resizes them, undistorted, with their cameras in `transforms.json`.
 
     Returns:
         Views [view ...] in the order of the photos, in the world of the first camera and the file's units.
 
     Raises:
         DataError: as in `read_transforms`, except for too few frames; or EXIF turns a photo, or its size differs.
-        CompleteSplatError: a photo is not in the file, or its lens has distortion.
+        CompleteSplatError: a photo is not in the file.
     """
     frames = {frame.image.resolve(): frame for frame in _read_frames(path, most_missing=1)[0]}
-    images, cameras = [], []
-    for picture in pictures:
-        frame = frames.get(picture.resolve())
+    squares, cameras = [], []
+    for image in images:
+        frame = frames.get(image.resolve())
         if frame is None:
-            raise CompleteSplatError(f"{picture}: {path} has no frame with this picture")
-        if any(frame.lens.distortion):
-            hint = "import the capture (completesplat data import), which undistorts it, and use the pictures it writes"
-            raise CompleteSplatError(f"{picture}: its lens distorts; {hint}")
-        read_picture(frame.image, frame.lens.image_size)  # refuses images that `read_photograph` would turn
-        images.append(read_photograph(frame.image, size).image)
-        cameras.append(_of_square(frame, size))
+            raise CompleteSplatError(f"{image}: {path} has no frame with this image")
+        undistorted, _ = frame.read()  # refuses images that `read_photograph` would turn
+        distorts = any(frame.lens.distortion)
+        squares.append(read_photograph(undistorted if distorts else frame.image, size).image)
+        camera = frame.camera().to(torch.float32)
+        (height, width), side = camera.image_size, min(camera.image_size)
+        cameras.append(crop_resize(camera, (width - side) // 2, (height - side) // 2, side, size))
     placed = stack(cameras)
-    return Views(torch.stack(images), placed.relative_to(placed[0]), torch.ones(len(images), 1, size, size))
+    return Views(torch.stack(squares), placed.relative_to(placed[0]), torch.ones(len(squares), 1, size, size))
 
 
-def _of_square(frame: CapturedFrame, size: int) -> Cameras:
-    """Return the camera of the resized central square."""
-    (height, width), (fx, fy), (x, y) = frame.lens.image_size, frame.lens.focal, frame.lens.center
-    whole = Cameras(
-        torch.tensor(frame.world_to_camera, dtype=torch.float32),
-        torch.tensor([[fx, 0, x], [0, fy, y], [0, 0, 1]], dtype=torch.float32),
-        (height, width),
-    )
-    side = min(height, width)
-    return crop_resize(whole, (width - side) // 2, (height - side) // 2, side, size)
-
-
-def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], dict[str, Any]]:
+def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], Entry]:
     """Return all frames that have images, and the file's content."""
     content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
+    root, frames, missing = path.parent, [], []
     with at(path):
         entries = field(content, "frames", list)
-        frames = []
-        for number, image in _find_pictures(path, entries, most_missing).items():
+        for number, entry in enumerate(entries):
             with at(frame=number):
-                frames.append(_read_frame(path.parent, number, content, entries[number], image))
+                name = field(entry, "file_path", str)
+                candidates = [inside(root, name + suffix) for suffix in SUFFIXES]
+                # `Path.is_file` raises if a name is too long.
+                image = next((candidate for candidate in candidates if isfile(candidate)), None)
+                if image is None:
+                    missing.append(name)
+                    continue
+                masked = entry.get("mask_path") is not None
+                mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
+                lens, pose = _read_lens({**content, **entry}, image), _read_pose(entry.get("transform_matrix"))
+                frames.append(CapturedFrame(number, image, mask, lens, pose))
+        if missing:
+            _account(path, missing, len(entries), most_missing)
     return frames, content
 
 
-def _find_pictures(path: Path, entries: Sequence[Any], most_missing: float) -> dict[int, Path]:
-    """Return the images that exist, by the number of their frame."""
-    paths, missing = {}, []
-    for number, entry in enumerate(entries):
-        with at(frame=number):
-            name = field(entry, "file_path", str)
-            candidates = [inside(path.parent, name + suffix) for suffix in SUFFIXES]
-        # `Path.is_file` raises if a name is too long.
-        if existing := [candidate for candidate in candidates if isfile(candidate)]:
-            paths[number] = existing[0]
-        else:
-            missing.append(name)
-    if missing:
-        counted = f"{len(missing)} of {len(entries)} frames have no picture"
-        named = shortened(missing)
-        if len(missing) > most_missing * len(entries):
-            raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
-        logger.warning("%s: %s and are left out: %s", path, counted, named)
-    return paths
-
-
-def _read_frame(root: Path, number: int, content: dict[str, Any], entry: Any, image: Path) -> CapturedFrame:
-    mask = None if entry.get("mask_path") is None else require_file(inside(root, field(entry, "mask_path", str)))
-    lens = _read_lens({**content, **entry}, image)
-    return CapturedFrame(number, image, mask, lens, _read_pose(entry.get("transform_matrix")))
+def _account(path: Path, missing: list[str], frames: int, most_missing: float) -> None:
+    """Warn of frames without an image, or refuse too many."""
+    counted, named = f"{len(missing)} of {frames} frames have no image", shortened(missing)
+    if len(missing) > most_missing * frames:
+        raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
+    logger.warning("%s: %s and are left out: %s", path, counted, named)
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
@@ -160,9 +138,6 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     pose = finite_array(matrix, (4, 4), "transform_matrix")
     if not np.allclose(pose[3], [0, 0, 0, 1]):
         raise BadCamera(f"transform_matrix ends in the row {pose[3].tolist()}, not in 0, 0, 0, 1")
-    lengths = np.linalg.norm(pose[:3, :3], axis=0)
-    if np.ptp(lengths) < SCALE_TOLERANCE < abs(lengths[0] - 1):
-        raise BadCamera(f"transform_matrix scales by {lengths[0]:g}; a pose is a rotation and a translation")
     require_rotation(pose[:3, :3], "the rotation of transform_matrix")
     pose[:3, 1:3] *= -1
     world_to_camera = np.eye(4)
@@ -170,14 +145,14 @@ def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:
     return world_to_camera
 
 
-def _read_lens(values: dict[str, Any], image: Path) -> Lens:
+def _read_lens(values: Entry, image: Path) -> Lens:
     model = values.get("camera_model", "OPENCV")
     others = [key for key in OTHER_LENSES if values.get(key)]
     if not isinstance(model, str) or model not in USED or others:
         raise BadCamera(f"camera model {others[0] if others else model} is not supported; there are: {', '.join(USED)}")
     number = partial(_number, values)
-    stored = None if {"w", "h"} <= values.keys() else picture_size(image, str(image))
-    height, width = stored or (_whole(values, "h"), _whole(values, "w"))
+    stored = None if {"w", "h"} <= values.keys() else stored_size(image, str(image))
+    height, width = stored or (int(number("h")), int(number("w")))  # instant-ngp writes 1920.0.
     if "fl_x" in values:
         fx = number("fl_x")
     elif "camera_angle_x" in values:
@@ -192,29 +167,14 @@ def _read_lens(values: dict[str, Any], image: Path) -> Lens:
             raise BadCamera(f"{key} = {values[key]} has no meaning for camera model {model}")
     k1, k2, p1, p2, k3 = (number(key, 0.0) for key in COEFFICIENTS)
     center = number("cx", width / 2), number("cy", height / 2)
-    return check_lens(Lens((fx, fy), center, (height, width), (k1, k2, p1, p2, k3)))
+    return Lens((fx, fy), center, (height, width), (k1, k2, p1, p2, k3))
 
 
-def _number(values: dict[str, Any], key: str, default: float | None = None) -> float:
+def _number(values: Entry, key: str, default: float | None = None) -> float:
     return default if default is not None and key not in values else float(finite_array(values.get(key), (), key))
-
-
-def _whole(values: dict[str, Any], key: str) -> int:
-    value = _number(values, key)  # instant-ngp writes 1920.0.
-    if value != int(value):
-        raise BadAnnotation(f"{key} must be a whole number, not {value}")
-    return int(value)
 
 
 def _focal(angle: float, side: int) -> float:
     if not 0 < angle < math.pi:
         raise BadCamera(f"a field of view of {angle:g} radians")
     return side / 2 / math.tan(angle / 2)
-
-
-def _read_cloud(path: Path) -> PointCloud | None:
-    vertices, points = read_points(path)
-    names = [name for name in ("red", "green", "blue") if name in (vertices.dtype.names or ())]
-    colors = [vertices[name] for name in names]
-    usable = len(colors) == 3 and all(color.dtype == np.uint8 for color in colors)
-    return make_cloud(points, np.stack(colors, axis=-1) if usable else np.full(points.shape, 128), path)

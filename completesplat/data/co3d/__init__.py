@@ -1,1 +1,1 @@
-"""CO3D v2 (Reizenstein et al., ICCV 2021) and captures in its layout."""
+"""CO3D v2 (Reizenstein et al., ICCV 2021)."""

@@ -3,10 +3,10 @@
 import gzip
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ from completesplat.ply_files import TYPES, header
 
 # From OpenCV's camera axes (+x right, +y down) to PyTorch3D's (+x left, +y up), and back.
 FLIP = np.diag([-1.0, -1.0, 1.0])
+Entry = Mapping[str, object]
 VIEWPOINT_SHAPES = {"R": (3, 3), "T": (3,), "focal_length": (2,), "principal_point": (2,)}
 
 
@@ -73,13 +74,17 @@ def read_videos(root: Path, path: Path, refuse: Refuse) -> dict[str, CO3DVideo]:
             with at(sequence=name):
                 if name in videos:
                     raise BadAnnotation("the sequence is annotated twice")
-                quality, cloud = _optional_number(entry, "viewpoint_quality_score"), entry.get("point_cloud")
-                file = None if cloud is None else inside(root, field(cloud, "path", str))
-                videos[name] = CO3DVideo(file, cloud and _optional_number(cloud, "quality_score"), quality)
+                quality = _optional_number(entry, "viewpoint_quality_score")
+                if entry.get("point_cloud") is None:
+                    videos[name] = CO3DVideo(None, None, quality)
+                    continue
+                cloud = field(entry, "point_cloud", dict)
+                path_of_cloud = inside(root, field(cloud, "path", str))
+                videos[name] = CO3DVideo(path_of_cloud, _optional_number(cloud, "quality_score"), quality)
     return videos
 
 
-def _optional_number(entry: dict[str, Any], key: str) -> float | None:
+def _optional_number(entry: Entry, key: str) -> float | None:
     value = entry.get(key)
     # CO3D's annotations have NaN for scores that could not be computed.
     if value is None or (isinstance(value, float) and math.isnan(value)):
@@ -112,7 +117,7 @@ def _name(entry: object, index: int) -> str:
         raise BadAnnotation(f"entry {index}: {error.reason}") from None
 
 
-def _read_list(path: Path) -> list[Any]:
+def _read_list(path: Path) -> list[Entry]:
     # CO3D was written by Python's `json`, which writes NaN; every number is checked before use.
     content = read_json(path, allow_nan=True)
     if type(content) is not list:
@@ -120,22 +125,23 @@ def _read_list(path: Path) -> list[Any]:
     return content
 
 
-def _frame(root: Path, number: int, entry: dict[str, Any]) -> CO3DFrame:
-    image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), entry.get("depth")
+def _frame(root: Path, number: int, entry: Entry) -> CO3DFrame:
+    image, mask, depth = field(entry, "image", dict), field(entry, "mask", dict), None
     size = field(image, "size", list)
     if [type(side) for side in size] != [int, int] or not 0 < min(size) <= max(size) <= MOST_PIXELS:
         expected = f"two positive integers of at most {MOST_PIXELS:,}"
         raise BadAnnotation(f"the image's size must be {expected}, not {str(size)[:80]}")
     camera = camera_from_viewpoint(field(entry, "viewpoint", dict), size)
     image_path, mask_path = (inside(root, field(part, "path", str)) for part in (image, mask))
-    if depth is not None:
-        path = inside(root, field(depth, "path", str))
+    if entry.get("depth") is not None:
+        stored = field(entry, "depth", dict)
         # Some writers write whole numbers as integers.
-        depth = DepthMap(path, float(finite_array(depth.get("scale_adjustment"), (), "scale_adjustment")))
+        scale = float(finite_array(stored.get("scale_adjustment"), (), "scale_adjustment"))
+        depth = DepthMap(inside(root, field(stored, "path", str)), scale)
     return CO3DFrame(number, image_path, mask_path, depth, camera)
 
 
-def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) -> Cameras:
+def camera_from_viewpoint(viewpoint: Entry, image_size: Sequence[int]) -> Cameras:
     """Convert a PyTorch3D viewpoint to an OpenCV camera (float64, no batch axis) for an image of (height, width).
 
     In PyTorch3D, X_cam = X_world R + T with row vectors, +x is left and +y is up. Image coordinates start at the image
@@ -168,7 +174,7 @@ def camera_from_viewpoint(viewpoint: dict[str, Any], image_size: Sequence[int]) 
 
 def viewpoint(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], focal: list[float], center: list[float]
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Invert `camera_from_viewpoint`; `focal` and `center` are in units of half the image's sides."""
     return {
         "R": (FLIP @ rotation).T.tolist(),
@@ -179,7 +185,7 @@ def viewpoint(
     }
 
 
-def sequence_annotation(category: str, name: str, points: int) -> dict[str, Any]:
+def sequence_annotation(category: str, name: str, points: int) -> dict[str, object]:
     """Return the annotation of a sequence without a video; with points, its cloud is `name`/pointcloud.ply."""
     cloud = {"path": f"{category}/{name}/pointcloud.ply", "quality_score": 1.0, "n_points": points}
     sequence = {"sequence_name": name, "category": category, "video": None, "point_cloud": cloud if points else None}
@@ -195,7 +201,11 @@ def write_points(path: Path, points: Float[np.ndarray, "n 3"], colors: UInt8[np.
 
 
 def write_annotations(
-    category: Path, frames: list[dict[str, Any]], sequences: list[dict[str, Any]], subset: str, lists: dict[str, Any]
+    category: Path,
+    frames: Sequence[Entry],
+    sequences: Sequence[Entry],
+    subset: str,
+    lists: Mapping[str, Sequence[Sequence[object]]],
 ) -> None:
     """Write a category's annotations and set list `subset`; `lists` has [sequence, frame number, image] by split."""
     for name, content in (("frame_annotations", frames), ("sequence_annotations", sequences)):

@@ -5,11 +5,13 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from completesplat.data.co3d.source import CO3DSource, ObjectFraming
+from completesplat.data.co3d.source import CO3DSource
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
+from completesplat.data.packed.manifest import Scalar
+from completesplat.data.placement import ObjectFraming
 from completesplat.data.sequences import PosedSequence
 from completesplat.settings.schema import Natural, Positive, Range, Share
 
@@ -25,7 +27,7 @@ class CO3DDataModule(SceneDataModule):
         category: a folder below `root`, such as "hydrant".
         subset: name of the set list that splits the frames (Splatter Image: `fewview_dev`); None: split by seed.
         allow_shared_sequences: accept a set list that tests on sequences of training or validation. CO3D's
-            `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`, `imported`).
+            `fewview_train` does, and so do all lists that divide the frames of a sequence (`manyview_...`).
         val_fraction, test_fraction, split_seed: see `SeededSplit`.
         min_frames, min_viewpoint_quality, min_point_cloud_quality, most_training_sequences: see `Filters`.
         evaluation_targets: at most this many evenly spaced targets of a test scene; None: all other frames.
@@ -87,7 +89,7 @@ class CO3DDataModule(SceneDataModule):
             return "of the set list, shared sequences allowed"
         return f"of the set list; where it validates nothing, {val:g} of training validates, by seed {seed}"
 
-    def packed_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Scalar]:
         names = ("category", "subset", "allow_shared_sequences")
         seeded = dict(zip(("val_fraction", "test_fraction", "split_seed"), self.seeded, strict=True))
         return {name: getattr(self, name) for name in names} | seeded | vars(self.filters) | vars(self.framing)

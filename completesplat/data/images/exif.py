@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from numbers import Real
-from typing import Any
 
 from PIL import ExifTags, Image
 
@@ -23,20 +22,23 @@ FULL_FRAME_WIDTH = 36.0  # mm
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # by FocalPlaneResolutionUnit; 4 and 5 are in common use
 
 
-def read_exif(picture: Image.Image) -> dict[int, Any]:
+Tags = dict[int, object]
+
+
+def read_exif(image: Image.Image) -> Tags:
     """Return all readable EXIF tags of an image that is decoded and still open.
 
     When Pillow decodes a TIFF, it turns it upright and removes the orientation from its record.
     """
-    tags: dict[int, Any] = {}
+    tags: Tags = {}
     with suppress(Exception):  # Pillow's parser raises almost any exception on a damaged record.
-        exif = picture.getexif()
+        exif = image.getexif()
         tags.update(exif)
         tags.update(exif.get_ifd(ExifTags.IFD.Exif))
     return tags
 
 
-def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:
+def crop_fov(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
     """Return the field of view in degrees of the largest centred square, or None if it is not recorded.
 
     The focal length in pixels is FocalLengthIn35mmFilm / 36 mm * longer side (the longer side of the image corresponds
@@ -52,18 +54,18 @@ def crop_fov(exif: Mapping[int, Any], size: tuple[int, int]) -> float | None:
     return fov if 1 < fov < 170 else None
 
 
-def _focal_from_sensor(exif: Mapping[int, Any], longer_side: int) -> float | None:
+def _focal_from_sensor(exif: Mapping[int, object], longer_side: int) -> float | None:
     focal = _positive(exif.get(ExifTags.Base.FocalLength))
     resolution = _positive(exif.get(ExifTags.Base.FocalPlaneXResolution))
     unit = exif.get(ExifTags.Base.FocalPlaneResolutionUnit, 2)
-    if focal is None or resolution is None or unit not in MILLIMETRES:
+    if focal is None or resolution is None or not isinstance(unit, int) or unit not in MILLIMETRES:
         return None
     recorded = [_positive(exif.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
     scale = longer_side / max(side or longer_side for side in recorded) if all(recorded) else 1.0
     return focal * resolution / MILLIMETRES[unit] * scale
 
 
-def _positive(value: Any) -> float | None:
+def _positive(value: object) -> float | None:
     """Return a finite number above 0, or None for anything else (0 means "unknown", and 0/0 occurs)."""
     if not isinstance(value, Real):
         return None

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from jaxtyping import Float
 from PIL import Image, ImageFile, UnidentifiedImageError
 from torch import Tensor
 
-from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, read_exif
-from completesplat.data.validation import BadPicture, require_file
+from completesplat.data.images.exif import ORIENTATION, TRANSPOSITIONS, Tags, read_exif
+from completesplat.data.validation import BadImage, require_file
 from completesplat.errors import ImageError
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
@@ -25,7 +25,6 @@ SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
 TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
 QUARTER_TURNS = (5, 6, 7, 8)
 TRANSPARENT = "has transparent pixels; lay it over a background first"
-SMALLEST_NORMAL = 2.0**-14  # of float16
 LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 
 
@@ -47,18 +46,18 @@ def decode(
 
     Raises:
         MissingFile: the file does not exist.
-        BadPicture: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
+        BadImage: it is too large, damaged, not a JPEG, PNG, WebP, TIFF or BMP, differs from the annotated size, or
             has pixels whose meaning in this mode is unclear.
     """
-    with _loaded(source, file, FORMATS) as (picture, exif):
+    with _loaded(source, file, FORMATS) as (stored, exif):
         orientation = exif.get(ORIENTATION)
-        image = upright(picture, orientation)
+        image = upright(stored, orientation)
         if image_size is not None:
             check_annotated_size(image, image_size, orientation)
-        return _eight_bits(image, getattr(picture, "tag_v2", {}), mode)
+        return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
-def picture_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
+def stored_size(source: Path | bytes, file: str, formats: tuple[str, ...] = FORMATS) -> tuple[int, int]:
     """Return (height, width) of an image file or its content, from its header; errors as in `decode`."""
     with refused_as_bad(file), opened(source if isinstance(source, bytes) else require_file(source), formats) as image:
         return image.height, image.width
@@ -71,33 +70,27 @@ def read_depth(path: Path, scale_adjustment: float) -> Float[Tensor, "1 height w
 
     Raises:
         MissingFile: the file does not exist.
-        BadPicture: it is no readable 16-bit PNG, the factor is not positive and finite, depths are negative, none is
-            finite, or all are subnormal, as integer depths below 1024 would be.
+        BadImage: it is no readable 16-bit PNG, the factor is not positive and finite, or depths are negative.
     """
     if not 0 < scale_adjustment < LARGEST_SCALE:
-        raise BadPicture(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
-    with _loaded(path, str(path), ("PNG",)) as (picture, _):
-        if picture.mode not in SIXTEEN_BIT_MODES:
-            raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {picture.mode}")
-        depth = np.asarray(picture).astype(np.uint16).view(np.float16).astype(np.float32)
-        finite = np.isfinite(depth)
-        if not finite.any():
-            raise ImageError("no finite depth in it")
-        depth[~finite] = 0
+        raise BadImage(f"the depth's scale adjustment must be positive and finite, not {scale_adjustment}", str(path))
+    with _loaded(path, str(path), ("PNG",)) as (image, _):
+        if image.mode not in SIXTEEN_BIT_MODES:
+            raise ImageError(f"a depth map is a grey PNG of 16 bits, this has colour mode {image.mode}")
+        depth = np.asarray(image).astype(np.uint16).view(np.float16).astype(np.float32)
+        depth[~np.isfinite(depth)] = 0
         if depth.min() < 0:
             raise ImageError("negative depths; its bits are no float16")
-        if 0 < depth.max() < SMALLEST_NORMAL:
-            raise ImageError("its values are integers, where the bits of float16 are expected")
     return torch.from_numpy(depth * np.float32(scale_adjustment))[None]
 
 
 @contextmanager
 def refused_as_bad(file: str) -> Iterator[None]:
-    """Convert an ImageError raised within the context to a BadPicture that names the file."""
+    """Convert an ImageError raised within the context to a BadImage that names the file."""
     try:
         yield
     except ImageError as error:
-        raise BadPicture(str(error), file) from error.__cause__
+        raise BadImage(str(error), file) from error.__cause__
 
 
 @contextmanager
@@ -111,11 +104,11 @@ def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Ima
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats) as picture:
-                width, height = picture.size
+            with Image.open(io.BytesIO(source) if isinstance(source, bytes) else source, formats=formats) as image:
+                width, height = image.size
                 if width * height > MOST_PIXELS:
                     raise ImageError(f"{width} x {height} are more than {MOST_PIXELS:,} pixels")
-                yield picture
+                yield image
         except ImageError:
             raise
         except UnidentifiedImageError:
@@ -128,31 +121,26 @@ def opened(source: str | Path | bytes, formats: tuple[str, ...]) -> Iterator[Ima
             raise ImageError(f"cannot be decoded: {reason}") from error
 
 
-def check_sums(picture: Image.Image, source: str | Path | io.BytesIO) -> None:
+def check_sums(image: Image.Image, source: str | Path | io.BytesIO) -> None:
     """Check all checksums of a PNG file, because decoding ignores those of the pixels."""
-    if picture.format == "PNG":
+    if image.format == "PNG":
         with Image.open(source, formats=("PNG",)) as again:
             again.verify()
 
 
-def over_white(picture: Image.Image) -> Image.Image:
-    """Composite an image over white and return it in RGB."""
-    return over_grey(picture, 1.0)
-
-
-def over_grey(picture: Image.Image, value: float) -> Image.Image:
+def over_grey(image: Image.Image, value: float) -> Image.Image:
     """Composite an image over a grey value from 0 to 1 and return it in RGB."""
-    grey = Image.new("RGBA", picture.size, (round(255 * value),) * 3)
-    return Image.alpha_composite(grey, picture.convert("RGBA")).convert("RGB")
+    grey = Image.new("RGBA", image.size, (round(255 * value),) * 3)
+    return Image.alpha_composite(grey, image.convert("RGBA")).convert("RGB")
 
 
-def upright(picture: Image.Image, orientation: object) -> Image.Image:
+def upright(image: Image.Image, orientation: object) -> Image.Image:
     """Turn and mirror an image by its EXIF orientation; undefined values change nothing."""
     transposition = TRANSPOSITIONS.get(orientation) if isinstance(orientation, int) else None
-    return picture if transposition is None else picture.transpose(transposition)
+    return image if transposition is None else image.transpose(transposition)
 
 
-def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
+def deep_grey(image: Image.Image, tiff_tags: Mapping[int, object]) -> np.ndarray:
     """Convert grey values of more than 8 bits to float32 in [0, 1]. Pillow's own conversion would clip them at 255.
 
     The TIFF tags come from the opened file, because images derived from it have none; they are empty for other formats.
@@ -161,21 +149,21 @@ def deep_grey(picture: Image.Image, tiff_tags: Mapping[int, Any]) -> np.ndarray:
         ImageError: values lie outside the range from black to white.
     """
     bits = tiff_tags.get(TIFF_BITS, (16,))
-    values = np.asarray(picture).astype(np.float64)
-    if picture.mode != "F":
+    values = np.asarray(image).astype(np.float64)
+    if image.mode != "F":
         # Pillow does not scale 12-bit TIFF values; all other images of these modes use 16 bits.
         values = values / (4095 if bits == (12,) else 65535)
     # The comparison is false for NaN too.
     if not ((values >= 0) & (values <= 1)).all():
-        raise ImageError(f"grey values of mode {picture.mode} outside the range from black to white, or not finite")
+        raise ImageError(f"grey values of mode {image.mode} outside the range from black to white, or not finite")
     if tiff_tags.get(TIFF_PHOTOMETRIC) == 0:
         values = 1 - values  # "white is zero", which Pillow inverts for 8 bits only
-    if isinstance(picture.info.get("transparency"), int):
-        values[np.asarray(picture) == picture.info["transparency"]] = 1
+    if isinstance(image.info.get("transparency"), int):
+        values[np.asarray(image) == image.info["transparency"]] = 1
     return values.astype(np.float32)
 
 
-def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
+def save_image(image: Image.Image, path: Path, **options: int) -> None:
     """Write an image in the format of its path's suffix; a full disk raises, while Pillow would truncate a JPEG."""
     content = io.BytesIO()
     image.save(content, Image.registered_extensions()[path.suffix], **options)
@@ -183,8 +171,8 @@ def save_picture(image: Image.Image, path: Path, **options: Any) -> None:
 
 
 @contextmanager
-def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, dict[int, Any]]]:
-    """Decode an image completely and yield it with its EXIF record; convert its errors to BadPicture."""
+def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterator[tuple[Image.Image, Tags]]:
+    """Decode an image completely and yield it with its EXIF record; convert its errors to BadImage."""
     with refused_as_bad(file):
         if ImageFile.LOAD_TRUNCATED_IMAGES:
             raise ImageError("Pillow is set to accept truncated files (ImageFile.LOAD_TRUNCATED_IMAGES); unset that")
@@ -192,13 +180,13 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
         if not 0 < size <= MOST_BYTES:
             raise ImageError(f"more than {MOST_BYTES:,} bytes" if size else "the file is empty")
         content = source.read_bytes() if isinstance(source, Path) else source
-        with opened(content, formats) as picture:
-            frames = getattr(picture, "n_frames", 1)
-            if frames > 1 and picture.format != "MPO":
-                raise ImageError(f"has {frames} frames; one picture is expected")
-            picture.load()
-            check_sums(picture, io.BytesIO(content))
-            yield picture, read_exif(picture)
+        with opened(content, formats) as image:
+            frames = getattr(image, "n_frames", 1)
+            if frames > 1 and image.format != "MPO":
+                raise ImageError(f"has {frames} frames; one image is expected")
+            image.load()
+            check_sums(image, io.BytesIO(content))
+            yield image, read_exif(image)
 
 
 def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
@@ -210,7 +198,7 @@ def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orienta
         raise ImageError(actual)
 
 
-def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, Any], mode: Literal["RGB", "L"]) -> Image.Image:
+def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Literal["RGB", "L"]) -> Image.Image:
     if image.mode in SIXTEEN_BIT_MODES:
         if (np.asarray(image) == image.info.get("transparency")).any():
             raise ImageError(TRANSPARENT)

@@ -10,7 +10,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -48,11 +48,11 @@ class Photograph(TensorDataclass):
     fov_source: Literal["given", "exif", "default"]
 
 
-Picture: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
+ImageLike: TypeAlias = str | Path | Image.Image | np.ndarray | Tensor
 
 
 def read_photograph(
-    picture: Picture,
+    source: ImageLike,
     size: int,
     fov_degrees: float | None = None,
     default_fov_degrees: float = 50.0,
@@ -66,7 +66,7 @@ def read_photograph(
     converted to sRGB. Grey images of 16 bits are scaled to [0, 1]; grey images of floats must lie in [0, 1].
 
     Args:
-        picture: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
+        source: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
             an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
@@ -84,9 +84,9 @@ def read_photograph(
         if fov is not None and not 0 < fov < 180:
             raise CompleteSplatError(f"the field of view must lie between 0 and 180 degrees, not {fov}")
     try:
-        image, recorded = _square(picture, size, remove_background, background, object_share)
+        image, recorded = _square(source, size, remove_background, background, object_share)
     except ImageError as error:
-        name = picture if isinstance(picture, (str, Path)) else "the picture"
+        name = source if isinstance(source, (str, Path)) else "the image"
         raise ImageError(f"{name}: {error}") from error.__cause__
     if fov_degrees is not None:
         return Photograph(image, float(fov_degrees), "given")
@@ -96,21 +96,21 @@ def read_photograph(
 
 
 def _square(
-    picture: Picture, size: int, remove_background: bool, background: float, object_share: float | None
+    source: ImageLike, size: int, remove_background: bool, background: float, object_share: float | None
 ) -> tuple[Float[Tensor, "3 size size"], float | None]:
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
-    if isinstance(picture, (np.ndarray, Tensor)):
-        picture = _pixels(picture)
-        if isinstance(picture, np.ndarray):
+    if isinstance(source, (np.ndarray, Tensor)):
+        source = _pixels(source)
+        if isinstance(source, np.ndarray):
             if remove_background:
-                raise ImageError("a picture whose background is to be removed is given in bytes, not in floats")
-            return _resized(picture, size), None
-    if not isinstance(picture, Image.Image):
-        _check_file(Path(picture))
-    with nullcontext(picture) if isinstance(picture, Image.Image) else opened(picture, FORMATS) as file:
+                raise ImageError("an image whose background is to be removed is given in bytes, not in floats")
+            return _resized(source, size), None
+    if not isinstance(source, Image.Image):
+        _check_file(Path(source))
+    with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
         _check_side(*file.size)
-        if not isinstance(picture, Image.Image):
-            check_sums(file, picture)
+        if not isinstance(source, Image.Image):
+            check_sums(file, source)
         file.load()
         exif = read_exif(file)
     seen = upright(file, exif.get(ORIENTATION))
@@ -123,17 +123,17 @@ def _square(
     return _to_tensor(seen, file, size, background), crop_fov(exif, file.size)
 
 
-def _cut_out(picture: Image.Image, background: float) -> Image.Image:
-    if picture.mode not in EIGHT_BIT_MODES:
-        raise ImageError(f"colour mode {picture.mode} goes without background=remove")
-    return without_background(_to_srgb(picture, background))
+def _cut_out(image: Image.Image, background: float) -> Image.Image:
+    if image.mode not in EIGHT_BIT_MODES:
+        raise ImageError(f"colour mode {image.mode} goes without background=remove")
+    return without_background(_to_srgb(image, background))
 
 
-def _around_object(picture: Image.Image, share: float) -> Image.Image | None:
+def _around_object(image: Image.Image, share: float) -> Image.Image | None:
     """Crop the square around the opaque part, which may extend beyond the image; None if all pixels are opaque."""
-    if picture.mode not in EIGHT_BIT_MODES or not picture.has_transparency_data:
+    if image.mode not in EIGHT_BIT_MODES or not image.has_transparency_data:
         return None
-    cut_out = picture.convert("RGBA")
+    cut_out = image.convert("RGBA")
     alpha = cut_out.getchannel("A")
     if alpha.getextrema()[0] == 255:
         return None
@@ -159,14 +159,14 @@ def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
     return left, top, left + side, top + side
 
 
-def _pixels(picture: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
+def _pixels(image: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
     """Convert an array (channel last) or tensor (channel first): bytes to an image, floats to a float32 array."""
-    channel = 0 if isinstance(picture, Tensor) else -1
-    if picture.ndim != 3 or picture.shape[channel] != 3:
-        raise ImageError(f"{tuple(picture.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
-    if isinstance(picture, Tensor):  # NumPy has no bfloat16
-        picture = picture.float() if picture.is_floating_point() else picture
-    values = picture.movedim(0, -1).numpy(force=True) if isinstance(picture, Tensor) else picture
+    channel = 0 if isinstance(image, Tensor) else -1
+    if image.ndim != 3 or image.shape[channel] != 3:
+        raise ImageError(f"{tuple(image.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
+    if isinstance(image, Tensor):  # NumPy has no bfloat16
+        image = image.float() if image.is_floating_point() else image
+    values = image.movedim(0, -1).numpy(force=True) if isinstance(image, Tensor) else image
     if values.dtype == np.uint8:
         return Image.fromarray(values)
     if not np.issubdtype(values.dtype, np.floating):
@@ -223,7 +223,7 @@ def _to_srgb(square: Image.Image, background: float) -> Image.Image:
     return square.convert("RGB")
 
 
-def without_background(picture: Image.Image) -> Image.Image:
+def without_background(image: Image.Image) -> Image.Image:
     """Make the background of an RGB image transparent (RGBA) with U2-Net (Qin et al. 2020) from rembg.
 
     Raises:
@@ -235,7 +235,7 @@ def without_background(picture: Image.Image) -> Image.Image:
     except (ImportError, SystemExit) as error:  # rembg exits if onnxruntime is missing
         advice = 'pip install "completesplat[background]"'
         raise CompleteSplatError(f"background=remove needs rembg and onnxruntime: {advice}") from error
-    pixels = Image.fromarray(np.array(picture))  # without EXIF, because rembg would turn the image again
+    pixels = Image.fromarray(np.array(image))  # without EXIF, because rembg would turn the image again
     try:
         cut: Image.Image = rembg.remove(pixels, session=_session())
     except Exception as error:  # from the HTTP library, onnxruntime or the file system
@@ -247,13 +247,13 @@ def without_background(picture: Image.Image) -> Image.Image:
 
 
 @cache
-def _session() -> Any:
+def _session() -> object:
     import rembg
 
     return rembg.new_session(CUTTER)
 
 
-def picture_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
+def image_features(images: Float[Tensor, "*batch 3 height width"]) -> Float[Tensor, "*batch 8"]:
     """Return mean and standard deviation of red, green and blue, and two measures of detail; all lie in [0, 1].
 
     The measures of detail are the mean absolute differences between neighbours in a row, and in a column.
@@ -293,8 +293,8 @@ def outside_of_mask(photograph: Path, mask: Path, size: int) -> Float[Tensor, "1
 
 def square_side(photograph: Path) -> int:
     """Return the side in pixels of the largest square of a readable image."""
-    with Image.open(photograph) as picture:
-        return min(picture.size)
+    with Image.open(photograph) as image:
+        return min(image.size)
 
 
 def visible(hidden: Bool[np.ndarray, "side side"], size: int) -> Float[Tensor, "1 size size"]:

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.view_selection import draws
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import at
 from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
@@ -56,7 +56,7 @@ class SceneStore:
         self.names = list(names)
         self.mask_threshold = mask_threshold
         self.background = background
-        self._pictures: dict[tuple[str, int], Picture] | None = {} if cache else None
+        self._pictures: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
         """Return the scene of the frames with these indices in the reference camera's frame, if all can be read."""
@@ -73,7 +73,7 @@ class SceneStore:
         """Return one image, if it can be read."""
         return self._picture(sequence, view).image
 
-    def _picture(self, sequence: PosedSequence, view: int) -> Picture:
+    def _picture(self, sequence: PosedSequence, view: int) -> MaskedImage:
         key = sequence.name, view
         if self._pictures is None:
             return self._on_background(sequence.read(view))
@@ -81,12 +81,12 @@ class SceneStore:
             self._pictures[key] = self._on_background(sequence.read(view))
         return self._pictures[key]
 
-    def _masks(self, pictures: Sequence[Picture]) -> Float[Tensor, "view 1 size size"]:
+    def _masks(self, pictures: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
         everywhere = torch.full_like(pictures[0].image[:1], 255)
         masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
         return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
 
-    def _on_background(self, picture: Picture) -> Picture:
+    def _on_background(self, picture: MaskedImage) -> MaskedImage:
         if self.background is None or picture.mask is None:
             return picture
         mask = self._masks([picture])[0].numpy()

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from completesplat.data.images.photograph import picture_features
+from completesplat.data.images.photograph import image_features
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.sequences import PosedSequence
 from completesplat.errors import DataError
@@ -69,12 +69,12 @@ def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
-    """Return mean and standard deviation of `picture_features` over about 1,024 images; empty if none can be read."""
+    """Return mean and standard deviation of `image_features` over about 1,024 images; empty if none can be read."""
     rows = []
     for sequence, frames in excerpts(store, FEATURE_PICTURES):
         for frame in frames:
             with suppress(DataError):
-                rows.append(picture_features(store.image(sequence, frame).double() / 255))
+                rows.append(image_features(store.image(sequence, frame).double() / 255))
     if not rows:
         return {}
     features = torch.stack(rows)

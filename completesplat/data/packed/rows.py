@@ -15,8 +15,8 @@ from PIL import Image
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.sequences import Picture, PosedSequence
-from completesplat.data.validation import BadAnnotation, BadPicture, ChangedFile, UnreadableFile, at
+from completesplat.data.sequences import MaskedImage, PosedSequence
+from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, UnreadableFile, at
 from completesplat.geometry.cameras import Cameras, crop_resize
 
 # Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.
@@ -43,7 +43,7 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
     """Return the image that `encode` wrote in `size` pixels, resized to `wanted`.
 
     Raises:
-        BadPicture: the bytes are damaged, or have other channels or another size than expected.
+        BadImage: the bytes are damaged, or have other channels or another size than expected.
     """
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
@@ -54,9 +54,9 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
             pixels = None if wrong else np.array(image)
     # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
-        raise BadPicture(f"cannot be decoded: {error}") from error
+        raise BadImage(f"cannot be decoded: {error}") from error
     if pixels is None or pixels.dtype != np.uint8:
-        raise BadPicture(f"is no picture of {size} x {size} pixels with {channels} channels of 8 bits")
+        raise BadImage(f"is no picture of {size} x {size} pixels with {channels} channels of 8 bits")
     return torch.from_numpy(np.ascontiguousarray(pixels.reshape(size, size, channels).transpose(2, 0, 1)))
 
 
@@ -103,7 +103,7 @@ def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPi
     image, mask = sequence.read(index)
     for part in (image, mask):
         if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
-            raise BadPicture(f"has {part.shape[1]} x {part.shape[2]} pixels, its camera {sequence.cameras.image_size}")
+            raise BadImage(f"has {part.shape[1]} x {part.shape[2]} pixels, its camera {sequence.cameras.image_size}")
     without_loss = "png" if codec == "jpeg" else codec
     return EncodedPicture(encode(image, codec), None if mask is None else encode(mask, without_loss))
 
@@ -156,12 +156,14 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         images, masks = _values(row, "images", count), _values(row, "masks", count)
         checksums = _numbers(row, "picture_checksums", count)
 
-        def read(index: int) -> Picture:  # It does not access the bytes of other frames.
+        def read(index: int) -> MaskedImage:  # It does not access the bytes of other frames.
             with at(file=file, sequence=name, frame=frames[index]):
                 image, mask = images[index].as_py(), masks[index].as_py()
                 if image is None or EncodedPicture(image, mask).checksum() != checksums[index]:
-                    raise BadPicture("is no longer what was written")
-                return Picture(decode(image, 3, size, wanted), None if mask is None else decode(mask, 1, size, wanted))
+                    raise BadImage("is no longer what was written")
+                return MaskedImage(
+                    decode(image, 3, size, wanted), None if mask is None else decode(mask, 1, size, wanted)
+                )
 
         return PosedSequence(name, frames, crop_resize(cameras, 0, 0, size, wanted), depth_ranges, read)
 

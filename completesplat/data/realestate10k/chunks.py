@@ -7,17 +7,16 @@ a list of JPEG files as uint8 tensors (`real_estate_10k_tools`, `src/convert.py`
 import hashlib
 import json
 from collections.abc import Sequence
-from functools import partial
 from os.path import isfile
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, cut_square
-from completesplat.data.images.files import decode, picture_size
+from completesplat.data.images.files import decode, stored_size
 from completesplat.data.realestate10k.clips import CAMERA_NUMBERS, FORMATS, Clip, clip_cameras
 from completesplat.data.validation import BadAnnotation, UnreadableFile, at, inside, read_json, refused_to, require_file
 from completesplat.errors import DataError, TensorFileError
@@ -25,7 +24,7 @@ from completesplat.weights.checkpoint_reading import read_tensor_file
 
 CHUNKS_IN_MEMORY = 2
 
-Chunk = dict[str, dict[str, Any]]
+Chunk = dict[str, dict[str, object]]
 
 
 class ChunkedClips:
@@ -106,7 +105,7 @@ def read_chunk(path: Path) -> Chunk:
     return chunk
 
 
-def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
+def _clip_from_entry(path: Path, key: str, entry: dict[str, object]) -> Clip:
     images, times, rows = entry.get("images"), entry.get("timestamps"), entry.get("cameras")
     if not isinstance(images, list) or not all(_is_bytes(image) for image in images):
         raise BadAnnotation("images are not a list of JPEG files (uint8)")
@@ -117,22 +116,21 @@ def _clip_from_entry(path: Path, key: str, entry: dict[str, Any]) -> Clip:
     if not len(images) == len(rows) == len(times):
         raise BadAnnotation(f"{len(images)} images, {len(rows)} cameras and {len(times)} timestamps")
     with at(frame=0):
-        size = picture_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
+        size = stored_size(images[0].numpy().tobytes(), str(path), FORMATS) if images else (1, 1)
+
+    def read(frame: int, square: Square, side: int) -> UInt8[Tensor, "3 side side"]:
+        return cut_square(decode(images[frame].numpy().tobytes(), str(path), "RGB", size), square, side)
+
     timestamps = tuple(times.tolist())
-    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), partial(_read, images, size, str(path)))
+    return Clip(key, path, timestamps, clip_cameras(rows, timestamps, size), read)
 
 
-def _is_bytes(image: Any) -> bool:
+def _is_bytes(image: object) -> TypeGuard[Tensor]:
     return _is_plain(image) and image.dtype == torch.uint8 and image.ndim == 1 and image.is_contiguous()
 
 
-def _is_plain(value: Any) -> TypeGuard[Tensor]:
+def _is_plain(value: object) -> TypeGuard[Tensor]:
     """Return whether a value is a dense CPU tensor that is not part of an autograd graph."""
-    strided = isinstance(value, Tensor) and value.layout == torch.strided
-    return strided and value.device.type == "cpu" and not value.requires_grad
-
-
-def _read(
-    images: list[Tensor], image_size: tuple[int, int], file: str, frame: int, square: Square, size: int
-) -> UInt8[Tensor, "3 size size"]:
-    return cut_square(decode(images[frame].numpy().tobytes(), file, "RGB", image_size), square, size)
+    if not isinstance(value, Tensor) or value.layout != torch.strided:
+        return False
+    return value.device.type == "cpu" and not value.requires_grad

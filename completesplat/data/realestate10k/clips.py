@@ -6,7 +6,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -14,7 +13,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat.data.images.crop import Square, read_square
-from completesplat.data.images.files import picture_size
+from completesplat.data.images.files import stored_size
 from completesplat.data.validation import (
     ROTATION_TOLERANCE,
     BadAnnotation,
@@ -29,7 +28,7 @@ from completesplat.geometry.cameras import Cameras
 
 CAMERA_NUMBERS = 18
 FORMATS = ("JPEG", "PNG")
-PICTURES = (".png", ".jpg")
+SUFFIXES = (".png", ".jpg")
 MOST_BYTES = 2**26  # a frame needs about 300
 
 
@@ -103,15 +102,19 @@ class TextClips:
         path = self.folder / f"{key}.txt"
         with at(path, key):
             timestamps, rows = _read_text(path)
-            pictures = _pictures(self.folder / key)
+            images = _images_of(self.folder / key)
             for frame, time in enumerate(timestamps):
-                if time not in pictures:
-                    raise MissingFile("no such picture", str(self.folder / key / f"{time}.jpg"), key, frame)
-            paths = [pictures[time] for time in timestamps]
+                if time not in images:
+                    raise MissingFile("no such image", str(self.folder / key / f"{time}.jpg"), key, frame)
+            paths = [images[time] for time in timestamps]
             with at(frame=0):
-                size = picture_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
+                size = stored_size(paths[0], str(paths[0]), FORMATS) if paths else (1, 1)
+
+            def read(frame: int, square: Square, side: int) -> UInt8[Tensor, "3 side side"]:
+                return read_square(paths[frame], size, square, side, "RGB")
+
             numbers = torch.tensor(rows, dtype=torch.float64).reshape(-1, CAMERA_NUMBERS)
-            return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), partial(_read, paths, size))
+            return Clip(key, path, timestamps, clip_cameras(numbers, timestamps, size), read)
 
     def fingerprint(self) -> str:
         """Return the SHA-256 of the text files' names and sizes (reading tens of thousands would be slow)."""
@@ -143,15 +146,9 @@ def _read_text(path: Path) -> tuple[tuple[int, ...], list[list[float]]]:
     return tuple(timestamps), rows
 
 
-def _pictures(folder: Path) -> dict[int, Path]:
+def _images_of(folder: Path) -> dict[int, Path]:
     """Return image files by timestamp; JPEG is preferred to PNG."""
     with os.scandir(folder) as entries:
         paths = [Path(entry.path) for entry in entries]
-    ordered = sorted((path for path in paths if path.suffix in PICTURES), key=lambda path: PICTURES.index(path.suffix))
+    ordered = sorted((path for path in paths if path.suffix in SUFFIXES), key=lambda path: SUFFIXES.index(path.suffix))
     return {int(path.stem): path for path in ordered if path.stem.isdecimal()}
-
-
-def _read(
-    paths: list[Path], image_size: tuple[int, int], frame: int, square: Square, size: int
-) -> UInt8[Tensor, "3 size size"]:
-    return read_square(paths[frame], image_size, square, size, "RGB")

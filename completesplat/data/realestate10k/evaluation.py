@@ -4,7 +4,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from completesplat.data.loading.scenes import Choice
 from completesplat.data.sequences import PosedSequence, SequenceSource, shortened
@@ -110,7 +109,7 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
     return ChosenSource(source, clips, views, len(clips) + len(absent))
 
 
-def _from_table(content: Any) -> EvaluationIndex:
+def _from_table(content: object) -> EvaluationIndex:
     if not isinstance(content, dict):
         raise BadAnnotation("not a table of clips")
     form, views = None, dict[str, list[Choice]]()
@@ -126,7 +125,7 @@ def _from_table(content: Any) -> EvaluationIndex:
     return EvaluationIndex(form, views)
 
 
-def _form(value: Any) -> str:
+def _form(value: object) -> str:
     if isinstance(value, list):
         if all(isinstance(entry, dict) and entry.keys() == {CONTEXT, TARGET} for entry in value):
             return "latentSplat"
@@ -138,7 +137,7 @@ def _form(value: Any) -> str:
     )
 
 
-def _choice(entry: dict[str, Any]) -> Choice:
+def _choice(entry: dict[str, list[int]]) -> Choice:
     for frames in entry.values():
         if not isinstance(frames, list) or not frames or not all(type(f) is int and f >= 0 for f in frames):
             raise BadAnnotation("context and target must be lists of frame numbers")

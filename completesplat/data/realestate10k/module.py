@@ -13,10 +13,11 @@ from completesplat.data.images.crop import Square, principal_square
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.scenes import Choice, EvaluationScenes
 from completesplat.data.loading.view_selection import GrowingGap, evaluation_views_within, nearby_views
+from completesplat.data.packed.manifest import Scalar
 from completesplat.data.realestate10k.chunks import ChunkedClips
 from completesplat.data.realestate10k.clips import Clip, TextClips
 from completesplat.data.realestate10k.evaluation import EvaluationIndex, choose_clips, read_index, read_keys
-from completesplat.data.sequences import Picture, PosedSequence, SequenceSource, split_by_hash
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource, split_by_hash
 from completesplat.data.validation import BadAnnotation, at, require_file
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import crop_resize
@@ -90,9 +91,9 @@ def _square(clip: Clip, crop: str, frame: int) -> Square:
         return principal_square((x, y), (height, width))
 
 
-def _read(clip: Clip, squares: list[Square], size: int, index: int) -> Picture:
+def _read(clip: Clip, squares: list[Square], size: int, index: int) -> MaskedImage:
     with at(clip.source, clip.key, index):
-        return Picture(clip.read(index, squares[index], size), None)
+        return MaskedImage(clip.read(index, squares[index], size), None)
 
 
 class RE10KDataModule(SceneDataModule):
@@ -167,7 +168,7 @@ class RE10KDataModule(SceneDataModule):
             **({} if self.scene_list is None else {"scene_list": f"SHA-256 {_checksum(self.scene_list)}"}),
         }
 
-    def packed_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Scalar]:
         return {**vars(self.framing), "val_fraction": self.val_fraction, "val_seed": self.val_seed}
 
     def open(self, split: str) -> Mapping[str, RE10KSource]:

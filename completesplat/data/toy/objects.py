@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
-from completesplat.data.images.files import save_picture
+from completesplat.data.images.files import save_image
 from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.mini_scene import draw_mini
 from completesplat.data.toy.object_scene import ToyScene, draw_scene, render_frame
@@ -40,11 +40,11 @@ def _write_frame(
     }
     image, coverage, depth = render_frame(scene, frame, size)
     picture, mask = _to_bytes(image), _to_bytes(coverage)
-    save_picture(Image.fromarray(picture), folder / files["image"], quality=95, subsampling=0)
-    save_picture(Image.fromarray(mask), folder / files["mask"])
+    save_image(Image.fromarray(picture), folder / files["image"], quality=95, subsampling=0)
+    save_image(Image.fromarray(mask), folder / files["mask"])
     # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
-    save_picture(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
-    save_picture(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
+    save_image(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
+    save_image(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
     paths = {key: f"{category}/{path}" for key, path in files.items()}
     return {
         "sequence_name": name,

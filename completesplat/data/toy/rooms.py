@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from completesplat.data.images.files import save_picture
+from completesplat.data.images.files import save_image
 from completesplat.data.toy.disk import write_once, write_scenes
 from completesplat.data.toy.raytracing import Array
 from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
@@ -67,7 +67,7 @@ def write_text(clip: ClipFiles) -> None:
 def write_picture(path: Path, image: Array) -> None:
     """Write colours in [0, 1], [height width 3], as a JPEG."""
     pixels = np.round(255 * image.clip(0, 1)).astype(np.uint8)
-    save_picture(Image.fromarray(pixels), path, quality=JPEG_QUALITY, subsampling=0)
+    save_image(Image.fromarray(pixels), path, quality=JPEG_QUALITY, subsampling=0)
 
 
 def write_chunks(folder: Path, clips: list[ClipFiles]) -> None:

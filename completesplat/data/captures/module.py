@@ -1,0 +1,195 @@
+"""Data module of a user's captures, which are read in place."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+
+from completesplat.data.captures.capture import Capture, CapturedFrame
+from completesplat.data.captures.colmap import read_colmap
+from completesplat.data.captures.transforms_json import read_transforms
+from completesplat.data.images.crop import cut_square
+from completesplat.data.loading.data_module import SceneDataModule
+from completesplat.data.loading.scenes import Choice
+from completesplat.data.loading.view_selection import evaluation_views, spread_views, training_views
+from completesplat.data.packed.manifest import Scalar
+from completesplat.data.placement import (
+    ObjectFraming,
+    from_cameras,
+    from_points,
+    placed_sequence,
+    square_of,
+    upright_axes,
+)
+from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
+from completesplat.data.validation import MissingFile, at, refused_to
+from completesplat.errors import DataError
+from completesplat.settings.schema import Positive, Range, Share
+
+# Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
+# farthest point determines the scale of the scene.
+FARTHEST = 5.0
+FEWEST_HELD_OUT = 2
+
+
+def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
+    """Return the held-out frames, or the others.
+
+    Every `hold_out`-th frame is held out, from the first on (as LLFF and NeRF), or more for at least two frames.
+    """
+    step = min(hold_out, frames // FEWEST_HELD_OUT)
+    return [frame for frame in range(frames) if (frame % step == 0) == held_out]
+
+
+def read_capture(folder: Path, most_missing: float) -> Capture | None:
+    """Read the capture in a folder: `transforms.json`, or `sparse/0` or `sparse` with `images` and perhaps `masks`.
+
+    `folder` may also be a JSON file, such as `transforms_train.json` of NeRF.
+
+    Returns:
+        The capture, or None if the folder has none.
+    """
+    transforms = folder if folder.suffix == ".json" else folder / "transforms.json"
+    if transforms.is_file():
+        return read_transforms(transforms, most_missing)
+    for model in (folder / "sparse/0", folder / "sparse"):
+        if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
+            masks = folder / "masks"
+            return read_colmap(model, folder / "images", masks if masks.is_dir() else None)
+    return None
+
+
+class CaptureSource(SequenceSource):
+    """The same part of the frames of each capture; see `SequenceSource`.
+
+    Args:
+        captures: captures by name.
+        members: (number of frames) -> indices of the frames that belong to the split.
+    """
+
+    def __init__(
+        self,
+        captures: Mapping[str, Capture],
+        members: Callable[[int], list[int]],
+        framing: ObjectFraming,
+        refused: list[DataError],
+    ) -> None:
+        self.names = sorted(captures)
+        self.refused = refused
+        self.left_out: dict[str, list[str]] = {}
+        self.listed = len(captures) + len(refused)
+        self.framing = framing
+        self._captures = captures
+        self._members = members
+        self._sequences: dict[str, PosedSequence] = {}
+
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of the files of cameras and points, not of the images."""
+        files = [path for name in self.names for path in self._captures[name].files]
+        return hashlib.sha256(b"".join(hashlib.sha256(path.read_bytes()).digest() for path in files)).hexdigest()
+
+    def read(self, name: str) -> PosedSequence:
+        """Return one capture; its cameras are computed at the first call."""
+        if name not in self._sequences:
+            with at(self._captures[name].files[0], name):
+                self._sequences[name] = self._make(name)
+        return self._sequences[name]
+
+    def _make(self, name: str) -> PosedSequence:
+        """Place the object by all frames, so that all splits have the same scale."""
+        capture = self._captures[name]
+        cameras = [frame.camera() for frame in capture.frames]
+        if capture.points is None:
+            placement = from_cameras(cameras)
+        else:
+            distance = np.linalg.norm(capture.points - np.median(capture.points, axis=0), axis=-1)
+            near = capture.points[distance <= FARTHEST * np.median(distance)]
+            placement = from_points(near, upright_axes(cameras), "the point cloud")
+        numbers = self._members(len(capture.frames))
+        read = partial(_read, name, [capture.frames[number] for number in numbers], self.framing.image_size)
+        return placed_sequence(name, numbers, [cameras[number] for number in numbers], placement, self.framing, read)
+
+
+def _read(name: str, frames: list[CapturedFrame], size: int, index: int) -> MaskedImage:
+    with at(sequence=name):
+        image, mask = frames[index].read()
+        square = square_of(frames[index].camera())
+        return MaskedImage(cut_square(image, square, size), cut_square(mask, square, size))
+
+
+class CaptureDataModule(SceneDataModule):
+    """Scenes of captures, each with its own training frames and held-out frames for validation and test.
+
+    Images are undistorted (by pycolmap) when they are read, cut to the largest square around the principal point, and
+    scaled to a common object size. The object is placed by the capture's points, else by its cameras.
+
+    Args:
+        root: folder or file of a capture (`read_capture`), a folder of such folders, or prepared captures.
+        hold_out: one of every `hold_out` frames is for validation and test.
+        most_missing: largest share of the frames of a `transforms.json` that may lack an image and are left out.
+        evaluation_targets: at most this many evenly spaced targets of the reference, the first held-out frame; None:
+            all other held-out frames.
+        spread_targets: spread the training targets evenly around the reference, for a posterior that sees them.
+        depth_before, depth_after: depth range in front of and behind the object's centre; its half size is 0.57.
+        **settings: of `SceneDataModule`.
+    """
+
+    def __init__(
+        self,
+        root: str,
+        hold_out: Annotated[int, Range(2)] = 8,
+        most_missing: Share = 0.5,
+        evaluation_targets: Positive | None = None,
+        spread_targets: bool = False,
+        depth_before: float = 2.0,
+        depth_after: float = 2.0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(root, **settings)
+        self.hold_out = hold_out
+        self.most_missing = most_missing
+        self.evaluation_targets = evaluation_targets
+        self.spread_targets = spread_targets
+        self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
+
+    def describe(self) -> dict[str, str | None]:
+        targets = "its other frames" if self.evaluation_targets is None else f"{self.evaluation_targets} others"
+        return {
+            "data_set": "capture",
+            "split": f"one of {self.hold_out} frames of each capture is held out",
+            "crop": "largest square around the principal point",
+            "protocol_views": f"reference: a capture's first held-out frame; targets: {targets}",
+        }
+
+    def packed_settings(self) -> dict[str, Scalar]:
+        return {"hold_out": self.hold_out, "most_missing": self.most_missing, **vars(self.framing)}
+
+    def open(self, split: str) -> Mapping[str, CaptureSource]:
+        """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
+        captures: dict[str, Capture] = {}
+        refused: list[DataError] = []
+        folders = [self.root, *sorted(path for path in self.root.glob("*/") if path.is_dir())]
+        for folder in folders:
+            name = folder.resolve().name or "capture"
+            with refused_to(refused.append), at(sequence=name):
+                if (capture := read_capture(folder, self.most_missing)) is not None:
+                    captures[name] = capture
+            if folder == self.root and (captures or refused):
+                break
+        if not captures:
+            message = "no capture there: neither transforms.json nor sparse/0, nor folders that have one"
+            raise refused[0] if refused else MissingFile(message, str(self.root))
+        training, held_out = partial(members, self.hold_out, False), partial(members, self.hold_out, True)
+        parts = {"train": training, "val": held_out, "test": held_out}
+        return {part: CaptureSource(captures, members, self.framing, refused) for part, members in parts.items()}
+
+    def training_views(self, frames: int, epoch: int, rng: np.random.Generator) -> Choice:
+        """Draw a random reference and targets at random, or spread around it."""
+        return (spread_views if self.spread_targets else training_views)(frames, self.targets, rng)
+
+    def evaluation_views(self, sequence: PosedSequence, split: str) -> Choice:
+        """Return the first held-out frame as reference and others as targets."""
+        return evaluation_views(len(sequence.frames), self.evaluation_targets)

@@ -1,0 +1,160 @@
+"""Composition of a verb's config by Hydra: search path, resolvers, arguments of sweeps, errors with nearest names."""
+
+import hashlib
+import re
+import secrets
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+from hydra import compose as compose_by_hydra
+from hydra import initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from completesplat.errors import CompleteSplatError
+from completesplat.settings.arguments import for_hydra
+from completesplat.settings.options import conf_folder, did_you_mean, options
+
+RUN_NAME = f"{time.strftime('%Y-%m-%d_%H-%M-%S')}-{secrets.token_hex(3)}"
+NOT_THERE = re.compile(r"Could not override '([^']+)'")
+LONGEST_NAME = 120
+
+
+class SettingsOfWorkingFolder(SearchPathPlugin):
+    """Hydra plugin that finds further options of the config groups in `./conf`; the package's own come first."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append `./conf`, if it exists, to the search path (Hydra calls this method)."""
+        folder = Path.cwd() / "conf"
+        if folder.is_dir() and not folder.samefile(conf_folder()):
+            search_path.append("working-folder", f"file://{folder}")
+
+
+def use_working_folder() -> None:
+    """Append the working folder to `sys.path`, and its `conf` to Hydra's search path; each process must call this."""
+    folder = str(Path.cwd())
+    if not {"", folder} & set(sys.path):
+        sys.path.append(folder)
+    Plugins.instance().register(SettingsOfWorkingFolder)
+
+
+def compose(verb: str, *overrides: str) -> DictConfig:
+    """Return the config of a verb, as `completesplat VERB OVERRIDES...` composes it: `compose("fit", "trainer=ddp")`.
+
+    Raises:
+        CompleteSplatError: an override cannot be read, or names no option.
+    """
+    arguments = for_hydra(verb, overrides)
+    with nearest_names(verb, arguments):
+        config = _composed(verb, arguments)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def _composed(verb: str, overrides: Sequence[str] = ()) -> DictConfig:
+    use_working_folder()
+    with initialize_config_dir(str(conf_folder()), version_base="1.3"):
+        return compose_by_hydra(verb, overrides=list(overrides))
+
+
+def resolved_settings(config: DictConfig) -> dict[str, object]:
+    """Return a config as a plain mapping without references."""
+    return cast(dict[str, object], OmegaConf.to_container(config, resolve=True))
+
+
+@contextmanager
+def nearest_names(verb: str, arguments: Sequence[str]) -> Iterator[None]:
+    """Raise CompleteSplatError with the nearest names in place of Hydra's error about an unknown name."""
+    try:
+        yield
+    except (HydraException, ValueError) as error:
+        if (message := _misspelt(error, verb, arguments)) is None:
+            raise
+        raise CompleteSplatError(message) from error
+
+
+def _misspelt(error: Exception, verb: str, arguments: Sequence[str]) -> str | None:
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, option = error.missing_cfg_file.strip("/").rpartition("/")
+        known = [name for name in error.options or () if not name.startswith("_")]
+        kind = f"task of completesplat {verb}" if group == f"{verb}_task" else group
+        return f"no {kind} {option!r}: there are {', '.join(known)}{did_you_mean(option, known)}"
+    if str(error).startswith("Config group override must be"):
+        empty = [text.partition("=")[0] for text in arguments if text.endswith("=null") and options(text[:-5])]
+        return f"{empty[0]}=null: choose one of {', '.join(options(empty[0]))}" if empty else None
+    if not isinstance(error, HydraException) or (unknown := NOT_THERE.match(str(error))) is None:
+        return None
+    key = unknown[1]
+    settings = [text for text in arguments if not text.startswith("-") and text.lstrip("+~").partition("=")[0] != key]
+    try:
+        config = _composed(verb, settings)
+    except Exception:  # another argument is wrong, too
+        config = _composed(verb)
+    names = set(_keys(config))
+    nearest = did_you_mean(key, {name for name in names if name.count(".") == key.count(".")})
+    hint = f"; completesplat {verb} --help shows those that there are, and +{key}=VALUE adds one"
+    return f"no setting {key!r} of completesplat {verb}{nearest or did_you_mean(key, names) or hint}"
+
+
+def _keys(config: DictConfig, place: str = "") -> Iterator[str]:
+    """Yield all keys of a config with their places, without following references."""
+    for name in map(str, config):
+        yield f"{place}{name}"
+        followed = OmegaConf.is_missing(config, name) or OmegaConf.is_interpolation(config, name)
+        if not followed and isinstance(config[name], DictConfig):
+            yield from _keys(config[name], f"{place}{name}.")
+
+
+def sweep_arguments(verb: str, arguments: Sequence[str]) -> list[str]:
+    """Return arguments to add for a sweep: its directory, and in it one for each job, named by the swept settings."""
+    keys = [override.split("=")[0] for override in arguments]
+    added = [] if "out" in keys else [f"out=outputs/{verb}/{RUN_NAME}"]
+    if verb == "fit" and "ckpt_path" not in keys:
+        added.append("ckpt_path=last")
+    swept = swept_keys(arguments)
+    if swept and "hydra.sweep.subdir" not in keys:
+        added.append(f"hydra.sweep.subdir=${{job_name:{','.join(swept)}}}")
+    return added
+
+
+def swept_keys(arguments: Sequence[str]) -> list[str]:
+    """Return the keys to which a command line gives several values (`seed=0,1`, `ablation=glob(*)`), in its order."""
+    overrides = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    return [override.key_or_group for override in parsed if override.is_sweep_override()]
+
+
+def job_name(*keys: str, _root_: DictConfig) -> str:
+    """Return the directory name for the job that Hydra is about to start: `ablation-no_skips+seed-0`.
+
+    It has no equals signs and commas, so that paths into the directory need no quotes in Hydra's overrides.
+    """
+    values = dict(override.lstrip("+~").split("=", 1) for override in _root_.hydra.overrides.task if "=" in override)
+    full = "+".join(f"{key}-{values[key]}" for key in keys if key in values)
+    name = re.sub(r"[^\w.+-]+", "_", full)
+    if name == full and len(name) <= LONGEST_NAME:
+        return name
+    return f"{name[:LONGEST_NAME]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
+
+
+def best_precision() -> str:
+    """Return Lightning's precision for networks: bfloat16 where the GPU, or else the CPU, supports it, or float32."""
+    import torch
+
+    on_gpu = torch.cuda.is_available()
+    supported = torch.cuda.is_bf16_supported() if on_gpu else torch.cpu._is_avx512_bf16_supported()
+    return "bf16-mixed" if supported else "32-true"
+
+
+# Resolvers used in `conf/`. Jobs that a cluster starts import this module, too.
+OmegaConf.register_new_resolver("run_name", lambda: RUN_NAME, replace=True)
+OmegaConf.register_new_resolver("best_precision", best_precision, replace=True)
+OmegaConf.register_new_resolver("job_name", job_name, replace=True)

@@ -1,0 +1,454 @@
+"""Captures of bright blobs, drawn where an independent lens model puts known points."""
+
+import json
+import logging
+import sys
+from collections.abc import Callable
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from completesplat.data.captures.capture import CapturedFrame
+from completesplat.data.captures.colmap import read_colmap
+from completesplat.data.captures.module import CaptureDataModule, members
+from completesplat.data.captures.transforms_json import read_photographs, read_transforms
+from completesplat.data.validation import (
+    BadAnnotation,
+    BadCamera,
+    BadImage,
+    MissingFile,
+    OutsidePath,
+    TooFewFrames,
+    UnreadableFile,
+)
+from completesplat.errors import CompleteSplatError, DataError
+from completesplat.geometry.cameras import project
+
+pycolmap = pytest.importorskip("pycolmap")
+
+POINTS = np.random.default_rng(7).uniform(-1, 1, (14, 3)) * [1.4, 0.9, 1.2]
+FRAMES, WIDTH, HEIGHT = 8, 210, 150
+BLOB = 1.8  # standard deviation in pixels
+WINDOW = 7
+SQUARE = 132  # side of the largest square around the principal point
+PINHOLE = {"fl_x": 190.0, "fl_y": 205.0, "cx": 112.5, "cy": 66.0, "w": WIDTH, "h": HEIGHT}
+BARREL = {"k1": -0.18, "k2": 0.04, "p1": 0.002, "p2": -0.003}
+PINCUSHION = {"k1": 0.12, "k2": 0.02, "k3": 0.01, "p1": -0.002, "p2": 0.001}
+MODELS = {
+    "SIMPLE_PINHOLE": [200, 112.5, 66],
+    "PINHOLE": [190, 205, 112.5, 66],
+    "SIMPLE_RADIAL": [200, 100, 80, -0.15],
+    "RADIAL": [200, 112.5, 66, 0.1, 0.03],
+    "OPENCV": [190, 205, 112.5, 66, *BARREL.values()],
+}
+Change = Callable[[dict], object]
+
+
+def opengl_poses() -> np.ndarray:
+    """Camera-to-world, +x right, +y up, +z backward, on a rising arc around the origin."""
+    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
+    for pose, angle in zip(poses, np.linspace(0.3, 4.0, FRAMES), strict=True):
+        eye = np.array([4.2 * np.sin(angle), 0.6 + 0.2 * angle, 4.2 * np.cos(angle)])
+        back = eye / np.linalg.norm(eye)
+        right = np.cross([0.1, 1, 0], back)
+        right /= np.linalg.norm(right)
+        pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    return poses
+
+
+def local_points(pose: np.ndarray) -> np.ndarray:
+    """The points in OpenCV's axes of an OpenGL camera."""
+    return (POINTS - pose[:3, 3]) @ pose[:3, :3] * [1, -1, -1]
+
+
+def distorted_pixels(pose: np.ndarray, lens: dict[str, float]) -> np.ndarray:
+    """Where a camera sees the points, by OpenCV's model, written down anew."""
+    k1, k2, k3, p1, p2 = (lens.get(key, 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
+    x, y = (local_points(pose)[:, :2] / local_points(pose)[:, 2:]).T
+    square = x**2 + y**2
+    radial = 1 + k1 * square + k2 * square**2 + k3 * square**3
+    u = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x**2)
+    v = y * radial + p1 * (square + 2 * y**2) + 2 * p2 * x * y
+    return np.stack([lens["fl_x"] * u + lens["cx"], lens["fl_y"] * v + lens["cy"]], axis=1)
+
+
+def draw(pixels: np.ndarray) -> Image.Image:
+    """Blobs on black; the centre of the first pixel is (0.5, 0.5)."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    blobs = [np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * BLOB**2)) for u, v in pixels]
+    grey = np.round(230 * np.clip(np.sum(blobs, axis=0), 0, 1)).astype(np.uint8)
+    return Image.fromarray(np.repeat(grey[..., None], 3, axis=2))
+
+
+def write_transforms(folder: Path, suffix: str = ".png", change: Change | None = None, **lens: float) -> Path:
+    """A capture in `folder`, and the path of its transforms.json, whose content `change` edits."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for number, pose in enumerate(opengl_poses()):
+        name = f"images/r_{number}{suffix}"
+        draw(distorted_pixels(pose, PINHOLE | lens)).save(folder / name, quality=97, subsampling=0)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    content = {**PINHOLE, **lens, "frames": frames}
+    if change is not None:
+        change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder / "transforms.json"
+
+
+def write_model(folder: Path, model: str, binary: bool = True) -> Path:
+    """A capture with images drawn by COLMAP's own lens model and a model written by COLMAP; returns its folder."""
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, model, 200.0, WIDTH, HEIGHT)
+    camera.params = MODELS.get(model, camera.params)
+    reconstruction.add_camera_with_trivial_rig(camera)
+    (folder / "images/left").mkdir(parents=True)
+    for number, pose in enumerate(opengl_poses(), start=1):
+        matrix = np.linalg.inv(pose @ np.diag([1, -1, -1, 1]))
+        image = pycolmap.Image()
+        image.name, image.camera_id, image.image_id = f"left/{number}.png", 1, number
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D([1.0, 2.0])] * number)
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(matrix[:3, :3]), matrix[:3, 3])
+        reconstruction.add_image_with_trivial_frame(image, rigid)
+        draw(camera.img_from_cam(local_points(pose))).save(folder / "images" / image.name)
+    for number, point in enumerate(POINTS, start=1):
+        track = pycolmap.Track()
+        if number <= FRAMES:
+            track.add_element(number, 0)
+        reconstruction.add_point3D(point, track, np.array([10, 20, 30], dtype=np.uint8))
+    (folder / "sparse/0").mkdir(parents=True)
+    (reconstruction.write_binary if binary else reconstruction.write_text)(str(folder / "sparse/0"))
+    return folder / "sparse/0"
+
+
+def reprojection_errors(folder: Path, kind: str = "image", size: int = SQUARE) -> np.ndarray:
+    """Distances in pixels between projections by the cameras and the blobs in the images or masks, in both splits."""
+    data, errors, eyes = CaptureDataModule(str(folder), image_size=size), [], opengl_poses()[:, :3, 3]
+    for split, frames in {"train": (1, 2, 3, 5, 6, 7), "test": (0, 4)}.items():
+        (name,) = data.source(split).names
+        sequence = data.source(split).read(name)
+        assert sequence.frames == frames
+        factor = sequence.cameras.centers[0].norm().item() / np.linalg.norm(eyes[frames[0]])
+        for index in range(len(frames)):
+            projected = project(sequence.cameras[index], torch.from_numpy(factor * POINTS))[0].numpy()
+            pixels = getattr(sequence.read(index), kind)[0].numpy().astype(float)
+            for number, (u, v) in enumerate(projected):
+                distances = np.abs(np.delete(projected, number, axis=0) - [u, v]).max(axis=1)
+                if not (10 < u < size - 10 and 10 < v < size - 10) or distances.min() < 2 * WINDOW:
+                    continue
+                left, top = int(u) - WINDOW, int(v) - WINDOW
+                window = pixels[top : top + 2 * WINDOW + 1, left : left + 2 * WINDOW + 1]
+                assert window.sum() > 1000  # there is a blob
+                rows, columns = np.mgrid[: window.shape[0], : window.shape[1]] + 0.5
+                blob = np.array([(window * columns).sum(), (window * rows).sum()]) / window.sum() + [left, top]
+                errors.append(np.linalg.norm(blob - [u, v]))
+    assert len(errors) > 20
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(
+    ("lens", "suffix"), [({}, ".jpg"), (BARREL, ".png"), (PINCUSHION, ".png")], ids=["pinhole", "barrel", "pincushion"]
+)
+def test_known_points_are_where_the_cameras_of_transforms_see_them(tmp_path, lens, suffix):
+    write_transforms(tmp_path, suffix, **lens)
+    assert reprojection_errors(tmp_path).max() < 0.1
+    sequence = CaptureDataModule(str(tmp_path)).source("train").read(tmp_path.name)
+    assert (sequence.read(2).mask == 255).all()  # Without masks, everything is foreground.
+
+
+@pytest.mark.parametrize(("model", "binary"), [*((model, True) for model in MODELS), ("OPENCV", False)])
+def test_known_points_are_where_the_cameras_of_a_colmap_model_see_them(tmp_path, model, binary):
+    folder = write_model(tmp_path, model, binary)
+    assert reprojection_errors(tmp_path).max() < 0.1
+    points = read_colmap(folder, tmp_path / "images").points
+    order, expected = np.lexsort(points.T), np.lexsort(POINTS.T)
+    np.testing.assert_allclose(points[order], POINTS[expected], atol=1e-12)
+
+
+def test_the_object_fills_its_half_size_and_stray_points_are_left_out(tmp_path):
+    def add_points(content):
+        rows = [*POINTS.tolist(), [900.0, 0.0, 0.0]]
+        header = "ply\nformat ascii 1.0\nelement vertex 15\n" + "".join(f"property float {a}\n" for a in "xyz")
+        text = "\n".join(" ".join(map(str, row)) for row in rows)
+        (tmp_path / "sparse.ply").write_text(f"{header}end_header\n{text}\n")
+        content.update(ply_file_path="sparse.ply")
+
+    write_transforms(tmp_path, change=add_points)
+    sequence = CaptureDataModule(str(tmp_path / "transforms.json")).source("train").read("transforms.json")
+    factor = sequence.cameras.centers[0].norm().item() / np.linalg.norm(opengl_poses()[1, :3, 3])
+    extent = np.abs(POINTS - POINTS.mean(axis=0)).max()
+    assert factor == pytest.approx(0.57 / extent, rel=0.3)  # Its axes are turned.
+
+
+def test_the_field_of_view_gives_the_same_cameras_as_the_focal_length(tmp_path, caplog):
+    def only_the_angle(content):
+        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+            del content[key]
+        content["camera_angle_x"] = 2 * float(np.arctan(105 / 190))
+        for frame in content["frames"]:
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+
+    centred = {"fl_y": 190.0, "cx": 105.0, "cy": 75.0}
+    given, angle = write_transforms(tmp_path / "a", **centred), write_transforms(tmp_path / "b", change=only_the_angle)
+    with caplog.at_level(logging.WARNING):
+        pairs = zip(*(read_transforms(path).frames for path in (given, angle)), strict=True)
+    assert caplog.text == ""
+    for one, other in pairs:
+        assert one.lens.focal == pytest.approx(other.lens.focal)
+        assert (one.lens.center, one.lens.image_size) == (other.lens.center, other.lens.image_size)
+        np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
+
+
+def first_frame(path: Path) -> CapturedFrame:
+    return read_transforms(path).frames[0]
+
+
+def test_intrinsics_of_a_frame_go_before_those_of_the_file(tmp_path):
+    path = write_transforms(tmp_path, change=lambda content: content["frames"][3].update(fl_x=250.0))
+    assert [frame.lens.focal[0] for frame in read_transforms(path).frames] == [190] * 3 + [250] + [190] * 4
+
+
+def test_a_pincushion_shows_only_what_was_seen(tmp_path):
+    path = write_transforms(tmp_path, k1=0.15)
+    framed = np.full((HEIGHT, WIDTH, 3), 255, dtype=np.uint8)
+    framed[:2], framed[-2:], framed[:, :2], framed[:, -2:] = 60, 60, 60, 60
+    Image.fromarray(framed).save(tmp_path / "images/r_0.png")
+    undistorted = np.asarray(first_frame(path).read()[0])
+    assert undistorted.shape[:2] == first_frame(path).camera().image_size
+    assert undistorted.min() >= 60  # no blank pixels
+    assert undistorted.shape[0] < HEIGHT
+    assert undistorted.shape[1] < WIDTH
+
+
+def test_alpha_becomes_the_mask_over_white(tmp_path):
+    path = write_transforms(tmp_path)
+    pixels = np.zeros((HEIGHT, WIDTH, 4), dtype=np.uint8)
+    pixels[..., 0] = 100
+    pixels[:, :70, 3], pixels[:, 70:140, 3] = 255, 102
+    Image.fromarray(pixels).save(tmp_path / "images/r_0.png")
+    image, mask = map(np.asarray, first_frame(path).read())
+    np.testing.assert_array_equal(mask, pixels[..., 3])
+    # 0.4 of (100, 0, 0) and 0.6 of white.
+    assert [image[9, x].tolist() for x in (10, 100, 200)] == [[100, 0, 0], [193, 153, 153], [255, 255, 255]]
+
+
+@pytest.mark.parametrize("k1", [-0.1, 0.0])
+def test_masks_are_undistorted_like_their_images_and_nothing_is_mirrored(tmp_path, k1):
+    def name_masks(content):
+        (tmp_path / "masks").mkdir()
+        for number, frame in enumerate(content["frames"]):
+            frame["mask_path"] = f"masks/m_{number}.png"
+            Image.open(tmp_path / f"images/r_{number}.png").convert("L").save(tmp_path / frame["mask_path"])
+
+    path = write_transforms(tmp_path, change=name_masks, k1=k1)
+    assert reprojection_errors(tmp_path, "mask").max() < 0.1
+    quarters = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    quarters[:75, :105], quarters[:75, 105:], quarters[75:, :105] = (200, 0, 0), (0, 200, 0), (0, 0, 200)
+    Image.fromarray(quarters).save(tmp_path / "images/r_0.png")
+    image = np.asarray(first_frame(path).read()[0])
+    rows, columns = ([side // 4, side * 3 // 4] for side in image.shape[:2])
+    assert image[rows][:, columns].tolist() == [[[200, 0, 0], [0, 200, 0]], [[0, 0, 200], [0, 0, 0]]]
+
+
+@pytest.mark.parametrize("name", ["{}.png.png", "{}.png"])
+def test_masks_of_a_colmap_model_have_the_names_of_their_images(tmp_path, name):
+    model = write_model(tmp_path, "PINHOLE")
+    (tmp_path / "masks/left").mkdir(parents=True)
+    for number in range(1, 9):
+        Image.new("L", (WIDTH, HEIGHT), 20 * number).save(tmp_path / "masks/left" / name.format(number))
+    sequence = CaptureDataModule(str(tmp_path)).source("train").read(tmp_path.name)
+    assert [int(sequence.read(index).mask[0, 3, 4]) for index in range(6)] == [40, 60, 80, 120, 140, 160]
+    for path in (tmp_path / "masks/left").iterdir():
+        path.unlink()
+    with pytest.raises(DataError, match=r"left/1\.png\.png, frame 1: no such file, nor 1\.png"):
+        read_colmap(model, tmp_path / "images", tmp_path / "masks")
+
+
+def test_frames_without_an_image_are_named_and_left_out_up_to_a_share(tmp_path, caplog):
+    path = write_transforms(tmp_path)
+    for number in (2, 5):
+        (tmp_path / f"images/r_{number}.png").unlink()
+    with pytest.raises(MissingFile, match=r"transforms\.json: 2 of 8 frames .* most_missing=0\.24"):
+        read_transforms(path, most_missing=0.24)
+    frames = read_transforms(path, most_missing=0.25).frames
+    named = "images/r_2.png, images/r_5.png"
+    assert f"{path}: 2 of 8 frames have no image and are left out: {named}" in caplog.text
+    centers = [np.linalg.inv(frame.world_to_camera)[:3, 3] for frame in frames]
+    np.testing.assert_allclose(centers, opengl_poses()[[0, 1, 3, 4, 6, 7], :3, 3], atol=1e-9)
+
+
+def test_every_eighth_frame_is_held_out_and_two_at_least_are_on_either_side():
+    assert members(8, True, 40) == [0, 8, 16, 24, 32]
+    for frames, hold_out in product(range(6, 40), (2, 3, 8, 1000)):
+        training, held_out = members(hold_out, False, frames), members(hold_out, True, frames)
+        assert sorted(training + held_out) == list(range(frames))
+        assert min(len(training), len(held_out)) >= 2
+
+
+def test_frames_stand_in_the_order_of_the_numbers_in_their_names(tmp_path):
+    def rename(content):
+        (tmp_path / "images/r_3.png").rename(tmp_path / "images/r_10.png")
+        content["frames"][3].update(file_path="images/r_10.png")
+        content["frames"].reverse()
+
+    frames = read_transforms(write_transforms(tmp_path, change=rename)).frames
+    assert [frame.image.name for frame in frames] == [f"r_{number}.png" for number in (0, 1, 2, 4, 5, 6, 7, 10)]
+
+
+def test_captures_in_folders_are_sequences_and_broken_ones_are_counted(tmp_path):
+    for name in ("kitchen table", "b", "c"):
+        path = write_transforms(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    path.write_text("{}")
+    data = CaptureDataModule(str(tmp_path), batch_size=2)
+    source = data.source("train")
+    assert (source.names, source.listed) == (["b", "kitchen table"], 3)
+    assert [(error.file, error.sequence) for error in source.refused] == [(str(path), "c")]
+    data.setup("fit")
+    fingerprint = source.fingerprint()
+    (tmp_path / "b/transforms.json").unlink()
+    other = CaptureDataModule(str(tmp_path)).source("train")
+    assert other.names == ["kitchen table"]
+    assert other.fingerprint() != fingerprint
+    with pytest.raises(BadAnnotation, match=r"c/transforms\.json, c: no frames"):
+        CaptureDataModule(str(tmp_path / "c")).source("train")
+    with pytest.raises(MissingFile, match="empty: no capture there"):
+        CaptureDataModule(str(tmp_path / "empty")).source("train")
+
+
+def test_photographs_have_the_cameras_of_their_squares(tmp_path):
+    numbers = [2, 0, 5]
+    for lens in ({}, {"k1": -0.1}):
+        folder = tmp_path / f"{len(lens)}"
+        path = write_transforms(folder, **lens)
+        views = read_photographs([folder / f"images/r_{n}.png" for n in numbers], path, 75)
+        poses = opengl_poses()[numbers]
+        assert views.cameras.world_to_camera[0].allclose(torch.eye(4), atol=1e-5)
+        projected = project(views.cameras, torch.from_numpy(local_points(poses[0])).float())[0].numpy()
+        for image, pixels, pose in zip(views.images, projected, poses, strict=True):
+            if not lens:
+                expected = (distorted_pixels(pose, PINHOLE) - [(WIDTH - HEIGHT) / 2, 0]) * 75 / HEIGHT
+                np.testing.assert_allclose(pixels, expected, atol=1e-3)
+            inside = pixels[((pixels > 3) & (pixels < 72)).all(1)].astype(int)
+            assert (image[0, inside[:, 1], inside[:, 0]] > 0.5).all()
+    with pytest.raises(CompleteSplatError, match=r"r_0.png: .*transforms.json has no frame with this image"):
+        read_photographs([tmp_path / "0/images/r_0.png"], path, 32)
+
+
+def of_frame(number: int, **values: object) -> Change:
+    return lambda content: content["frames"][number].update(values)
+
+
+def entry_of_pose(row: int, column: int, value: float) -> Change:
+    return lambda content: content["frames"][3]["transform_matrix"][row].__setitem__(column, value)
+
+
+TRANSFORMS = {
+    "no frames": (lambda c: c.pop("frames"), BadAnnotation, r"transforms\.json: no frames"),
+    "five frames": (lambda c: c["frames"].__delitem__(slice(5, None)), TooFewFrames, "5 frames; .* at least 6"),
+    "NaN in a pose": (entry_of_pose(0, 3, float("nan")), BadAnnotation, r"transforms\.json, frame 3: .* not finite"),
+    "a sheared pose": (entry_of_pose(0, 0, 0.3), BadCamera, r"transforms\.json, frame 3: .* not orthonormal"),
+    "a projective pose": (entry_of_pose(3, 0, 0.1), BadCamera, "frame 3: transform_matrix ends in the row"),
+    "an image twice": (of_frame(2, file_path="./images/r_1"), BadAnnotation, "frame 2: the same image as frame 1"),
+    "an image outside": (of_frame(2, file_path="../r_2.png"), OutsidePath, r"json, frame 2: leads outside"),
+    "a missing mask": (of_frame(4, mask_path="m.png"), MissingFile, r"m\.png, frame 4: no such file"),
+    "no focal length": (lambda c: c.pop("fl_x"), BadAnnotation, "frame 0: neither fl_x nor camera_angle_x"),
+    "a negative focal length": (of_frame(1, fl_y=-2.0), BadCamera, "frame 1: .* must be positive"),
+    "half a circle": (lambda c: (c.pop("fl_x"), c.update(camera_angle_x=3.2)), BadCamera, "field of view of 3.2"),
+    "a centre outside": (of_frame(1, cx=210.0), BadCamera, r"frame 1: principal point \(210, 66\) lies outside"),
+    "a fisheye": (lambda c: c.update(camera_model="OPENCV_FISHEYE"), BadCamera, "OPENCV_FISHEYE is not supported"),
+    "instant-ngp's fisheye": (lambda c: c.update(is_fisheye=True), BadCamera, "is_fisheye is not supported"),
+    "a fourth coefficient": (lambda c: c.update(k4=0.1), BadCamera, "k4 = 0.1 has no meaning for camera model OPENCV"),
+    "no point cloud": (lambda c: c.update(ply_file_path="transforms.json"), UnreadableFile, r"json: not a point cloud"),
+}
+
+
+@pytest.mark.parametrize(("change", "kind", "message"), TRANSFORMS.values(), ids=TRANSFORMS)
+def test_a_bad_transforms_file_is_refused(tmp_path, change, kind, message):
+    path = write_transforms(tmp_path, change=change)
+    with pytest.raises(kind, match=message):
+        read_transforms(path)
+
+
+def turn(path: Path) -> None:
+    exif = Image.Exif()
+    exif[274] = 3  # Upside down: the size is the same.
+    Image.open(path).save(path, exif=exif)
+
+
+def flip_a_bit(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 16
+    path.write_bytes(content)
+
+
+IMAGES = {
+    "upside down by EXIF": (turn, r"EXIF orientation 3"),
+    "damaged": (flip_a_bit, "cannot be decoded"),
+    "of another size": (lambda path: Image.new("RGB", (WIDTH, 9)).save(path), "has 9 x 210 pixels"),
+    "of another size, with alpha": (lambda path: Image.new("RGBA", (HEIGHT, WIDTH)).save(path), "has 210 x 150 pixels"),
+}
+
+
+@pytest.mark.parametrize(("damage", "message"), IMAGES.values(), ids=IMAGES)
+def test_a_bad_image_is_refused(tmp_path, damage, message):
+    write_transforms(tmp_path)
+    damage(tmp_path / "images/r_5.png")
+    sequence = CaptureDataModule(str(tmp_path)).source("train").read(tmp_path.name)
+    with pytest.raises(BadImage, match=rf"images/r_5\.png, {tmp_path.name}, frame 5: .*{message}"):
+        sequence.read(3)
+
+
+@pytest.mark.parametrize("k1", [-4.0, -1.0, 4.0, 1e300])
+def test_distortion_that_leaves_no_image_is_refused(tmp_path, k1):
+    write_transforms(tmp_path, change=lambda content: content.update(k1=k1))
+    with pytest.raises(BadCamera, match=r"r_0\.png, .*, frame 0: distortion .* leaves no usable image"):
+        CaptureDataModule(str(tmp_path)).source("train").read(tmp_path.name)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("share", [0.01, 0.99, 1.01])
+def test_cut_and_lengthened_models_are_refused(tmp_path, file, share):
+    model = write_model(tmp_path, "OPENCV")
+    path = model / f"{file}.bin"
+    content = path.read_bytes()
+    path.write_bytes((content + bytes(99))[: int(share * len(content)) + (share > 1)])
+    with pytest.raises(DataError, match=rf"{file}\.bin: cut off"):
+        read_colmap(model, tmp_path / "images")
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_other_models_of_lenses_are_refused(tmp_path, binary):
+    model = write_model(tmp_path, "FULL_OPENCV", binary)
+    with pytest.raises(BadCamera, match=r"cameras\.\w+: camera model .* is not supported"):
+        read_colmap(model, tmp_path / "images")
+
+
+def test_missing_images_and_those_outside_and_what_is_no_model_are_refused(tmp_path):
+    model, images = write_model(tmp_path, "PINHOLE", binary=False), tmp_path / "images"
+    (images / "left/3.png").unlink()
+    with pytest.raises(MissingFile, match=r"left/3\.png, frame 3: no such file"):
+        read_colmap(model, images)
+    text = (model / "images.txt").read_text()
+    (model / "images.txt").write_text(text.replace("left/3.png", "../3.png"))
+    with pytest.raises(OutsidePath, match=r"frame 3: leads outside"):
+        read_colmap(model, images)
+    (model / "images.txt").write_text(text.replace("left/3.png", "left/4.png"))
+    (model / "points3D.txt").write_text("1 2 three\n")
+    with pytest.raises(DataError):
+        read_colmap(model, images)
+    (model / "points3D.txt").unlink()
+    with pytest.raises(MissingFile, match=r"points3D\.txt: no such file"):
+        read_colmap(model, images)
+
+
+def test_pycolmap_is_needed_for_distorted_lenses_only(monkeypatch, tmp_path):
+    write_model(tmp_path / "plain", "PINHOLE")
+    write_transforms(tmp_path / "barrel", **BARREL)
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    CaptureDataModule(str(tmp_path / "plain")).source("train").read("plain").read(0)
+    with pytest.raises(CompleteSplatError, match=r"pip install completesplat\[colmap\]"):
+        CaptureDataModule(str(tmp_path / "barrel")).source("train").read("barrel")
