@@ -1,4 +1,4 @@
-"""What only a GPU can show, step by step into one folder: `make gpu`.
+"""Tests, times and trainings that need a GPU, step by step into one folder: `make gpu`.
 
 A step that is done is not done again. One that fails holds up no other but those that need its files, and is tried
 again the next time. `--small` goes through the same steps at tiny sizes, on any machine.
@@ -66,8 +66,8 @@ def training(out: Path, size: int, small: bool) -> Iterator[Step]:
     stage2 = ["fit", "experiment=toy_views_diffusion", *data, *limit, *(STAGE2 if small else [])]
     trained = f"model.autoreconstructor_checkpoint={out / f'var_{size}/checkpoints/last.ckpt'}"
     yield verb(f"diffusion_{size}", *stage2, trained, needs=f"var_{size}", out=out)
-    given = ["test", f"ckpt={out / f'diffusion_{size}/checkpoints/last.ckpt'}"]
-    yield verb(f"test_{size}", *given, needs=f"diffusion_{size}", out=out)
+    arguments = ["test", f"ckpt={out / f'diffusion_{size}/checkpoints/last.ckpt'}"]
+    yield verb(f"test_{size}", *arguments, needs=f"diffusion_{size}", out=out)
 
 
 def done(step: Step, out: Path) -> bool:
@@ -80,8 +80,8 @@ def done(step: Step, out: Path) -> bool:
         )
     if process.returncode == 0:
         failed.replace(log)
-    said = f"done, {log}" if process.returncode == 0 else f"status {process.returncode}, {failed}"
-    print(f"{step.name}: {said} ({time.monotonic() - begun:.0f} s)", flush=True)
+    result = f"done, {log}" if process.returncode == 0 else f"status {process.returncode}, {failed}"
+    print(f"{step.name}: {result} ({time.monotonic() - begun:.0f} s)", flush=True)
     return process.returncode == 0
 
 
@@ -105,8 +105,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--small", action="store_true", help="tiny sizes, on any machine")
     parser.add_argument("--out", type=Path, help="folder; default: outputs/gpu, or outputs/gpu_small")
-    given = parser.parse_args()
-    lacking = run(given.out or Path("outputs/gpu_small" if given.small else "outputs/gpu"), given.small)
+    options = parser.parse_args()
+    lacking = run(options.out or Path("outputs/gpu_small" if options.small else "outputs/gpu"), options.small)
     sys.exit(f"not done: {', '.join(lacking)}" if lacking else 0)
 
 

@@ -1,4 +1,4 @@
-"""Random scenes on which rasterizers are compared, and what it takes to compare them."""
+"""Random scenes on which rasterizers are compared, and the comparison."""
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ def draw_scene(generator: torch.Generator, batch: int, views: int, size: tuple[i
 
 
 def keeps_clear_of_the_steps(gaussians: Gaussians, cameras: Cameras, constants: RenderingConstants) -> bool:
-    """Whether no decision (thresholds, stop, order, culling) is so close that float32 could decide otherwise."""
+    """Return whether no decision (thresholds, stop, order, culling) is so close that float32 could decide otherwise."""
     for b in range(gaussians.means.shape[0]):
         for v in range(cameras.intrinsics.shape[1]):
             scene, camera = gaussians[b].to(torch.float64), cameras[b, v].to(torch.float64)
@@ -115,7 +115,7 @@ def assert_agrees(
     rasterizer: Rasterizer, constants: RenderingConstants, gaussians: Gaussians, cameras: Cameras, seed: int,
     image: float = 1e-5, gradient: float = 1e-4, of: tuple[str, ...] | None = None,
 ) -> None:  # fmt: skip
-    """With the float64 reference, under random cotangents.
+    """Compare with the float64 reference, under random cotangents.
 
     Args:
         image: largest error of the images, absolute, and of each image as a whole, relative in L2.
@@ -123,12 +123,12 @@ def assert_agrees(
         of: the inputs whose gradients are compared; by default all, cameras included.
     """
     cotangents = cotangents_for(cameras, seed)
-    found, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents)
+    rendering, gradients = render_with_gradients(rasterizer, gaussians, cameras, cotangents)
     doubles = [tensor.double() for tensor in cotangents]
     gaussians, cameras = gaussians.to(torch.float64), cameras.to(torch.float64)
     exact, exact_gradients = render_with_gradients(ReferenceRasterizer(constants), gaussians, cameras, doubles)
     for name, expected in vars(exact).items():
-        difference = getattr(found, name) - expected
+        difference = getattr(rendering, name) - expected
         assert difference.abs().max() <= image, name
         assert difference.norm() <= image * expected.norm(), name
     for name in of or exact_gradients:

@@ -31,7 +31,7 @@ LATENTS_ONLY = {"gaussians", "splatter_image", "rasterizers"}
 DATASETS = ("co3d", "realestate", "toy", "hydrant", "teddybear")
 LONGEST_FILE, LONGEST_FUNCTION, MOST_FILES, MOST_LINES = 400, 50, 200, 31_200
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal"}
-FOR_OWN_CHILDREN = {("data/processes.py", "pickle")}  # what multiprocessing does with every argument
+FOR_OWN_CHILDREN = {("data/validation/processes.py", "pickle")}  # what multiprocessing does with every argument
 FORBIDDEN_CALLS = {"eval", "exec", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "os.system", "os.popen"}
 
 

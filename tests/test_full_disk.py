@@ -18,9 +18,9 @@ from PIL import Image
 from support import SMALL, some_gaussians, tiny_generator
 
 from completesplat.commands import exit_status, refusal
-from completesplat.data.audit import Findings
 from completesplat.data.images.files import save_image
 from completesplat.data.toy import write_objects, write_rooms
+from completesplat.data.validation.audit import Findings
 from completesplat.errors import DiskError
 from completesplat.export.formats import write_splat
 from completesplat.export.images import write_png

@@ -1,4 +1,4 @@
-"""What the viewer's tests show: four balls of known colours, and a page without a browser."""
+"""Scene of the viewer's tests: four balls of known colours."""
 
 import torch
 

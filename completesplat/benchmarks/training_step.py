@@ -1,19 +1,17 @@
 """Optimizer steps of both stages, and the rasterizer's share of a step of the reconstruction model."""
 
 import statistics
-import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import torch
 from hydra.utils import instantiate
 from torch import Tensor
 
-from completesplat.benchmarks.measuring import Row
-from completesplat.benchmarks.workloads import DISTANCE, Backend, orbit
+from completesplat.benchmarks.measuring import Row, milliseconds
+from completesplat.benchmarks.workloads import DISTANCE, Backend, orbit, rendering_milliseconds
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras
-from completesplat.rasterizers import Rasterizer, Rendering
+from completesplat.rasterizers import Rendering
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.training.stage import Stage
 
@@ -51,45 +49,10 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=precision.startswith("bf16"))
 
 
-class StopWatch:
-    """A rasterizer that sums the time of its forward and backward passes."""
-
-    def __init__(self, rasterizer: Rasterizer) -> None:
-        self.rasterizer = rasterizer
-        self.seconds = 0.0
-
-    def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
-        """Render with the rasterizer."""
-        gaussians = Gaussians(*_OnBackward.apply(self._stop, *vars(gaussians).values()))  # type: ignore[no-untyped-call]
-        self._start()
-        rendering = self.rasterizer(gaussians, cameras)
-        self._stop()
-        return Rendering(*_OnBackward.apply(self._start, *vars(rendering).values()))  # type: ignore[no-untyped-call]
-
-    def _start(self) -> None:
-        self.seconds -= time.perf_counter()
-
-    def _stop(self) -> None:
-        self.seconds += time.perf_counter()
-
-
-class _OnBackward(torch.autograd.Function):
-    """Identity that calls a function when the tensors' gradients pass in the backward pass."""
-
-    @staticmethod
-    def forward(ctx: Any, function: Callable[[], None], *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.function = function
-        ctx.set_materialize_grads(False)  # zeros for missing gradients would be extra work for the rasterizer
-        return tuple(tensor.view_as(tensor) for tensor in tensors)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        ctx.function()
-        return None, *gradients
-
-
 def share(backend: Backend, model: Mapping[str, object], size: int, batch: int, targets: int, precision: str) -> Row:
     """Return medians over optimizer steps on one synthetic batch, on the CPU.
+
+    The rasterizer's part is the time of both its passes for the Gaussians and cameras of the last step.
 
     Args:
         model: config of the module, without its rasterizer.
@@ -97,23 +60,26 @@ def share(backend: Backend, model: Mapping[str, object], size: int, batch: int, 
         batch, targets: number of scenes in a batch, and of target views of each.
         precision: precision in Lightning's notation.
     """
-    watch, scenes = StopWatch(backend.rasterizer), synthetic_batch(size, batch, targets)
-    training = Training(instantiate(model, rasterizer=watch, _convert_="all"), precision)
+    inputs: list[tuple[Gaussians, Cameras]] = []
+
+    def rasterizer(gaussians: Gaussians, cameras: Cameras) -> Rendering:
+        inputs[:] = [(gaussians, cameras)]
+        return backend.rasterizer(gaussians, cameras)
+
+    scenes = synthetic_batch(size, batch, targets)
+    training = Training(instantiate(model, rasterizer=rasterizer, _convert_="all"), precision)
     untimed, timed = SLOW.get(backend.name, (UNTIMED_STEPS, TIMED_STEPS))
-    steps, inside = [], []
-    for _ in range(untimed + timed):
-        watch.seconds, start = 0.0, time.perf_counter()
-        training.step(scenes)
-        steps.append(time.perf_counter() - start)
-        inside.append(watch.seconds)
+    steps = [milliseconds(lambda: training.step(scenes), torch.device("cpu")) for _ in range(untimed + timed)]
+    step = statistics.median(steps[untimed:])
+    rendering = statistics.median(rendering_milliseconds(backend.rasterizer, *inputs[0])[1] for _ in range(timed))
     return {
         "backend": backend.name,
         "size": size,
         "batch": batch,
         "views": 1 + targets,
-        "step_ms": statistics.median(steps[untimed:]) * 1e3,
-        "rasterizer_ms": statistics.median(inside[untimed:]) * 1e3,
-        "share": statistics.median(a / b for a, b in zip(inside[untimed:], steps[untimed:], strict=True)),
+        "step_ms": step,
+        "rasterizer_ms": rendering,
+        "share": rendering / step,
     }
 
 

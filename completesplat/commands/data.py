@@ -5,14 +5,11 @@ import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_text
 from completesplat.settings.schema import Entries, Positive, Range
-
-if TYPE_CHECKING:
-    from completesplat.data.sequences import PosedSequence, SequenceSource
 
 logger = logging.getLogger(__name__)
 
@@ -20,23 +17,36 @@ Split = Literal["train", "val", "test"]
 Splits = Annotated[Sequence[Split], Entries(1)]
 
 
-def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
+@runtime_checkable
+class DataModule(Protocol):
+    """Parts of `SceneDataModule`, which takes seconds to import."""
+
+    root: Path
+    policy: tuple[str, float]
+
+    def prepare_data(self) -> None: ...
+
+    def source(self, split: str) -> Any: ...
+
+    def packed_settings(self) -> dict[str, str | int | float | bool | None]: ...
+
+
+def check(data: DataModule, splits: Splits, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
-    from completesplat.data.audit import Findings, show
-    from completesplat.data.audit import check as check_sources
+    from completesplat.data.validation import audit
 
     try:
-        findings = check_sources(_sources(data, splits), workers)
+        findings = audit.check(_sources(data, splits), workers)
     except DataError as error:  # concerns the data set as a whole
-        findings = Findings(0, 0, [error], {}, {})
+        findings = audit.Findings(0, 0, [error], {}, {})
     findings.write(out / "check.json")
-    show(findings)
+    audit.show(findings)
     if not findings.sequences:
         print(out)
         sys.exit(1)
 
 
-def stats(data: Any, splits: Splits, out: Path) -> None:
+def stats(data: DataModule, splits: Splits, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
@@ -50,7 +60,7 @@ def stats(data: Any, splits: Splits, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
+def show(data: DataModule, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
     """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
@@ -64,7 +74,7 @@ def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures:
 
 
 def prepare(
-    data: Any,
+    data: DataModule,
     splits: Splits,
     out: Path,
     codec: str,
@@ -73,14 +83,13 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write packed data into `out`; see `completesplat.data.packed.writing.prepare`."""
-    from completesplat.data.packed.manifest import is_packed
-    from completesplat.data.packed.writing import prepare as prepare_sources
+    """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
+    from completesplat.data.packed import manifest, writing
 
-    if is_packed(data.root):
+    if manifest.is_packed(data.root):
         raise CompleteSplatError(f"{data.root} is prepared already")
-    sources, bad = _sources(data, splits), (on_bad, max_bad_fraction)
-    prepare_sources(sources, data.packed_settings(), out, codec, sequences_per_shard, workers, *bad)
+    sources, settings = _sources(data, splits), data.packed_settings()
+    writing.prepare(sources, settings, out, codec, sequences_per_shard, workers, on_bad, max_bad_fraction)
 
 
 def latents(
@@ -122,7 +131,7 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: Any, splits: Sequence[str]) -> "dict[str, SequenceSource]":
+def _sources(data: DataModule, splits: Sequence[str]) -> dict[str, Any]:
     """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()
@@ -139,7 +148,7 @@ def _sources(data: Any, splits: Sequence[str]) -> "dict[str, SequenceSource]":
     return sources
 
 
-def _readable(source: "SequenceSource", names: Iterable[str]) -> "Iterator[PosedSequence]":
+def _readable(source: Any, names: Iterable[str]) -> Iterator[Any]:
     for name in names:
         try:
             yield source.read(name)

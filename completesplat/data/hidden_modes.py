@@ -1,7 +1,7 @@
 """Scenes with known hidden parts: all alternatives for what the reference image hides, with their probabilities."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -58,7 +58,7 @@ class KnowsHiddenModes(Protocol):
         """Return all test scenes, each with up to `views` views that show the modes best and evenly spread targets."""
 
 
-def hidden_modes(data: Any, views: int, spread_views: int) -> HiddenModeScenes:
+def hidden_modes(data: object, views: int, spread_views: int) -> HiddenModeScenes:
     """Return `data.hidden_modes(views, spread_views)`, after a check that the data module has this method."""
     if not isinstance(data, KnowsHiddenModes):
         raise CompleteSplatError("evaluation=hidden_modes needs data whose hidden parts are known: toy objects")

@@ -120,8 +120,8 @@ def _magnification(cameras: Cameras, constants: RenderingConstants) -> Float[Ten
     return (focal * (1 + slope.square()).sqrt()).amax(-1)
 
 
-def prepare(gaussians: Gaussians, kept: Bool[Tensor, "batch gaussian"]) -> Gaussians:
-    """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those that are not kept.
+def prepare(gaussians: Gaussians, mask: Bool[Tensor, "batch gaussian"]) -> Gaussians:
+    """Return Gaussians that are safe for gsplat: unit quaternions, and zeros for those outside of the mask.
 
     Zero opacity keeps a Gaussian out of the image; zeros for its other values keep NaN out of the gradients. The
     number of Gaussians is padded to a multiple of 32, at least 32, for two reasons. gsplat fails without Gaussians (a
@@ -131,8 +131,8 @@ def prepare(gaussians: Gaussians, kept: Bool[Tensor, "batch gaussian"]) -> Gauss
     missing = max(WARP - gaussians.count, -gaussians.count % WARP)
 
     def clean(tensor: Tensor) -> Tensor:
-        values = torch.where(kept.reshape(*kept.shape, *[1] * (tensor.ndim - kept.ndim)), tensor, 0.0)
-        return pad(values, (*[0, 0] * (tensor.ndim - kept.ndim), 0, missing))
+        values = torch.where(mask.reshape(*mask.shape, *[1] * (tensor.ndim - mask.ndim)), tensor, 0.0)
+        return pad(values, (*[0, 0] * (tensor.ndim - mask.ndim), 0, missing))
 
     cleaned = gaussians.map(clean)
     # Scale components to at most 1 first, because the square of a long quaternion overflows.

@@ -2,10 +2,10 @@
 
 import json
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice, product
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -122,9 +122,8 @@ class Pictures(DrawsFixedScenes):
     """Callback that draws the first target of each scene and figures of its Gaussians; see `DrawsFixedScenes`.
 
     `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/newest/` the scenes themselves
-    (`write_newest`). All loggers get
-    `gaussians/opacity_p10`, `_p50`, `_p90`, the same percentiles of all `distributions`, figures of the layers on the
-    object (`layer_figures`), and the model's `latent_figures`. Weights & Biases gets the images and histograms too.
+    (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`; Weights &
+    Biases also gets the image.
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
@@ -140,7 +139,7 @@ class Pictures(DrawsFixedScenes):
         sheet = image_sheet(list(panels), [list(map(SheetCell, row)) for row in zip(*panels.values(), strict=True)])
         write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
         write_newest(self.folder / "newest", trainer.global_step, gaussians, batch, module.up)
-        figures = percentiles(distributions(gaussians)) | layer_figures(gaussians, batch) | latents
+        figures = gaussian_figures(gaussians) | layer_figures(gaussians, batch) | latents
         log_drawings(trainer, figures, "pictures", sheet)
 
 
@@ -210,20 +209,20 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     return figures
 
 
-def distributions(gaussians: Gaussians) -> dict[str, Float[np.ndarray, " value"]]:
-    """Return opacities, decimal logarithms of all scales, and depths in the reference's frame, in scene units."""
-    values = {
+def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
+    """Return percentiles of opacities, decimal logarithms of all scales, and depths in the reference's frame.
+
+    Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
+    """
+    tensors = {
         "opacity": gaussians.opacities,
         "log10_scale": gaussians.scales.log10(),
         "depth": gaussians.means[..., 2],
     }
-    return {name: value.float().flatten().cpu().numpy() for name, value in values.items()}
-
-
-def percentiles(values: Mapping[str, Float[np.ndarray, " _"]]) -> dict[str, float]:
-    """Return the percentiles of each entry, named `gaussians/NAME_p10` and so on."""
-    pairs = product(values.items(), PERCENTILES)
-    return {f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for (name, array), p in pairs}
+    values = {name: tensor.float().flatten().cpu().numpy() for name, tensor in tensors.items()}
+    return {
+        f"gaussians/{name}_p{p}": float(np.percentile(array, p)) for name, array in values.items() for p in PERCENTILES
+    }
 
 
 def log_drawings(trainer: Trainer, figures: dict[str, float], name: str, image: Image.Image) -> None:

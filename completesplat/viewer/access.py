@@ -25,8 +25,9 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from completesplat.errors import CompleteSplatError
+from completesplat.files import printable
 
-# What viser has no settings for. Where another version of viser has other texts, the page stays as viser made it.
+# viser has no settings for these. The page stays as viser made it if another version of viser has other texts.
 TITLE = "completesplat"
 ICON = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 32 32"><g fill-opacity=".8">
 <ellipse cx="11" cy="20" rx="9" ry="7" fill="#1971c2"/><ellipse cx="21" cy="20" rx="9" ry="7" fill="#f08c00"/>
@@ -125,7 +126,7 @@ class GuardedServer(viser.ViserServer):
             return "The viewer answers its own page only."
         expected = self.token.encode()
         if not any(secrets.compare_digest(token, expected) for token in tokens(request, port)):
-            return "Open the address that completesplat view has printed: its token is missing here, or is another's."
+            return "Open the address that completesplat view has printed: its token is missing here, or wrong."
         return None
 
     def _limit_uploads(self) -> None:
@@ -147,7 +148,7 @@ class GuardedServer(viser.ViserServer):
             source, size = message.source_component_uuid, message.size_bytes
             client.gui._websock_interface.queue_message(FileTransferPartAck(source, message.transfer_uuid, size, size))
             most = f"at most {MOST_BYTES // 2**20} MiB are taken at a time"
-            text = f"{told(message.filename)}: {size / 2**20:.0f} MiB; {most}"
+            text = f"{printable(message.filename)}: {size / 2**20:.0f} MiB; {most}"
             client.add_notification("Not possible", text, color="red")
 
     def _upload_goes_on(self, client_id: ClientId, message: FileTransferPart) -> None:
@@ -189,13 +190,8 @@ def tokens(request: Request, port: int) -> list[bytes]:
     return [token.encode(errors="replace") for token in candidates]
 
 
-def told(name: str) -> str:
-    """Return an uploaded file's name for messages: printable, and at most 80 characters."""
-    return "".join(c if c.isprintable() else "?" for c in name)[:80] or "the file"
-
-
 def with_head(page: str) -> str:
-    """viser's HTML with our title, icon and corrections."""
+    """Return viser's HTML with our title, icon and corrections."""
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
     page = re.sub(r'<link\s+rel="icon"\s+href="[^"]*"\s*/>', icon, page, count=1)
     page = re.sub(r"<title>[^<]*</title>", f"<title>{TITLE}</title>", page, count=1)

@@ -12,10 +12,10 @@ import viser
 from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError, ImageError
 from completesplat.export.images import to_bytes
+from completesplat.files import printable
 from completesplat.gaussians import Gaussians
 from completesplat.generator import CompleteSplat
 from completesplat.scene_model import SceneModel
-from completesplat.viewer.access import told
 from completesplat.viewer.page import Page
 from completesplat.viewer.panel import MOST_SAMPLES, SLIDERS, add_drawing, nearest_steps, preview_of
 from completesplat.viewer.sample import Sample
@@ -115,4 +115,4 @@ def read_upload(model: SceneModel, name: str, content: bytes, remove_background:
         try:
             return model.read(file, remove_background=remove_background)
         except ImageError as error:
-            raise ImageError(str(error).replace(str(file), told(name))) from error
+            raise ImageError(str(error).replace(str(file), printable(name))) from error

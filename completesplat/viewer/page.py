@@ -221,7 +221,7 @@ class Page:
 
         def save() -> None:
             try:
-                files = self.saver.save(kind, self.view.shown)
+                files = self.saver.save(kind, self.view.visible)
             except CompleteSplatError as error:
                 return self.tell(error, client)
             for file in files:

@@ -51,11 +51,11 @@ class Sample:
         pixels, depths = project(self.reference, finite.means)
         height, width = self.reference.image_size
         offset = pixels / torch.tensor([width, height], device=pixels.device) - 0.5
-        seen = (depths > 0) & (offset.abs() < 1 / 6).all(-1)
-        if not seen.any():
-            seen = depths > 0
-        ordered, order = depths[seen].sort()
-        weights = finite.opacities[seen][order].cumsum(0)
+        mask = (depths > 0) & (offset.abs() < 1 / 6).all(-1)
+        if not mask.any():
+            mask = depths > 0
+        ordered, order = depths[mask].sort()
+        weights = finite.opacities[mask][order].cumsum(0)
         depth = ordered[(weights < weights[-1] / 2).sum()].item() if len(ordered) else 1.0
         return self.reference.centers + self.reference.camera_to_world[:3, 2] * depth
 

@@ -116,7 +116,7 @@ class SplatView:
         server.on_client_connect(self._welcome)
 
     @property
-    def shown(self) -> list[Sample]:
+    def visible(self) -> list[Sample]:
         """The samples on the page: the chosen one (or the first, if its number does not exist), or all."""
         samples, chosen = self.samples, self.chosen
         return samples if chosen is None or not samples else [samples[chosen if chosen < len(samples) else 0]]
@@ -130,7 +130,7 @@ class SplatView:
     def refresh(self) -> None:
         """Draw the state of the attributes; move the cameras of browsers only if the arrangement has changed."""
         with self._lock, self.server.atomic():
-            samples = self.shown
+            samples = self.visible
             if not samples:
                 return
             arrangement = arrangement_of(samples)
@@ -161,29 +161,28 @@ class SplatView:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         """Let narrow windows of a new browser (a phone's, upright) show the whole image, as wide ones do."""
-        seen: float | None = None
+        last_aspect: float | None = None
 
         def fit(camera: viser.CameraHandle) -> None:
-            nonlocal seen
+            nonlocal last_aspect
             aspect, view = camera.image_width / max(camera.image_height, 1), self._arrangement
-            if view is not None and aspect > 0 and aspect != seen:
-                seen = aspect
+            if view is not None and aspect > 0 and aspect != last_aspect:
+                last_aspect = aspect
                 camera.fov = view.fov_in(aspect)
 
         client.camera.on_update(fit)
         fit(client.camera)
 
-    def _draw_splats(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
-        scenes = [sample.for_viewers() for sample in shown]
+    def _draw_splats(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
+        scenes = [sample.for_viewers() for sample in samples]
         if self.depth:
             scenes = depth_colored(scenes)
-        wanted = {
-            f"/sample_{i}/layer_{layer}": (
-                arrangement.beside(i, layer_of(scene, layer, sample.layers)), arrangement.shift(i), layer
-            )
-            for i, (sample, scene) in enumerate(zip(shown, scenes, strict=True))
-            for layer in range(sample.layers)
-        }  # fmt: skip
+        wanted = {}
+        for i, (sample, scene) in enumerate(zip(samples, scenes, strict=True)):
+            size = scene.count // sample.layers  # Gaussians are ordered by layer, row, column
+            for layer in range(sample.layers):
+                gaussians = arrangement.beside(i, scene[layer * size : (layer + 1) * size])
+                wanted[f"/sample_{i}/layer_{layer}"] = gaussians, arrangement.shift(i), layer
         for name in self._splats.keys() - wanted.keys():
             self._splats.pop(name).remove()
         for name, (gaussians, shift, layer) in wanted.items():
@@ -197,11 +196,11 @@ class SplatView:
             handle.scale, handle.position = splats.scale, shift
             handle.visible = layer not in self.hidden_layers
 
-    def _draw_cameras(self, shown: Sequence[Sample], arrangement: Arrangement) -> None:
+    def _draw_cameras(self, samples: Sequence[Sample], arrangement: Arrangement) -> None:
         for frustum in self._frusta:
             frustum.remove()
         self._frusta = []
-        for i, sample in enumerate(shown):
+        for i, sample in enumerate(samples):
             reference = sample.reference
             up = reference.intrinsics.new_tensor(self.up.tolist())
             groups = {
@@ -265,12 +264,6 @@ def to_splats(gaussians: Gaussians) -> ViserSplats:
 
 def _bytes(values: Float[Tensor, "gaussian channel"]) -> UInt8[np.ndarray, "gaussian channel"]:
     return values.detach().clamp(0, 1).mul(255).round().to(torch.uint8).numpy()
-
-
-def layer_of(gaussians: Gaussians, layer: int, layers: int) -> Gaussians:
-    """Return one layer of a splatter image's Gaussians, which are ordered by layer, row, column."""
-    size = gaussians.count // layers
-    return gaussians[layer * size : (layer + 1) * size]
 
 
 def depth_colored(scenes: Sequence[Gaussians]) -> list[Gaussians]:

@@ -1,4 +1,4 @@
-"""`completesplat bench data`: how epochs are counted and timed, and what it writes, prints and refuses."""
+"""`completesplat bench data`: how epochs are timed, and what it writes, prints and refuses."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,14 +6,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from packed_sequences import ListedSource
 from support import strict_json
 
 from completesplat.benchmarks import data_loading
-from completesplat.benchmarks.data_loading import Epoch, read_epoch, rows
-from completesplat.data.loading.loader import EpochSampler, SceneLoader
-from completesplat.data.loading.scenes import SceneStore, TrainingScenes
-from completesplat.data.loading.view_selection import training_views
+from completesplat.benchmarks.data_loading import Epoch, rows
 from completesplat.data.toy import rooms
 
 QUICK = [
@@ -24,17 +20,6 @@ QUICK = [
     *("rooms.write.scenes=14", "rooms.write.frames=4", "rooms.write.size=16", "rooms.write.workers=1"),
     *("rooms.data.image_size=16", "rooms.data.references_per_sequence=2"),
 ]
-
-
-def test_an_epoch_counts_batches_scenes_and_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Five scenes of three views, in batches of two."""
-    source = ListedSource([f"sequence {number}" for number in range(5)])
-    store = SceneStore(source, source.names)
-    scenes = TrainingScenes(store, lambda n, _, rng: training_views(n, 2, rng), lambda scene, rng: scene, 1, 0)
-    loader = SceneLoader(scenes, 2, EpochSampler(scenes.groups(), 0), 0)
-    monkeypatch.setattr(data_loading, "time", SimpleNamespace(perf_counter=iter([3.0, 5.5]).__next__))
-    assert read_epoch(loader, 7) == Epoch(2.5, batches=3, scenes=5, images=15)
-    assert loader.sampler.epoch == 7  # each epoch draws anew
 
 
 def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypatch: pytest.MonkeyPatch) -> None:

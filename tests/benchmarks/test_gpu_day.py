@@ -8,7 +8,7 @@ from support import strict_json
 GOOD, BAD = ["-c", "print('good')"], ["-c", "import sys; sys.exit('bad')"]
 
 
-def test_what_failed_and_what_needs_it_is_tried_again(tmp_path, monkeypatch):
+def test_a_failed_step_and_those_that_need_it_are_tried_again(tmp_path, monkeypatch):
     planned = [Step("one", GOOD), Step("two", BAD), Step("three", GOOD, needs="two"), Step("four", GOOD, needs="one")]
     monkeypatch.setattr(gpu_day, "steps", lambda out, small: planned)
     assert gpu_day.run(tmp_path, small=True) == ["two", "three"]

@@ -4,12 +4,11 @@ import sys
 from dataclasses import replace
 
 import pytest
-import torch
 from degenerate_gaussians import NEVER_DRAWN, changed, draw
 from rasterizer_scenes import OTHER_CONSTANTS, assert_agrees, scenes
 
 from completesplat.benchmarks import gsplat_torch
-from completesplat.benchmarks.gsplat_torch import GsplatTorchRasterizer, intersect_tiles
+from completesplat.benchmarks.gsplat_torch import GsplatTorchRasterizer
 from completesplat.errors import CompleteSplatError
 from completesplat.rasterizers import RenderingConstants
 
@@ -30,22 +29,7 @@ def test_nothing_to_draw() -> None:
     assert not any(tensor.any() for tensor in (images, *gradients.values()))
 
 
-def test_the_lists_of_tiles_are_those_of_gsplat() -> None:
-    pytest.importorskip("gsplat")
-    size, views, count = (40, 36), 3, 60
-    gaussians, cameras = scenes(4, 1, views, size, RenderingConstants(), count=count)
-    rasterizer = GsplatTorchRasterizer()
-    splats = rasterizer._project(gaussians[0], cameras[0])
-    keys, listed = intersect_tiles(splats, (5, 5), views)
-    shaped = [tensor.unflatten(0, (views, count)) for tensor in (splats.centers, splats.radii, splats.depths)]
-    _, expected_keys, expected = rasterizer.gsplat._isect_tiles(*shaped, gsplat_torch.TILE_SIZE, 5, 5)
-    assert keys.numel() > views * count
-    assert torch.equal(keys, expected_keys)
-    assert torch.equal(listed, expected.long())
-
-
 def test_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a frustum margin that gsplat does not have, and where there is no gsplat."""
     pytest.importorskip("gsplat")
     with pytest.raises(CompleteSplatError, match="frustum_margin"):
         GsplatTorchRasterizer(OTHER_CONSTANTS)

@@ -50,7 +50,7 @@ def test_scenes_are_made_in_the_temporary_folder(task, tmp_path, monkeypatch):
 
 
 def papers_work(*settings: str) -> bool:
-    """Whether these settings give the work of the paper's durations."""
+    """Return whether these settings give the work of the paper's durations."""
     task = OmegaConf.to_container(compose_config("bench", "bench_task=paper", *settings).task, resolve=True)
     data = task["data"]
     work = {"image_size": data["image_size"], "batch": data["batch_size"]}

@@ -74,7 +74,7 @@ def was_mirrored(changed: SceneBatch) -> bool:
     return torch.equal(changed.reference.masks, scene().reference.masks.flip(-1))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> None:
     everything = augment(scene(), rng(seed), STRONG, BoxMasks(), horizontal_flip=True)
     jitter = augment(scene(), rng(seed), STRONG, None, horizontal_flip=False)
@@ -88,10 +88,9 @@ def test_no_part_depends_on_whether_the_others_are_switched_on(seed: int) -> Non
 
 
 def test_every_other_scene_is_mirrored() -> None:
-    """Of 400 draws, 4 standard deviations to either side."""
-    before = scene()
-    count = sum(was_mirrored(augment(before, rng(seed), None, None, horizontal_flip=True)) for seed in range(400))
-    assert abs(count - 200) < 4 * (400 * 0.25) ** 0.5
+    """Of 100 draws, 4 standard deviations to either side."""
+    count = sum(was_mirrored(augment(scene(), rng(seed), None, None, horizontal_flip=True)) for seed in range(100))
+    assert abs(count - 50) < 4 * (100 * 0.25) ** 0.5
 
 
 def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
@@ -104,7 +103,7 @@ def test_reference_and_targets_get_the_same_jitter_and_the_rest_stays() -> None:
     assert torch.equal(after.reference.masks, before.reference.masks)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_color_becomes_one_color_in_all_views_within_bounds(seed: int) -> None:
     images = torch.cat([pictures(1, 3, 8, 8) * 0.3, 0.7 + pictures(1, 3, 8, 8) * 0.3])
     images[:, :, 2, 3] = torch.tensor([0.2, 0.5, 0.6])
@@ -117,25 +116,25 @@ def test_one_color_becomes_one_color_in_all_views_within_bounds(seed: int) -> No
 def test_brightness_alone_multiplies_by_a_factor_within_its_range() -> None:
     images = 0.1 + 0.4 * pictures(2, 3, 5, 5)
     factors = []
-    for seed in range(200):
+    for seed in range(60):
         ratio = ColorJitter(0.5, 0, 0, 0)(images, rng(seed)) / images
         torch.testing.assert_close(ratio, ratio[:1, :1, :1, :1].expand_as(ratio))
         factors.append(ratio[0, 0, 0, 0].item())
-    assert 0.5 <= min(factors) < 0.55
-    assert 1.45 < max(factors) <= 1.5
+    assert 0.5 <= min(factors) < 0.6
+    assert 1.4 < max(factors) <= 1.5
 
 
 def test_hue_rotates_colors_up_to_their_complement_and_keeps_grey_grey() -> None:
     """Of all angles within half a turn, the farthest from red is cyan; some draw comes near it, none beyond."""
     images = pictures(2, 1, 5, 5).repeat(1, 3, 1, 1)
     images[:, :, 0, 0] = torch.tensor([1.0, 0, 0])
-    jittered = [ColorJitter(0, 0, 0, 0.5)(images, rng(seed)) for seed in range(300)]
+    jittered = [ColorJitter(0, 0, 0, 0.5)(images, rng(seed)) for seed in range(100)]
     torch.testing.assert_close(jittered[1][:, :, 1:], images[:, :, 1:])
     reds = torch.stack([one[0, :, 0, 0] for one in jittered])
     # A pure colour of whichever hue has one channel at 1 and one at 0.
-    torch.testing.assert_close(torch.stack(reds.aminmax(dim=1)), torch.tensor([[0.0], [1.0]]).expand(2, 300))
+    torch.testing.assert_close(torch.stack(reds.aminmax(dim=1)), torch.tensor([[0.0], [1.0]]).expand(2, 100))
     assert (reds - torch.tensor([0.0, 1, 1])).abs().amax(dim=1).min() < 0.1
-    quarter = [ColorJitter(0, 0, 0, 0.25)(images, rng(seed))[0, 0, 0, 0] for seed in range(300)]
+    quarter = [ColorJitter(0, 0, 0, 0.25)(images, rng(seed))[0, 0, 0, 0] for seed in range(100)]
     # A quarter turn either way ends half-way between yellow and green, or between magenta and blue.
     assert 0.5 - 1e-5 <= min(quarter) < 0.55
 
@@ -157,7 +156,7 @@ def test_contrast_scales_distances_from_the_mean_grey_and_saturation_from_that_o
     [
         *((ColorJitter, wrong) for wrong in ({"brightness": -0.1}, {"contrast": float("nan")}, {"hue": 0.6})),
         *((BoxMasks, wrong) for wrong in ({"probability": float("nan")}, {"boxes": (0, 2)}, {"boxes": (3, 2)})),
-        *((BoxMasks, wrong) for wrong in ({"sides": (0.0, 0.5)}, {"sides": (0.5, 1.2)})),
+        *((BoxMasks, wrong) for wrong in ({"sides": (0.5, 0.1)}, {"sides": (0.5, 1.2)})),
     ],
 )
 def test_settings_without_meaning_are_refused_by_name(kind: type, settings: dict[str, object]) -> None:
@@ -187,19 +186,8 @@ def test_a_single_box_is_a_rectangle_with_sides_in_the_stated_range() -> None:
     assert corners == {"first", "last"}
 
 
-def test_several_boxes_hide_no_more_than_all_of_them_together() -> None:
-    masks = [BoxMasks(1.0, boxes=(2, 3), sides=(0.2, 0.2))(40, 40, rng(seed)) for seed in range(200)]
-    assert set(torch.stack(masks).unique().tolist()) == {0.0, 1.0}
-    hidden = [(mask == 0).sum() for mask in masks]
-    assert max(hidden) == 3 * 8 * 8
-    # Two boxes may overlap, but hide at least one.
-    assert min(hidden) >= 8 * 8
-    assert 2 * 8 * 8 in hidden
-
-
-def test_pictures_are_masked_with_the_stated_probability() -> None:
-    """Of 1000 draws, 4 standard deviations to either side."""
-    for probability in (0.5, 0.2):
-        masked = sum(bool((BoxMasks(probability)(8, 8, rng(seed)) == 0).any()) for seed in range(1000))
-        assert abs(masked - 1000 * probability) < 4 * (1000 * probability * (1 - probability)) ** 0.5
-    assert all((BoxMasks(0.0)(8, 8, rng(seed)) == 1).all() for seed in range(50))
+def test_images_are_masked_with_the_stated_probability() -> None:
+    """Of 300 draws, 4 standard deviations to either side."""
+    for probability in (0.5, 0.2, 0.0):
+        masked = sum(bool((BoxMasks(probability)(8, 8, rng(seed)) == 0).any()) for seed in range(300))
+        assert abs(masked - 300 * probability) <= 4 * (300 * probability * (1 - probability)) ** 0.5

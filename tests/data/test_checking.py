@@ -1,11 +1,16 @@
+import resource
+from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 from checked_sources import Prepared, Source
 from support import strict_json
+from torch import Tensor
 
-from completesplat.data.audit import Findings, check, show
 from completesplat.data.validation import ChangedFile, MissingFile
+from completesplat.data.validation.audit import Findings, check, show
+from completesplat.data.validation.processes import map_in_processes
 
 
 def check_quietly(**sources: Source) -> Findings:
@@ -93,6 +98,7 @@ def test_splits_are_read_by_themselves_and_too_few_frames_reported_only_where_no
         check_quietly(train=Source(dict.fromkeys("abcd", (1, 2)), bugs={"c"}))
 
 
+@pytest.mark.processes
 def test_two_processes_find_the_same_in_the_same_order() -> None:
     sources = damaged()
     sources["train"].frames |= {f"more {i}": (1, 2, 3) for i in range(40)}
@@ -109,8 +115,23 @@ def test_sound_data_show_no_table_and_strange_names_are_shown_whole(capsys: pyte
     assert capsys.readouterr().out == "usable sequences: 1, their usable frames: 2 (train 1 and 2, val 0 and 0)\n"
     name = "[bold]" + "long/" * 50 + "\x1b[31m\n\udc80"
     show(check_quietly(train=Source({"a": (1, 2)}, refused=[MissingFile("no such file", name)])))
-    shown = capsys.readouterr().out.splitlines()
-    assert max(map(len, shown)) <= 120
-    cell = "".join(line.split("│")[3].strip() for line in shown if "│" in line)
-    # Lines may end at a space, which is then not shown.
+    printed = capsys.readouterr().out.splitlines()
+    assert max(map(len, printed)) <= 120
+    cell = "".join(line.split("│")[3].strip() for line in printed if "│" in line)
+    # Lines may end at a space, which is then not printed.
     assert "[bold]" + "long/" * 50 + r"\x1b[31m\n\udc80:nosuchfile" in cell.replace(" ", "")
+
+
+def _total(tensors: list[Tensor], place: int) -> float:
+    return float(tensors[place].sum())
+
+
+@pytest.mark.processes
+def test_the_function_for_processes_may_hold_more_tensors_than_a_process_may_open_files():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    total = partial(_total, [torch.full((3,), float(value)) for value in range(300)])
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    try:
+        assert list(map_in_processes(total, [0, 150, 299], workers=2)) == pytest.approx([0, 450, 897])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

@@ -13,7 +13,7 @@ from completesplat.data.co3d.source import object_placement
 from completesplat.data.co3d.splits import Filters, SeededSplit, SplitMembers, read_category
 from completesplat.data.loading.scenes import SceneStore
 from completesplat.data.toy import write_objects
-from completesplat.data.toy.objects import SUBSET
+from completesplat.data.toy.writing import SUBSET
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import project
 from completesplat.scene import SceneBatch
@@ -167,8 +167,8 @@ def test_the_fingerprint_tells_other_annotations_and_lists(tmp_path):
 
 
 def test_without_targets_one_image_of_a_scene_is_read_and_the_references_are_the_same(toy_root, monkeypatch):
-    read, picture = [], SceneStore._picture
-    monkeypatch.setattr(SceneStore, "_picture", lambda *given: read.append(given) or picture(*given))
+    read, picture = [], SceneStore._read
+    monkeypatch.setattr(SceneStore, "_read", lambda *given: read.append(given) or picture(*given))
     settings = {"references_per_sequence": 4, "horizontal_flip": True, "box_masks": {"probability": 0.5}}
     without = epoch(module(toy_root, targets=0, **settings).train_dataloader(), 0)
     assert len(read) == sum(len(batch.names) for batch in without) == 8

@@ -10,7 +10,7 @@ from completesplat.data.co3d.annotations import CO3DFrame, DepthMap, camera_from
 from completesplat.data.co3d.source import from_depth_maps, object_placement
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.placement import Axes, Placement, from_cameras, from_points, upright_axes
-from completesplat.data.toy.objects import SUBSET
+from completesplat.data.toy.writing import SUBSET
 from completesplat.data.validation import BadImage, BadPlacement, MissingFile, UnreadableFile, read_points
 
 CENTER = np.array([3.0, -2.0, 5.0])

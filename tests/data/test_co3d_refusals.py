@@ -14,7 +14,6 @@ import torch
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
 from PIL import Image
 
-from completesplat.data.audit import check
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
 from completesplat.data.sequences import SPLITS
@@ -27,6 +26,7 @@ from completesplat.data.validation import (
     OutsidePath,
     UnreadableFile,
 )
+from completesplat.data.validation.audit import check
 from completesplat.errors import DataError
 
 POLICIES = pytest.mark.parametrize("policy", ["raise", "skip"])

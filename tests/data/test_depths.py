@@ -13,7 +13,7 @@ from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.images.crop import Square
 from completesplat.data.loading.scenes import Loaded, collate
 from completesplat.data.toy.module import ToyObjectsDataModule
-from completesplat.data.toy.objects import SUBSET
+from completesplat.data.toy.writing import SUBSET
 from completesplat.data.validation import BadImage
 from completesplat.geometry.cameras import Cameras, pinhole, project
 from completesplat.scene import SceneBatch
@@ -84,9 +84,9 @@ def test_maps_of_any_size_are_cut_as_the_picture_is(monkeypatch, shape):
     monkeypatch.setattr(source, "read_depth", lambda *_: depth)
     camera = Cameras(torch.eye(4), pinhole(50.0, 8), (8, 12))
     frame = CO3DFrame(1, Path("image"), Path("mask"), DepthMap(Path("depth"), 1.0), camera)
-    found = source.square_depth(frame, Square(6, 2, 4), 2, factor=10.0)
+    depths = source.square_depth(frame, Square(6, 2, 4), 2, factor=10.0)
     half_pixel = 12 / shape[1] / 2
-    assert found.shape == (1, 2, 2)
-    assert found[0].flatten().tolist() == pytest.approx([70, 90, 70, 90], abs=10 * half_pixel)
+    assert depths.shape == (1, 2, 2)
+    assert depths[0].flatten().tolist() == pytest.approx([70, 90, 70, 90], abs=10 * half_pixel)
     unknown = source.square_depth(replace(frame, depth=None), Square(6, 2, 4), 2, factor=10.0)
     assert not unknown.any()

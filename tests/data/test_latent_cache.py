@@ -82,9 +82,9 @@ def test_where_few_frames_are_encoded_the_nearest_takes_the_references_place(tmp
     nearest = {0: 1, 1: 1, 2: 1, 3: 3, 4: 3}
     seen = set()
     for key in [(number, index) for number in range(6) for index in range(4)]:
-        drawn, found = pictures.dataset[key].scenes, cached.dataset[key].scenes
-        assert found.names == drawn.names
-        assert found.reference_frame.item() == nearest[drawn.reference_frame.item()]
+        drawn, scene = pictures.dataset[key].scenes, cached.dataset[key].scenes
+        assert scene.names == drawn.names
+        assert scene.reference_frame.item() == nearest[drawn.reference_frame.item()]
         seen.add(drawn.reference_frame.item())
     assert len(seen) > 2
     name = next(iter(store.sequences))

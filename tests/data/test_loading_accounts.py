@@ -22,7 +22,7 @@ def make_tree(root: Path, pictures: list[str], cameras: list[str] = ()) -> Path:
     return write_tree(root, "text", clips, clips)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [0, pytest.param(2, marks=pytest.mark.processes)])
 def test_a_refusal_reaches_the_main_process_with_its_place(tmp_path, workers):
     root = make_tree(tmp_path, ["c5"], ["c2"])
     data = module(root, on_bad="raise", workers=workers, evaluation_batch_size=1)
@@ -62,7 +62,7 @@ def test_too_many_are_an_error_that_names_the_share_and_the_last(tmp_path):
     with pytest.raises(DataError, match=r"3 of 9 items .* data\.max_bad_fraction=0\.25 .*last one: .*c6, frame 1"):
         list(module(root, max_bad_fraction=0.25).test_dataloader())
     with pytest.raises(DataError, match=r"data\.max_bad_fraction=0\.1"):
-        list(module(root, max_bad_fraction=0.1, workers=2, val_fraction=0.0).train_dataloader())
+        list(module(root, max_bad_fraction=0.1, val_fraction=0.0).train_dataloader())
     assert len(list(module(root, max_bad_fraction=0.34, evaluation_batch_size=1).test_dataloader())) == 6
     one_bad = module(make_tree(tmp_path / "one", ["c5"]), max_bad_fraction=0.0, evaluation_batch_size=1)
     assert len(list(one_bad.test_dataloader())) == 8  # One is no share.

@@ -16,7 +16,7 @@ from packed_sequences import SIZE, ListedSource, make_sequence, smooth_picture
 from PIL import Image
 
 from completesplat.data.packed.manifest import is_packed, read_manifest, settings_must_match
-from completesplat.data.packed.rows import EncodedPicture, decode, encode, from_row, to_row
+from completesplat.data.packed.rows import EncodedImage, decode, encode, from_row, to_row
 from completesplat.data.packed.source import PackedSource
 from completesplat.data.packed.writing import prepare
 from completesplat.data.sequences import PosedSequence, SequenceSource
@@ -44,16 +44,16 @@ def store(tmp_path: Path) -> Path:
     return make(tmp_path / "store")
 
 
-def assert_same(found: PosedSequence, expected: PosedSequence, tolerance: int = 0) -> None:
-    assert (found.name, found.frames) == (expected.name, expected.frames)
-    assert found.cameras.image_size == expected.cameras.image_size
+def assert_same(sequence: PosedSequence, expected: PosedSequence, tolerance: int = 0) -> None:
+    assert (sequence.name, sequence.frames) == (expected.name, expected.frames)
+    assert sequence.cameras.image_size == expected.cameras.image_size
     for part in ("world_to_camera", "intrinsics"):
-        one, other = getattr(found.cameras, part), getattr(expected.cameras, part)
+        one, other = getattr(sequence.cameras, part), getattr(expected.cameras, part)
         assert one.dtype == other.dtype == torch.float64
         assert one.numpy().tobytes() == other.numpy().tobytes()
-    assert torch.equal(found.depth_ranges, expected.depth_ranges)
-    for index in range(len(found.frames)):
-        (image, mask), (expected_image, expected_mask) = found.read(index), expected.read(index)
+    assert torch.equal(sequence.depth_ranges, expected.depth_ranges)
+    for index in range(len(sequence.frames)):
+        (image, mask), (expected_image, expected_mask) = sequence.read(index), expected.read(index)
         assert (image.int() - expected_image.int()).abs().max() <= tolerance
         assert (mask is None) == (expected_mask is None)
         assert mask is None or torch.equal(mask, expected_mask)
@@ -74,9 +74,9 @@ def test_png_and_bmp_give_back_every_bit_also_in_other_processes(masked: bool, c
 
 def test_jpeg_keeps_cameras_and_masks_and_changes_colours_by_little(tmp_path: Path) -> None:
     source = PackedSource(make(tmp_path / "store", codec="jpeg"), "train")
-    expected, found = make_sequence("s3"), source.read("s3")
-    assert_same(found, expected, tolerance=16)
-    differences = [found.read(index).image.float() - expected.read(index).image for index in range(4)]
+    expected, sequence = make_sequence("s3"), source.read("s3")
+    assert_same(sequence, expected, tolerance=16)
+    differences = [sequence.read(index).image.float() - expected.read(index).image for index in range(4)]
     assert 0 < torch.stack(differences).abs().mean() < 2
 
 
@@ -95,7 +95,7 @@ def test_one_store_serves_smaller_images_as_pillow_makes_them(tmp_path: Path) ->
 
 def test_masks_of_some_frames_only_stay_with_them() -> None:
     image, mask = smooth_picture(1, True)
-    pictures = [EncodedPicture(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
+    pictures = [EncodedImage(encode(image, "png"), content) for content in (None, encode(mask, "png"))]
     read = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "file", "s").read
     assert read(0).mask is None
     assert torch.equal(read(1).mask, mask)
@@ -141,7 +141,7 @@ def test_only_a_complete_store_with_its_own_shards_opens(store: Path, tmp_path: 
 def test_wherever_a_byte_of_a_shard_changes_its_sequences_are_refused_or_the_same(store: Path) -> None:
     content = (store / SHARD).read_bytes()
     places, intact = set(), 0
-    for position in np.random.default_rng(0).choice(len(content), 30, replace=False):
+    for position in np.random.default_rng(0).choice(len(content), 16, replace=False):
         damaged = bytearray(content)
         damaged[position] ^= 0xFF
         # Never in place: pages of an earlier round may still be mapped.
@@ -193,15 +193,13 @@ def change(row: pa.Table, column: str, value: object) -> pa.Table:
         ("world_to_camera", [1.0] * 31, BadAnnotation),
         ("world_to_camera", [float("nan")] * 32, BadAnnotation),
         ("world_to_camera", [1.0] * 32, ChangedFile),
-        ("world_to_camera", None, BadAnnotation),
-        ("frames", [], BadAnnotation),
         ("images", [b""], BadAnnotation),
         ("size", None, ChangedFile),
         ("name", "other", BadAnnotation),
     ],
 )
 def test_a_row_that_does_not_fit_is_refused_with_its_place(column: str, value: object, kind: type[DataError]) -> None:
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedPicture(b"", b"")] * 2)
+    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(b"", b"")] * 2)
     with pytest.raises(kind) as caught:
         from_row(change(row, column, value), "shard.arrow", "s")
     assert (caught.value.file, caught.value.sequence) == ("shard.arrow", "s")
@@ -211,7 +209,7 @@ def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
     image = encode(smooth_picture(0, True).image, "jpeg")
     # Where the checksum is that of the wrong bytes, decoding them has to notice.
     for wrong in (image[: len(image) // 2], encode(smooth_picture(0, True, size=SIZE + 1).image, "png")):
-        pictures = [EncodedPicture(image, None), EncodedPicture(wrong, None)]
+        pictures = [EncodedImage(image, None), EncodedImage(wrong, None)]
         sequence = from_row(to_row(make_sequence("s", frames=2), [0, 1], pictures), "shard.arrow", "s")
         sequence.read(0)
         with pytest.raises(BadImage) as caught:
@@ -219,7 +217,7 @@ def test_bytes_that_are_not_the_picture_are_refused_with_their_place() -> None:
         assert (caught.value.file, caught.value.sequence, caught.value.frame) == ("shard.arrow", "s", 13)
     flipped = image[:-20] + bytes([image[-20] ^ 1]) + image[-19:]
     assert decode(flipped, 3, SIZE, SIZE).shape == (3, SIZE, SIZE)
-    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedPicture(image, None)] * 2)
+    row = to_row(make_sequence("s", frames=2), [0, 1], [EncodedImage(image, None)] * 2)
     read = from_row(change(row, "images", [image, flipped]), "shard.arrow", "s").read
     read(0)
     with pytest.raises(BadImage, match="no longer"):
@@ -235,7 +233,6 @@ FIRST = ("splits", "train", "shards", 0)
         (["format"], 1, UnreadableFile),
         (["settings"], {"image_size": [1]}, BadAnnotation),
         (["splits", "train", "names"], ["s3"], BadAnnotation),
-        (["splits", "train", "left_out"], {"x": "1"}, BadAnnotation),
         (["splits", "train", "refused"], [{}], BadAnnotation),
         ([*FIRST, "file"], "../secret.arrow", OutsidePath),
         ([*FIRST, "bytes"], True, BadAnnotation),
@@ -256,6 +253,7 @@ def test_other_settings_than_those_baked_in_are_refused_by_name(store: Path) -> 
         settings_must_match(store, {"image_size": 32, "crop": "central"})
 
 
+@pytest.mark.processes
 def test_reading_needs_no_network_and_writes_nothing_into_the_home_folder(store: Path, tmp_path: Path) -> None:
     code = (
         "import socket; socket.socket.connect = None\n"

@@ -12,12 +12,13 @@ from packed_sequences import SIZE, ListedSource
 from realestate10k_trees import equal
 
 from completesplat.data.co3d.module import CO3DDataModule
-from completesplat.data.packed.remote import local_root
-from completesplat.data.packed.source import PackedSource
+from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.packed.writing import prepare
-from completesplat.data.toy.objects import SUBSET
+from completesplat.data.toy.writing import SUBSET
 from completesplat.data.validation import ChangedFile, MissingFile
 from completesplat.errors import DataError
+
+pytestmark = pytest.mark.processes
 
 NAMES = [f"s{number}" for number in range(6)]
 
@@ -63,9 +64,9 @@ def test_shards_are_fetched_when_they_are_read_once_and_in_their_order(served):
     assert source.groups(["s4", "s0", "s5"]) == [[0, 2], [1]]
     here = PackedSource(folder, "train")
     for name in NAMES:
-        found, expected = source.read(name), here.read(name)
-        assert found.frames == expected.frames
-        assert all((found.read(i).image == expected.read(i).image).all() for i in range(4))
+        sequence, expected = source.read(name), here.read(name)
+        assert sequence.frames == expected.frames
+        assert all((sequence.read(i).image == expected.read(i).image).all() for i in range(4))
         assert len(shards_asked(asked)) == 1 + NAMES.index(name) // 2
     again = PackedSource(local_root(f"{address}"), "train")
     assert (again.read("s0").name, len(shards_asked(asked))) == ("s0", 3)

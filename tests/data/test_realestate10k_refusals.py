@@ -23,7 +23,6 @@ from realestate10k_trees import (
     write_text_form,
 )
 
-from completesplat.data.audit import check
 from completesplat.data.images.crop import Square
 from completesplat.data.realestate10k import chunks
 from completesplat.data.realestate10k.chunks import ChunkedClips, read_chunk
@@ -38,6 +37,7 @@ from completesplat.data.validation import (
     TooFewFrames,
     UnreadableFile,
 )
+from completesplat.data.validation.audit import check
 from completesplat.errors import DataError
 
 BAD, INTACT = "bad", ("one", "two")

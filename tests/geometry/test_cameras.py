@@ -138,9 +138,9 @@ def test_the_place_that_cameras_look_at_is_nearest_to_their_axes(count: int) -> 
     target = rand(3, low=-2, high=2)
     poses = look_at(target + rand(count, 3, low=-4, high=-1, seed=1), target, f64(0.0, -1, 0))
     cameras = Cameras(poses, random_cameras(count).intrinsics, (48, 64))
-    found = nearest_to_axes(cameras)
-    assert found is not None
-    assert_close(found, target)
+    point = nearest_to_axes(cameras)
+    assert point is not None
+    assert_close(point, target)
     parallel = replace(cameras, world_to_camera=poses[:1].repeat(count, 1, 1))
     parallel.world_to_camera[:, 0, 3] += torch.arange(count)
     assert nearest_to_axes(parallel) is None

@@ -19,7 +19,7 @@ def wall_and_square():
     return cameras, depths
 
 
-def test_what_lies_behind_or_outside_is_hidden():
+def test_surfaces_behind_or_outside_are_hidden():
     cameras, depths = wall_and_square()
     hidden, known = hidden_from(cameras[0], depths[0], cameras, depths)
     assert not hidden[0].any()  # a camera sees all that it sees
@@ -35,7 +35,7 @@ def test_what_lies_behind_or_outside_is_hidden():
     assert not middle[~square & (x > 1.2) & (x < 4.8)].any()
 
 
-def test_what_has_no_depth_is_unknown():
+def test_pixels_without_depth_are_unknown():
     cameras, depths = wall_and_square()
     depths[1, 0, :4] = 0
     hidden, known = hidden_from(cameras[0], depths[0], cameras[1:], depths[1:])

@@ -102,7 +102,7 @@ def test_two_renderings_at_once_do_not_share_memory() -> None:
 
 
 def test_more_views_than_are_held_at_once_without_gradients() -> None:
-    """And of inputs that are not contiguous."""
+    """The inputs are not contiguous either."""
     gaussians, cameras = scenes(9, 2, 6, (6, 7), CONSTANTS, count=10)
     strided = gaussians.map(lambda tensor: torch.stack([tensor, tensor], dim=-1)[..., 0])
     assert not strided.means.is_contiguous()

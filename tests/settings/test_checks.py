@@ -34,7 +34,7 @@ ODD = [
     ("fit", "trainer.precision=half", "trainer.precision=half: choose one of "),
     ("fit", "trainer.accelerator=abacus", "trainer: "),
     ("fit", "loss.terms.kl.weight=inf", "loss.terms.kl.weight=inf: must be finite"),
-    ("fit", "data.workers=4000", "data.workers=4000: must not be above 4 for each of "),
+    ("fit", "data.workers=4000", "data.workers=4000: must lie between 0 and 256"),
     ("data", "data_task=check workers=-1", "workers=-1: must be at least 1"),
     ("data", "data_task=prepare workers=0", "workers=0: must be at least 1"),
     ("data", "frames=1001", "toy_objects: frames=1001: must lie between 2 and 1000"),

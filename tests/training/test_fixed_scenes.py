@@ -2,7 +2,6 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pandas
 import pytest
 import torch
@@ -22,10 +21,9 @@ from completesplat.rasterizers.reference import ReferenceRasterizer
 from completesplat.scene import SceneBatch
 from completesplat.training.fixed_scenes import (
     SceneDrawings,
-    distributions,
     fixed_scenes,
+    gaussian_figures,
     layer_figures,
-    percentiles,
     samples_sheet,
     scene_panels,
     write_newest,
@@ -85,18 +83,16 @@ def test_near_depths_are_bright_on_a_scale_for_each_scene_and_unseen_pixels_are_
     torch.testing.assert_close(depth[0], depth[1], atol=1e-3, rtol=0)
 
 
-def test_distributions_are_of_all_values():
-    values = distributions(two_layers(scene_batch()))
-    count = 2 * 2 * SIZE * SIZE
-    assert {name: len(of) for name, of in values.items()} == {
-        "opacity": count,
-        "log10_scale": 3 * count,
-        "depth": count,
-    }
-    assert np.allclose(values["log10_scale"], -3)
-    assert np.unique(values["depth"].round(5)).tolist() == [1, 3]
-    shuffled = np.random.default_rng(0).permutation(101).astype(float)  # of 0 to 100 the n-th percentile is n
-    assert percentiles({"depth": shuffled}) == {f"gaussians/depth_p{n}": n for n in (10, 50, 90)}
+def test_percentiles_are_of_all_gaussians():
+    scenes = scene_batch()
+    gaussians = layer(scenes, 1.0, 0.9, scenes.reference.images)
+    ranks = torch.linspace(0, 1, gaussians.opacities.numel())[torch.randperm(gaussians.opacities.numel())]
+    figures = gaussian_figures(replace(gaussians, opacities=ranks.view_as(gaussians.opacities)))
+    for p in (10, 50, 90):
+        assert figures[f"gaussians/opacity_p{p}"] == pytest.approx(p / 100, abs=1e-5)
+        assert figures[f"gaussians/log10_scale_p{p}"] == pytest.approx(-3, abs=1e-5)
+        assert figures[f"gaussians/depth_p{p}"] == pytest.approx(1, abs=1e-5)
+    assert len(figures) == 3 * 3
 
 
 def test_figures_of_the_layers_are_those_of_the_reference_s_pixels():

@@ -126,17 +126,17 @@ def shrunk(image: np.ndarray, factor: int) -> np.ndarray:
 
 def place(image: np.ndarray, color: tuple[float, float, float]) -> tuple[float, float]:
     """The middle (row, column) of what is nearly of this colour."""
-    found = np.argwhere(abs(image - 255 * np.array(color)).max(-1) < 40)
-    assert len(found), f"nothing of the colour {color}"
-    return tuple(found.mean(axis=0))
+    places = np.argwhere(abs(image - 255 * np.array(color)).max(-1) < 40)
+    assert len(places), f"nothing of the colour {color}"
+    return tuple(places.mean(axis=0))
 
 
 def test_the_page_draws_the_splats_as_our_rasterizer_does(tab):
     seen = settled(tab)
-    expected, found = ours(*seen.shape[:2], shrink=3), shrunk(seen, 3)
-    assert np.corrcoef(found.ravel(), expected.ravel())[0, 1] > 0.97
+    expected, actual = ours(*seen.shape[:2], shrink=3), shrunk(seen, 3)
+    assert np.corrcoef(actual.ravel(), expected.ravel())[0, 1] > 0.97
     for _, color in BALLS.values():
-        assert place(found, color) == pytest.approx(place(expected, color), abs=1)
+        assert place(actual, color) == pytest.approx(place(expected, color), abs=1)
 
 
 def test_a_layer_disappears_when_it_is_switched_off(tab):
@@ -195,8 +195,8 @@ def test_too_large_a_file_is_refused_and_the_page_says_so(tab, page, tmp_path):
     with tab.expect_file_chooser() as chooser:
         tab.get_by_role("button", name="Load an image").click()
     chooser.value.set_files(file)
-    told = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
-    told.wait_for(state="attached", timeout=1000 * LIMIT)
+    message = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
+    message.wait_for(state="attached", timeout=1000 * LIMIT)
     assert page.server.gui._current_file_upload_states == {}
 
 
@@ -253,14 +253,14 @@ def space(tiny_weights):
     program = [sys.executable, "-m", "completesplat.viewer.space", str(tiny_weights)]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    said: list[str] = []
+    lines: list[str] = []
     for line in process.stdout:
-        said.append(line)
+        lines.append(line)
         if "public link" in line:  # gradio's last word before it waits
-            yield re.search(r"http://127\.0\.0\.1:\d+", "".join(said))[0]
+            yield re.search(r"http://127\.0\.0\.1:\d+", "".join(lines))[0]
             break
     else:
-        pytest.fail("".join(said))
+        pytest.fail("".join(lines))
     process.terminate()
     process.wait(timeout=LIMIT)
 
@@ -284,6 +284,6 @@ def test_a_space_completes_an_upload_and_shows_a_frame_for_each_sample(chromium,
 
 
 def drawn(frame) -> bool:
-    """Whether the lower half of a frame, below viser's notices, shows more than one grey."""
+    """Return whether the lower half of a frame, below viser's notices, shows more than one grey."""
     seen = np.asarray(Image.open(io.BytesIO(frame.screenshot())).convert("RGB")).astype(float)
     return bool(seen[len(seen) * 2 // 3 :].std() > 5)

@@ -32,15 +32,15 @@ def test_an_image_is_read_at_the_models_size(model):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("notes.txt", png(50, 40)[:60], "^notes.txt: "),
-        ("../../\n\x1betc/passwd", b"nothing", r"^\.\./\.\./\?\?etc/passwd: not an image"),  # no path, no markup
+        ("../../\n\x1betc/passwd", b"nothing", r"^\.\./\.\./\\n\\x1betc/passwd: not an image"),  # no path, no markup
         ("bomb.png", png(8000, 8000, "1"), "64,000,000|8000 x 8000"),  # some kilobytes
     ],
 )
-def test_other_files_and_too_many_pixels_are_refused_by_file_name(model, name, content, said):
-    with pytest.raises(ImageError, match=said):
+def test_other_files_and_too_many_pixels_are_refused_by_file_name(model, name, content, message):
+    with pytest.raises(ImageError, match=message):
         read_upload(model, name, content)
 
 

@@ -165,8 +165,8 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     monkeypatch.setattr("completesplat.viewer.completion.PAUSE", 0)
     seen, show = [], completion.page.show
     monkeypatch.setattr(completion.page, "show", lambda samples, text: seen.append(samples[0]) or show(samples, text))
-    shown = upload(completion)
-    for sample, expected in zip(shown, model(completion.photograph[1], **SETTINGS), strict=True):
+    samples = upload(completion)
+    for sample, expected in zip(samples, model(completion.photograph[1], **SETTINGS), strict=True):
         assert torch.equal(sample.gaussians.means, expected.means)
         assert torch.equal(sample.gaussians.scales, expected.scales)
     assert "photo.png" in completion.controls.preview.content
@@ -175,7 +175,7 @@ def test_an_uploaded_image_is_completed_as_by_the_model_and_shown_forming(comple
     assert not torch.equal(seen[0].gaussians.means, seen[-1].gaussians.means)
 
 
-def test_a_slider_draws_anew_unless_that_is_switched_off(completion):
+def test_a_slider_draws_anew_unless_drawing_is_off(completion):
     before, controls = upload(completion)[0].gaussians.means, completion.controls
     controls.skip_weight.value = 0.25
     sample = finish(completion)[0]
@@ -303,16 +303,7 @@ def test_thumbnails_without_a_key_choose_nothing():
     assert (row.count("<img"), row.count("onclick")) == (11, 9)
 
 
-def test_formats_that_need_nodejs_are_refused_without_it(page, monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    browser = Browser()
-    page.saving.kind.value = "spz"
-    press(page.saving.save, browser)
-    assert page.worker.wait(LIMIT)
-    assert "need Node.js" in browser.messages[0]
-
-
-def test_the_object_is_cut_out_when_that_is_switched_on(completion, model, monkeypatch):
+def test_the_object_is_cut_out_on_request(completion, model, monkeypatch):
     seen, read = [], type(model).read
 
     def reading(self, file, *given, remove_background=False):

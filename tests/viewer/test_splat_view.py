@@ -9,7 +9,7 @@ from viewer_scenes import balls, balls_sample
 
 from completesplat.gaussians import concatenate
 from completesplat.geometry.cameras import look_at
-from completesplat.viewer.splat_view import arrangement_of, depth_colored, layer_of, to_splats
+from completesplat.viewer.splat_view import arrangement_of, depth_colored, to_splats
 
 
 def test_one_sample_is_seen_as_its_reference_camera_sees_it():
@@ -105,13 +105,6 @@ def test_centers_and_bytes_of_finite_gaussians():
     assert len(splats.centers) == gaussians.count - 2
     assert all(np.isfinite(part).all() for part in splats[:4])
     assert to_splats(gaussians[:0]).centers.shape == (0, 3)
-
-
-def test_the_layers_are_the_parts_in_order():
-    gaussians = balls(points=3)
-    parts = [layer_of(gaussians, layer, 4) for layer in range(4)]
-    assert [part.count for part in parts] == [3] * 4
-    torch.testing.assert_close(vars(concatenate(parts)), vars(gaussians), atol=0, rtol=0)
 
 
 def test_depth_colours_brighten_towards_the_camera_on_one_scale():

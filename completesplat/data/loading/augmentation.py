@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -14,6 +15,12 @@ from torch import Tensor
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror
 from completesplat.scene import SceneBatch, Views
+from completesplat.settings.schema import Entries, Positive, Range, Share, check_value, hints_of
+
+
+def _check(name: str, settings: object) -> None:
+    for key, annotation in hints_of(type(settings)).items():
+        check_value(f"{name}.{key}", annotation, getattr(settings, key))
 
 
 @dataclass(frozen=True)
@@ -32,17 +39,13 @@ class ColorJitter:
         CompleteSplatError: a strength is negative or not finite, or the hue is above 0.5.
     """
 
-    brightness: float
-    contrast: float
-    saturation: float
-    hue: float
+    brightness: Annotated[float, Range(0)]
+    contrast: Annotated[float, Range(0)]
+    saturation: Annotated[float, Range(0)]
+    hue: Annotated[float, Range(0, 0.5)]
 
     def __post_init__(self) -> None:
-        for name, strength in vars(self).items():
-            if not 0 <= strength < math.inf:
-                raise CompleteSplatError(f"color_jitter.{name} must be 0 or more, not {strength}")
-        if self.hue > 0.5:
-            raise CompleteSplatError(f"color_jitter.hue must be at most 0.5, half a turn, not {self.hue}")
+        _check("data.color_jitter", self)
 
     def __call__(
         self, images: Float[Tensor, "view 3 height width"], rng: np.random.Generator
@@ -80,17 +83,15 @@ class BoxMasks:
         CompleteSplatError: the probability or the sides lie outside of 0 to 1, or a range is empty.
     """
 
-    probability: float = 0.5
-    boxes: Sequence[int] = (1, 4)
-    sides: Sequence[float] = (0.1, 0.5)
+    probability: Share = 0.5
+    boxes: Annotated[Sequence[Positive], Entries(2, 2)] = (1, 4)
+    sides: Annotated[Sequence[Share], Entries(2, 2)] = (0.1, 0.5)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.probability <= 1:
-            raise CompleteSplatError(f"box_masks.probability must be from 0 to 1, not {self.probability}")
-        if len(self.boxes) != 2 or not 1 <= self.boxes[0] <= self.boxes[1]:
-            raise CompleteSplatError(f"box_masks.boxes must be the fewest and the most, 1 or more, not {self.boxes}")
-        if len(self.sides) != 2 or not 0 < self.sides[0] <= self.sides[1] <= 1:
-            raise CompleteSplatError(f"box_masks.sides must be a range within 0 to 1, not {self.sides}")
+        _check("data.box_masks", self)
+        for name, (least, most) in {"boxes": self.boxes, "sides": self.sides}.items():
+            if least > most:
+                raise CompleteSplatError(f"data.box_masks.{name}=[{least}, {most}]: the first number is the smallest")
 
     def __call__(self, height: int, width: int, rng: np.random.Generator) -> Float[Tensor, "1 {height} {width}"]:
         """Return 1 where the image is visible and 0 in the boxes, which lie inside the image on whole pixels."""

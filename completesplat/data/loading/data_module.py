@@ -20,32 +20,17 @@ from completesplat.data.loading.latent_cache import CachedTrainingScenes, Latent
 from completesplat.data.loading.loader import EpochSampler, SceneLoader
 from completesplat.data.loading.scenes import Choice, EvaluationScenes, SceneStore, TrainingScenes
 from completesplat.data.loading.training_statistics import TypicalCamera, feature_moments, mean_camera, mean_image
-from completesplat.data.packed.manifest import is_packed, settings_must_match
-from completesplat.data.packed.remote import local_root
-from completesplat.data.packed.source import PackedSource
+from completesplat.data.packed.manifest import Scalar, is_packed, settings_must_match
+from completesplat.data.packed.source import PackedSource, local_root
 from completesplat.data.sequences import PosedSequence, SequenceSource
 from completesplat.data.validation import TooFewFrames, at
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.settings.schema import Natural, OneOf, Positive, Range, Share, Side, check_value, hints_of
 
 MOST_WORKERS = 4  # if data.workers is null
-WORKERS_OF_A_CORE = 4  # upper limit of data.workers for each core
 SPLITS_OF_STAGE = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 logger = logging.getLogger(__name__)
-
-
-def _check_settings(settings: Mapping[str, Any], latent_cache: str | None, augmented: bool) -> None:
-    """Refuse settings of `SceneDataModule` that are out of range, or that would change images with cached latents."""
-    hints, workers, cores = hints_of(SceneDataModule.__init__), settings["workers"], os.cpu_count() or 1
-    for name, value in settings.items():
-        check_value(f"data.{name}", hints[name], value)
-    if workers is not None and workers > WORKERS_OF_A_CORE * cores:
-        message = f"must not be above {WORKERS_OF_A_CORE} for each of {cores} cores"
-        raise CompleteSplatError(f"data.workers={workers}: {message}")
-    if latent_cache is not None and (augmented or settings["background"] is not None):
-        unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
-        raise CompleteSplatError(f"data.latent_cache is of pictures as they are: set {unchanged}")
 
 
 class SceneDataModule(LightningDataModule):
@@ -54,7 +39,7 @@ class SceneDataModule(LightningDataModule):
     The random choices of training depend on the seed, the epoch and the item only.
 
     Args:
-        root: folder of the data set or of its prepared form, or the address of the prepared form (`packed.remote`).
+        root: folder of the data set or of its prepared form, or the address of the prepared form (`packed.source`).
         batch_size: scenes of an optimizer step, summed over all training processes and accumulated batches.
         targets: target views of a training scene (not stated by the paper); 0 for latent diffusion, which needs none.
         evaluation_batch_size: scenes of an evaluation batch; 1 is used if scenes have different numbers of targets.
@@ -85,7 +70,7 @@ class SceneDataModule(LightningDataModule):
         color_jitter: Mapping[str, float] | None = None,
         box_masks: Mapping[str, Any] | None = None,
         horizontal_flip: bool = False,
-        workers: Natural | None = 0,
+        workers: Annotated[int, Range(0, 256)] | None = 0,
         cache: bool = False,
         latent_cache: str | None = None,
         on_bad: Annotated[str, OneOf(("skip", "raise"))] = "skip",
@@ -94,9 +79,12 @@ class SceneDataModule(LightningDataModule):
         seed: Natural = 0,
     ) -> None:
         super().__init__()
-        augmented = color_jitter is not None or horizontal_flip
         ranged = {"targets": targets, "mask_threshold": mask_threshold, "background": background}
-        _check_settings(ranged | {"workers": workers, "on_bad": on_bad}, latent_cache, augmented)
+        for name, value in (ranged | {"workers": workers, "on_bad": on_bad}).items():
+            check_value(f"data.{name}", hints_of(SceneDataModule.__init__)[name], value)
+        if latent_cache is not None and (color_jitter is not None or horizontal_flip or background is not None):
+            unchanged = "data.color_jitter=null data.horizontal_flip=false data.background=null"
+            raise CompleteSplatError(f"data.latent_cache is of images as they are: set {unchanged}")
         self.root = local_root(root)
         self.image_size = image_size
         self.batch_size = batch_size
@@ -120,7 +108,7 @@ class SceneDataModule(LightningDataModule):
         self._stores: dict[str, SceneStore] = {}
 
     @abstractmethod
-    def packed_settings(self) -> dict[str, Any]:
+    def packed_settings(self) -> dict[str, Scalar]:
         """Return the settings that determine images, cameras and splits; prepared data must have the same."""
 
     @abstractmethod
@@ -262,16 +250,16 @@ class SceneDataModule(LightningDataModule):
         return SceneLoader(local, batch_size, None, self.workers, *self.policy)
 
     @cached_property
-    def trained_on(self) -> dict[str, Any]:
+    def trained_on(self) -> dict[str, str | int]:
         """Fingerprint and number of sequences of the training data, as they were at the first access."""
         source = self.source("train")
         return {"fingerprint": source.fingerprint(), "sequences": len(source.names)}
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, str | int]:
         """Return fingerprint and size of the training data for checkpoints."""
         return dict(self.trained_on)
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: dict[str, str | int]) -> None:
         """Compare the training data with those of the run that is resumed; with `allow_changed`, only warn.
 
         Raises:
@@ -292,7 +280,7 @@ class SceneDataModule(LightningDataModule):
         with at(file=self.root):
             return mean_camera(self.store("train"))
 
-    def training_facts(self) -> dict[str, Any]:
+    def training_facts(self) -> dict[str, float | list[float]]:
         """Return the facts about training images that weights store (`completesplat.opening.parts.TrainingImages`)."""
         hidden = 0.0 if self.box_masks is None else self.box_masks.probability
         return {"box_masks": hidden, **feature_moments(self.store("train"))}

@@ -1,11 +1,13 @@
 """Rank of this training process, and values gathered from all of them."""
 
-from typing import Any
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from completesplat.errors import CompleteSplatError
+
+T = TypeVar("T")
 
 
 def processes() -> tuple[int, int]:
@@ -21,12 +23,12 @@ def is_first() -> bool:
     return processes()[0] == 0
 
 
-def gathered(value: Any) -> list[Any]:
+def gathered(value: T) -> list[T]:
     """Gather the values of all processes in rank order; every process must call this."""
     count = processes()[1]
     if count == 1:
         return [value]
-    values: list[Any] = [None] * count
+    values = [value] * count
     torch.distributed.all_gather_object(values, value)
     return values
 

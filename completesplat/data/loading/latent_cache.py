@@ -6,10 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import reduce
 from hashlib import sha256
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -21,7 +19,6 @@ from completesplat.data.loading.scenes import Choice, SceneStore, TrainingScenes
 from completesplat.data.packed.manifest import MANIFEST, Scalar, differences, json_text, read_as
 from completesplat.data.sequences import SequenceSource
 from completesplat.data.validation import (
-    BadAnnotation,
     ChangedFile,
     MissingFile,
     UnreadableFile,
@@ -60,11 +57,6 @@ class CachedSequence:
     first: int
     stored: tuple[int, ...]
 
-    def __post_init__(self) -> None:
-        # They must be strictly increasing, at least 0 and below `frames`.
-        if not self.stored or any(b <= a for a, b in pairwise((-1, *self.stored, self.frames))):
-            raise BadAnnotation("stored frames must be places in the sequence, in order")
-
 
 @dataclass(frozen=True)
 class Origin:
@@ -96,19 +88,6 @@ class LatentCacheManifest:
     checksums: str
     sha256: str = NO_SUM
 
-    def __post_init__(self) -> None:
-        rows, shapes = sum(len(s.stored) for s in self.sequences), {n: a.shape for n, a in self.arrays.items()}
-        for true, reason in [
-            (set(shapes) == {*ARRAYS, CHECKSUMS}, f"arrays other than {', '.join(ARRAYS)}, {CHECKSUMS}"),
-            (all(len(s) == 4 and s[0] == rows for s in shapes.values()), f"arrays without {rows} rows of 3 axes"),
-            (shapes.get("mean") == shapes.get("log_variance"), "means and log-variances of different shapes"),
-            (all(0 <= s.first <= rows - len(s.stored) for s in self.sequences), "rows outside of the arrays"),
-            (len({s.name for s in self.sequences}) == len(self.sequences), "two sequences of one name"),
-            (min(self.std) > 0, f"std must be above 0, not {self.std}"),
-        ]:
-            if not true:
-                raise BadAnnotation(reason)
-
 
 def is_latent_cache(root: Path) -> bool:
     """Return whether a folder holds a finished store."""
@@ -123,9 +102,8 @@ def write_manifest(root: Path, manifest: LatentCacheManifest) -> None:
 
 def row_checksums(rows: Mapping[str, Shaped[np.ndarray, "row _ _ _"]]) -> Shaped[np.ndarray, "row 1 1 1"]:
     """Return one CRC-32 for each row, computed over all arrays in order."""
-    sums = [
-        reduce(lambda value, name: crc32(rows[name][i].tobytes(), value), ARRAYS, 0) for i in range(len(rows["mean"]))
-    ]
+    content = zip(*(rows[name] for name in ARRAYS), strict=True)
+    sums = [reduce(lambda value, part: crc32(part.tobytes(), value), parts, 0) for parts in content]
     return np.array(sums, dtype=np.uint32).reshape(-1, 1, 1, 1)
 
 
@@ -188,11 +166,11 @@ def open_array(root: Path, array: Array) -> np.memmap:
         try:
             mapped = np.load(path, mmap_mode="r", allow_pickle=False)
         except (ValueError, EOFError, OSError) as error:
-            raise UnreadableFile(f"damaged or no NumPy array: encode the pictures again ({error})") from None
+            raise UnreadableFile(f"damaged or no NumPy array: encode the images again ({error})") from None
         if not isinstance(mapped, np.memmap) or mapped.shape != array.shape or mapped.dtype != np.dtype(array.dtype):
-            raise ChangedFile("not the array that the manifest describes: encode the pictures again")
+            raise ChangedFile("not the array that the manifest describes: encode the images again")
         if path.stat().st_size != mapped.offset + mapped.nbytes:
-            raise ChangedFile("longer than it was written: encode the pictures again")
+            raise ChangedFile("longer than it was written: encode the images again")
         return mapped
 
 
@@ -210,19 +188,19 @@ class LatentCache:
         if not is_latent_cache(folder):
             raise MissingFile("no finished latent cache: completesplat data latents makes one", str(folder))
         self.folder = folder
-        self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the pictures again")
+        self.manifest = read_as(LatentCacheManifest, folder / MANIFEST, HEADER, "encode the images again")
         text, digest = (folder / MANIFEST).read_text(), self.manifest.sha256
         if sha256(text.replace(digest, NO_SUM).encode()).hexdigest() != digest:
-            raise ChangedFile("its checksum is another: encode the pictures again", str(folder / MANIFEST))
+            raise ChangedFile("its checksum is another: encode the images again", str(folder / MANIFEST))
         self.origin = self.manifest.origin
         self.mean, self.std = self.manifest.mean, self.manifest.std
         self.arrays = {name: open_array(folder, array) for name, array in self.manifest.arrays.items()}
         checksums = folder / self.manifest.arrays[CHECKSUMS].file
         if sha256_of(checksums) != self.manifest.checksums:
-            raise ChangedFile("its checksum is another: encode the pictures again", str(checksums))
+            raise ChangedFile("its checksum is another: encode the images again", str(checksums))
         self.sequences = {sequence.name: sequence for sequence in self.manifest.sequences}
         self.latent_shape = self.manifest.arrays["mean"].shape[1:]  # channels, height and width
-        self.holds_pictures = self.origin.conditioning is None  # rather than features
+        self.holds_images = self.origin.conditioning is None  # rather than features
 
     def scene(self, name: str, frame: int) -> CachedScene:
         """Return the frame with this index in a sequence, without batch axis, in float32.
@@ -236,9 +214,9 @@ class LatentCache:
         row = sequence.first + sequence.stored.index(frame)
         rows = {name: np.array(array[row : row + 1]) for name, array in self.arrays.items()}
         if row_checksums(rows) != rows[CHECKSUMS]:
-            raise ChangedFile("its checksum is another: encode the pictures again", str(self.folder), name, frame)
+            raise ChangedFile("its checksum is another: encode the images again", str(self.folder), name, frame)
         mean, log_variance, condition = (torch.from_numpy(rows[array][0].astype(np.float32)) for array in ARRAYS)
-        if self.holds_pictures:
+        if self.holds_images:
             # The same division as for images that are read from the data set, for bitwise equal results.
             condition = torch.from_numpy(np.divide(rows["condition"][0], 255, dtype=np.float32))
         return CachedScene(mean, log_variance, condition, torch.tensor(frame), name)
@@ -255,7 +233,7 @@ class LatentCache:
         if self.origin.data != source.fingerprint() or list(self.sequences) != source.names:
             raise DataError("made from other data than the training set now: encode it again", str(self.folder))
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[type["LatentCache"], tuple[Path]]:
         # Worker processes map the files themselves, because pickling an array would copy all of it.
         return LatentCache, (self.folder,)
 
@@ -280,9 +258,9 @@ class CachedTrainingScenes(TrainingScenes):
         seed: int,
     ) -> None:
         super().__init__(store, choose, lambda scene, rng: scene, references, seed)
-        if box_masks is not None and not cache.holds_pictures:
+        if box_masks is not None and not cache.holds_images:
             raise CompleteSplatError(
-                "data.box_masks cannot hide parts of encoded features: use data.latent_cache=null, or encode pictures"
+                "data.box_masks cannot hide parts of encoded features: use data.latent_cache=null, or encode images"
             )
         self.cache = cache
         self.box_masks = box_masks

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch.utils.data import DataLoader, Sampler
+from torch.utils.data.dataloader import _BaseDataLoaderIter
 
 from completesplat.data.loading.distributed import processes
 from completesplat.data.loading.scenes import EvaluationScenes, TrainingScenes, collate
@@ -124,11 +125,11 @@ class SceneLoader:
     # Lightning ends the worker processes that it finds under this name. The garbage collector would wait 5 seconds for
     # each of them, and delay the training process.
     @property
-    def _iterator(self) -> Any:
+    def _iterator(self) -> _BaseDataLoaderIter | None:
         return self._loader._iterator
 
     @_iterator.setter
-    def _iterator(self, iterator: Any) -> None:
+    def _iterator(self, iterator: _BaseDataLoaderIter | None) -> None:
         self._loader._iterator = iterator
 
     @property
@@ -139,7 +140,7 @@ class SceneLoader:
         """Return the current epoch and the number of its batches that were yielded."""
         return {"epoch": self._epoch, "batches": self._batches}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, int]) -> None:
         """Let the next iteration start after the batches counted in `state`, if the epoch is still the same."""
         self._resume = dict(state)
 

@@ -56,14 +56,13 @@ class SceneStore:
         self.names = list(names)
         self.mask_threshold = mask_threshold
         self.background = background
-        self._pictures: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
+        self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
         """Return the scene of the frames with these indices in the reference camera's frame, if all can be read."""
         views = [reference, *targets]
-        pictures = [self._picture(sequence, view) for view in views]
-        images = _shares([picture.image for picture in pictures])
-        masks = self._masks(pictures)
+        pairs = [self._read(sequence, view) for view in views]
+        images, masks = _shares([pair.image for pair in pairs]), self._masks(pairs)
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
         seen, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
         ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
@@ -71,32 +70,32 @@ class SceneStore:
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
         """Return one image, if it can be read."""
-        return self._picture(sequence, view).image
+        return self._read(sequence, view).image
 
-    def _picture(self, sequence: PosedSequence, view: int) -> MaskedImage:
+    def _read(self, sequence: PosedSequence, view: int) -> MaskedImage:
         key = sequence.name, view
-        if self._pictures is None:
+        if self._cache is None:
             return self._on_background(sequence.read(view))
-        if key not in self._pictures:
-            self._pictures[key] = self._on_background(sequence.read(view))
-        return self._pictures[key]
+        if key not in self._cache:
+            self._cache[key] = self._on_background(sequence.read(view))
+        return self._cache[key]
 
-    def _masks(self, pictures: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
-        everywhere = torch.full_like(pictures[0].image[:1], 255)
-        masks = _shares([everywhere if picture.mask is None else picture.mask for picture in pictures])
+    def _masks(self, pairs: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
+        everywhere = torch.full_like(pairs[0].image[:1], 255)
+        masks = _shares([everywhere if pair.mask is None else pair.mask for pair in pairs])
         return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
 
-    def _on_background(self, picture: MaskedImage) -> MaskedImage:
-        if self.background is None or picture.mask is None:
-            return picture
-        mask = self._masks([picture])[0].numpy()
-        mixed = np.rint(picture.image.numpy() * mask + 255 * self.background * (1 - mask))
-        return picture._replace(image=torch.from_numpy(mixed.astype(np.uint8)))
+    def _on_background(self, pair: MaskedImage) -> MaskedImage:
+        if self.background is None or pair.mask is None:
+            return pair
+        mask = self._masks([pair])[0].numpy()
+        mixed = np.rint(pair.image.numpy() * mask + 255 * self.background * (1 - mask))
+        return pair._replace(image=torch.from_numpy(mixed.astype(np.uint8)))
 
 
-def _shares(pictures: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
+def _shares(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
     # NumPy, because torch would start its threads for little work, and they would block cores that others need.
-    return torch.from_numpy(np.divide([picture.numpy() for picture in pictures], 255, dtype=np.float32))
+    return torch.from_numpy(np.divide([image.numpy() for image in images], 255, dtype=np.float32))
 
 
 class TrainingScenes(Dataset[Loaded]):
@@ -224,15 +223,15 @@ def _with_depths(scene: SceneBatch, depths: Float[Tensor, "view 1 height width"]
 def collate(items: Sequence[Loaded]) -> Loaded:
     """Stack the scenes that could be read; if only some have depths, the depths of the others are 0 (unknown)."""
     scenes = [item.scenes for item in items if item.scenes is not None]
-    with_depths = [isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes]
-    if any(with_depths):
-        scenes = [scene if has else _with_unknown_depths(scene) for scene, has in zip(scenes, with_depths, strict=True)]
+    if any(isinstance(scene, SceneBatch) and scene.reference.depths is not None for scene in scenes):
+        scenes = [
+            _with_depths(scene, torch.zeros_like(scene.all_views().masks))
+            if isinstance(scene, SceneBatch) and scene.reference.depths is None
+            else scene
+            for scene in scenes
+        ]
     return Loaded(
         stack(scenes) if scenes else None,
         tuple(error for item in items for error in item.refused),
         tuple(error for item in items for error in item.refused_depths),
     )
-
-
-def _with_unknown_depths(scene: SceneBatch | CachedScene) -> SceneBatch | CachedScene:
-    return _with_depths(scene, torch.zeros_like(scene.all_views().masks)) if isinstance(scene, SceneBatch) else scene

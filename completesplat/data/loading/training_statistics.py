@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from completesplat.data.images.photograph import image_features
@@ -15,9 +15,9 @@ from completesplat.errors import DataError
 from completesplat.geometry.cameras import Cameras
 
 # A mean over all images of RealEstate10K's 66,033 training clips would take hours.
-SEQUENCES, PICTURES = 400, 8192
+SEQUENCES, IMAGES = 400, 8192
 # Fewer images suffice for the standard deviations of eight features.
-FEATURE_PICTURES, SMALLEST_DEVIATION = 1024, 1e-3
+FEATURE_IMAGES, SMALLEST_DEVIATION = 1024, 1e-3
 
 
 class TypicalCamera(NamedTuple):
@@ -60,21 +60,15 @@ def mean_camera(store: SceneStore) -> TypicalCamera:
 def mean_image(store: SceneStore, size: int) -> Float[Tensor, "3 {size} {size}"]:
     """Average the images of the same frames; return black if none can be read."""
     total, count = torch.zeros(3, size, size, dtype=torch.float64), 0
-    for sequence, frames in excerpts(store):
-        for frame in frames:
-            with suppress(DataError):
-                total += store.image(sequence, frame)
-                count += 1
+    for image in _images(store, IMAGES):
+        total += image
+        count += 1
     return (total / (255 * max(count, 1))).float()
 
 
 def feature_moments(store: SceneStore) -> dict[str, list[float]]:
     """Return mean and standard deviation of `image_features` over about 1,024 images; empty if none can be read."""
-    rows = []
-    for sequence, frames in excerpts(store, FEATURE_PICTURES):
-        for frame in frames:
-            with suppress(DataError):
-                rows.append(image_features(store.image(sequence, frame).double() / 255))
+    rows = [image_features(image.double() / 255) for image in _images(store, FEATURE_IMAGES)]
     if not rows:
         return {}
     features = torch.stack(rows)
@@ -82,10 +76,17 @@ def feature_moments(store: SceneStore) -> dict[str, list[float]]:
     return {"picture_mean": features.mean(0).tolist(), "picture_std": deviation.tolist()}
 
 
-def excerpts(store: SceneStore, pictures: int = PICTURES) -> Iterator[tuple[PosedSequence, list[int]]]:
-    """Yield the first sequences that can be read, each with evenly spaced frames, about `pictures` frames in total."""
+def _images(store: SceneStore, images: int) -> Iterator[UInt8[Tensor, "3 height width"]]:
+    for sequence, frames in excerpts(store, images):
+        for frame in frames:
+            with suppress(DataError):
+                yield store.image(sequence, frame)
+
+
+def excerpts(store: SceneStore, images: int = IMAGES) -> Iterator[tuple[PosedSequence, list[int]]]:
+    """Yield the first sequences that can be read, each with evenly spaced frames, about `images` frames in total."""
     names = store.names[:SEQUENCES]
-    most = pictures // len(names)
+    most = images // len(names)
     for name in names:
         with suppress(DataError):
             sequence = store.source.read(name)

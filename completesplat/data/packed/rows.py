@@ -5,7 +5,6 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,22 +19,17 @@ from completesplat.data.validation import BadAnnotation, BadImage, ChangedFile, 
 from completesplat.geometry.cameras import Cameras, crop_resize
 
 # Pillow's arguments by codec. BMP is uncompressed: more than twice the bytes of PNG, decoded in a ninth of the time.
-CODECS: dict[str, dict[str, Any]] = {
-    "png": {"format": "PNG"},
-    "jpeg": {"format": "JPEG", "quality": 95, "subsampling": 0},
-    "bmp": {"format": "BMP"},
-}
+CODECS: dict[str, dict[str, int]] = {"png": {}, "jpeg": {"quality": 95, "subsampling": 0}, "bmp": {}}
 # Number of values for each frame in the columns that `checksum` covers.
 WIDTHS = {"frames": 1, "world_to_camera": 16, "intrinsics": 9, "depth_ranges": 2}
 
 
-def encode(picture: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
+def encode(image: UInt8[Tensor, "channel size size"], codec: str) -> bytes:
     """Return an image file with three channels (colour) or one (grey); PNG and BMP are lossless."""
     # NumPy reorders the channels, here and below, because starting PyTorch's threads costs more than the work itself.
-    channels_last = np.ascontiguousarray(picture.numpy().transpose(1, 2, 0))
-    image = Image.fromarray(channels_last.squeeze(-1) if len(picture) == 1 else channels_last)
+    pixels = np.ascontiguousarray(image.numpy().transpose(1, 2, 0))
     content = io.BytesIO()
-    image.save(content, **CODECS[codec])
+    Image.fromarray(pixels.squeeze(-1) if len(image) == 1 else pixels).save(content, codec.upper(), **CODECS[codec])
     return content.getvalue()
 
 
@@ -48,21 +42,20 @@ def decode(content: bytes, channels: int, size: int, wanted: int) -> UInt8[Tenso
     try:
         with Image.open(io.BytesIO(content), formats=("PNG", "JPEG", "BMP")) as image:
             # The header is checked before the pixels are decoded, so that no file unpacks to a huge image.
-            wrong = image.size != (size, size) or len(image.getbands()) != channels
-            if not wrong and wanted != size:
+            if image.size != (size, size) or image.mode != {1: "L", 3: "RGB"}[channels]:
+                raise ValueError(f"no image of {size} x {size} pixels with {channels} channels of 8 bits")
+            if wanted != size:
                 return cut_square(image, Square(0, 0, size), wanted)
-            pixels = None if wrong else np.array(image)
+            pixels = np.array(image).reshape(size, size, channels)
     # On damaged files, Pillow's decoders raise almost any exception: OSError, SyntaxError, struct.error, KeyError, ...
     except Exception as error:
         raise BadImage(f"cannot be decoded: {error}") from error
-    if pixels is None or pixels.dtype != np.uint8:
-        raise BadImage(f"is no picture of {size} x {size} pixels with {channels} channels of 8 bits")
-    return torch.from_numpy(np.ascontiguousarray(pixels.reshape(size, size, channels).transpose(2, 0, 1)))
+    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
 @cache
-def features() -> Any:
-    """Return the columns (`datasets.Features`). Values of all frames are flattened in row-major order.
+def schema() -> pa.Schema:
+    """Return the columns, which `datasets` reads as well. Values of all frames are flattened in row-major order.
 
     `picture_checksums` are the CRC-32 of each frame's image and mask, because Pillow ignores PNG's checksums and JPEG
     has none. `checksum` covers the other columns. A mask may be null. Types are large because rows can exceed 2 GB.
@@ -70,24 +63,24 @@ def features() -> Any:
     # A local import, because it takes a second and 70 MB, which users of raw data should not pay.
     from datasets import Features, LargeList, Value
 
-    return Features(
-        {
-            "name": Value("string"),
-            "size": Value("int64"),
-            "frames": LargeList(Value("int64")),
-            "world_to_camera": LargeList(Value("float64")),
-            "intrinsics": LargeList(Value("float64")),
-            "depth_ranges": LargeList(Value("float32")),
-            "images": LargeList(Value("large_binary")),
-            "masks": LargeList(Value("large_binary")),
-            "picture_checksums": LargeList(Value("int64")),
-            "checksum": Value("int64"),
-        }
-    )
+    integers, floats, files = (LargeList(Value(kind)) for kind in ("int64", "float64", "large_binary"))
+    columns = {
+        "name": Value("string"),
+        "size": Value("int64"),
+        "frames": integers,
+        "world_to_camera": floats,
+        "intrinsics": floats,
+        "depth_ranges": LargeList(Value("float32")),
+        "images": files,
+        "masks": files,
+        "picture_checksums": integers,
+        "checksum": Value("int64"),
+    }
+    return Features(columns).arrow_schema
 
 
 @dataclass(frozen=True)
-class EncodedPicture:
+class EncodedImage:
     """Encoded files of an image and of its mask, if it has one."""
 
     image: bytes
@@ -98,19 +91,19 @@ class EncodedPicture:
         return zlib.crc32(self.mask or b"", zlib.crc32(self.image))
 
 
-def encode_picture(sequence: PosedSequence, index: int, codec: str) -> EncodedPicture:
+def encode_image(sequence: PosedSequence, index: int, codec: str) -> EncodedImage:
     """Encode a frame's image, and its mask without loss, after a check that both have their camera's size."""
     image, mask = sequence.read(index)
     for part in (image, mask):
         if part is not None and tuple(part.shape[1:]) != sequence.cameras.image_size:
             raise BadImage(f"has {part.shape[1]} x {part.shape[2]} pixels, its camera {sequence.cameras.image_size}")
     without_loss = "png" if codec == "jpeg" else codec
-    return EncodedPicture(encode(image, codec), None if mask is None else encode(mask, without_loss))
+    return EncodedImage(encode(image, codec), None if mask is None else encode(mask, without_loss))
 
 
-def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[EncodedPicture]) -> pa.Table:
-    """Return a table of one row with the frames whose indices are `kept`, and their images."""
-    indices, cameras = list(kept), sequence.cameras
+def to_row(sequence: PosedSequence, usable: Sequence[int], images: Sequence[EncodedImage]) -> pa.Table:
+    """Return a table of one row with the frames whose indices are `usable`, and their `images`."""
+    indices, cameras = list(usable), sequence.cameras
     numbers = {
         "frames": np.array([sequence.frames[index] for index in indices], dtype=np.int64),
         "world_to_camera": cameras.world_to_camera[indices].double().numpy().ravel(),
@@ -122,12 +115,12 @@ def to_row(sequence: PosedSequence, kept: Sequence[int], pictures: Sequence[Enco
         "name": sequence.name,
         "size": size,
         **numbers,
-        "images": [picture.image for picture in pictures],
-        "masks": [picture.mask for picture in pictures],
-        "picture_checksums": [picture.checksum() for picture in pictures],
+        "images": [encoded.image for encoded in images],
+        "masks": [encoded.mask for encoded in images],
+        "picture_checksums": [encoded.checksum() for encoded in images],
         "checksum": _checksum(sequence.name, size, numbers),
     }
-    return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=features().arrow_schema)
+    return pa.Table.from_pydict({name: [value] for name, value in row.items()}, schema=schema())
 
 
 def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None) -> PosedSequence:
@@ -159,7 +152,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
         def read(index: int) -> MaskedImage:  # It does not access the bytes of other frames.
             with at(file=file, sequence=name, frame=frames[index]):
                 image, mask = images[index].as_py(), masks[index].as_py()
-                if image is None or EncodedPicture(image, mask).checksum() != checksums[index]:
+                if image is None or EncodedImage(image, mask).checksum() != checksums[index]:
                     raise BadImage("is no longer what was written")
                 return MaskedImage(
                     decode(image, 3, size, wanted), None if mask is None else decode(mask, 1, size, wanted)
@@ -170,7 +163,7 @@ def from_row(row: pa.Table, file: str, name: str, image_size: int | None = None)
 
 def _values(row: pa.Table, column: str, count: int | None = None) -> pa.Array:
     values = row.column(column)[0].values
-    if values is None or len(values) != (len(values) if count is None else count):
+    if values is None or count not in (None, len(values)):
         raise BadAnnotation(f"{column} must have {'some' if count is None else count} values")
     return values
 

@@ -1,18 +1,89 @@
-"""Reader of a packed store, which maps a shard into memory when one of its sequences is read."""
+"""Reader of a packed store, in a folder or behind an address (http, https, s3, gs, hf, ...).
 
+A shard is mapped into memory when one of its sequences is read. From an address, fsspec fetches it into a local folder.
+"""
+
+import hashlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
+from filelock import FileLock
 
 from completesplat.data.packed.manifest import MANIFEST, Shard, read_manifest
-from completesplat.data.packed.remote import address_of, fetched
-from completesplat.data.packed.rows import features, from_row
+from completesplat.data.packed.rows import from_row, schema
 from completesplat.data.sequences import PosedSequence, SequenceSource
-from completesplat.data.validation import BadAnnotation, ChangedFile, UnreadableFile, at, inside, require_file
+from completesplat.data.validation import (
+    BadAnnotation,
+    ChangedFile,
+    MissingFile,
+    UnreadableFile,
+    at,
+    inside,
+    require_file,
+)
 from completesplat.errors import DataError
+from completesplat.files import atomic_path
 from completesplat.weights import sha256_of
+
+ADDRESS = "address.txt"
+
+
+def local_root(root: str) -> Path:
+    """Return a local folder as it is; for an address, fetch the manifest into a folder below `COMPLETESPLAT_CACHE`.
+
+    A store that was made again at the same address gets another folder, which depends on the manifest's digest.
+
+    Raises:
+        DataError: nothing can be fetched from the address.
+    """
+    if "://" not in root:
+        return Path(root)
+    place = os.environ.get("COMPLETESPLAT_CACHE", "~/.cache/completesplat")
+    folder = Path(place).expanduser() / "stores" / _digest(root.encode())
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / ".lock"):
+        _get(root, MANIFEST, folder / MANIFEST)
+        store = folder / _digest((folder / MANIFEST).read_bytes())
+        store.mkdir(exist_ok=True)
+        for name, content in ((ADDRESS, root.encode()), (MANIFEST, (folder / MANIFEST).read_bytes())):
+            with atomic_path(store / name) as temporary:
+                temporary.write_bytes(content)
+    return store
+
+
+def _fetch(address: str, shard: Shard, path: Path) -> None:
+    """Fetch a shard if its local file is missing; one process fetches it while the others wait.
+
+    Raises:
+        MissingFile: the shard cannot be fetched.
+        ChangedFile: its checksum differs from the manifest's.
+    """
+    if path.is_file():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_name(f".{path.name}.lock")):
+        if not path.is_file():
+            with atomic_path(path, size=shard.bytes) as temporary:
+                _get(address, shard.file, temporary)
+                if sha256_of(temporary) != shard.sha256:
+                    raise ChangedFile("its checksum is not that of the manifest", f"{address}/{shard.file}")
+
+
+def _get(address: str, name: str, path: Path) -> None:
+    import fsspec  # a slow import
+
+    try:
+        files, folder = fsspec.core.url_to_fs(address.rstrip("/"))
+        files.get_file(f"{folder}/{name}", str(path))
+    except Exception as error:  # each kind of store raises other exceptions
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise MissingFile(f"cannot be fetched ({reason})", f"{address}/{name}") from error
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 class PackedSource(SequenceSource):
@@ -25,8 +96,7 @@ class PackedSource(SequenceSource):
     def __init__(self, root: Path, split: str, image_size: int | None = None) -> None:
         splits = read_manifest(root).splits
         if split not in splits:
-            there = ", ".join(splits) or "none"
-            raise DataError(f"no split {split} in this packed store; there are: {there}", str(root))
+            raise DataError(f"no split {split} in this packed store; there are: {', '.join(splits)}", str(root))
         entry = splits[split]
         self.root = root
         self.image_size = image_size
@@ -39,34 +109,41 @@ class PackedSource(SequenceSource):
         self._places = {
             name: (number, row) for number, shard in enumerate(self.shards) for row, name in enumerate(shard.sequences)
         }
-        self._opened: dict[int, OpenShard] = {}
-        self.address = address_of(root)
+        self._opened: dict[int, _OpenShard] = {}
+        address = root / ADDRESS
+        # None: the store was made or copied here.
+        self.address = address.read_text() if address.is_file() else None
         with at(file=root / MANIFEST):
             for shard in self.shards:
                 path = inside(root, shard.file)
-                if self.address is not None and not path.is_file():
-                    continue
-                size = require_file(path).stat().st_size
-                if size != shard.bytes:
+                absent = self.address is not None and not path.is_file()
+                if not absent and (size := require_file(path).stat().st_size) != shard.bytes:
                     reason = f"{size:,} bytes, {shard.bytes:,} were written: prepare again into the same folder"
                     raise ChangedFile(reason, str(path))
 
     def read(self, name: str) -> PosedSequence:
         """Read one sequence, unless its shard is damaged; its images are decoded one by one when they are read."""
         number, row = self._places[name]
-        shard = self.shards[number]
-        path = self.root / shard.file
-        if number not in self._opened:
-            with at(sequence=name):
-                if self.address is not None:
-                    fetched(self.address, shard, path)
-                self._opened[number] = open_shard(path, shard)
+        path = self.root / self.shards[number].file
         with at(file=path, sequence=name):
             try:
-                table = self._opened[number][row]
+                table = self._shard(number, path)[row]
             except (pa.ArrowException, OSError, ValueError) as error:
-                raise UnreadableFile(f"damaged ({error})") from None
+                raise UnreadableFile(f"damaged, or not an Arrow file ({error})") from None
         return from_row(table, str(path), name, self.image_size)
+
+    def _shard(self, number: int, path: Path) -> "_OpenShard":
+        if number not in self._opened:
+            shard = self.shards[number]
+            if self.address is not None:
+                _fetch(self.address, shard, path)
+            opened = _OpenShard(require_file(path))
+            if not opened.schema.equals(schema()):
+                raise UnreadableFile("its columns are not those of a packed store")
+            if len(opened.places) != len(shard.sequences):
+                raise BadAnnotation(f"{len(opened.places)} sequences, the manifest says {len(shard.sequences)}")
+            self._opened[number] = opened
+        return self._opened[number]
 
     def groups(self, names: Sequence[str]) -> list[list[int]]:
         """Group sequences by shard if shards have to be fetched, so that training can start after the first one."""
@@ -87,18 +164,15 @@ class PackedSource(SequenceSource):
         paths = {require_file(self.root / shard.file): shard.sha256 for shard in self.shards}
         return [ChangedFile(reason, str(path)) for path, checksum in paths.items() if sha256_of(path) != checksum]
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         # Worker processes open the files themselves and share their memory pages.
         return {**self.__dict__, "_opened": {}}
 
 
-class OpenShard:
+class _OpenShard:
     """Memory-mapped shard, whose rows are record batches that are parsed when they are read.
 
     Arrow's description of a parsed batch takes 8 kB, or half a gigabyte in every process for all RealEstate10K clips.
-
-    Raises:
-        ArrowException, OSError: the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,33 +180,16 @@ class OpenShard:
             self._content = file.read_buffer()  # not a copy; the file itself need not stay open
         stream = pa.BufferReader(self._content)
         self.schema = pa.ipc.read_schema(stream)
-        self._places: list[int] = []
+        self.places: list[int] = []
         while (place := stream.tell()) < self._content.size:
             try:
                 pa.ipc.read_message(stream)
             except EOFError:  # the end-of-stream mark
                 break
-            self._places.append(place)
-
-    def __len__(self) -> int:
-        return len(self._places)
+            self.places.append(place)
 
     def __getitem__(self, row: int) -> pa.Table:
         """Return a table of one row."""
         stream = pa.BufferReader(self._content)
-        stream.seek(self._places[row])
+        stream.seek(self.places[row])
         return pa.Table.from_batches([pa.ipc.read_record_batch(pa.ipc.read_message(stream), self.schema)])
-
-
-def open_shard(path: Path, shard: Shard) -> OpenShard:
-    """Open a shard, which has one row for each sequence, after a check of its columns and number of rows."""
-    with at(file=path):
-        try:
-            opened = OpenShard(require_file(path))
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise UnreadableFile(f"not a readable Arrow file ({error})") from None
-        if not opened.schema.equals(features().arrow_schema):
-            raise UnreadableFile("its columns are not those of a packed store")
-        if len(opened) != len(shard.sequences):
-            raise BadAnnotation(f"{len(opened)} sequences, the manifest says {len(shard.sequences)}")
-        return opened

@@ -6,12 +6,15 @@ import logging
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+import pyarrow as pa
 from rich.filesize import decimal
 from rich.progress import Progress
 
@@ -28,12 +31,13 @@ from completesplat.data.packed.manifest import (
     parsed,
     write_json,
 )
-from completesplat.data.packed.rows import CODECS, EncodedPicture, encode_picture, features, to_row
-from completesplat.data.processes import map_in_processes
+from completesplat.data.packed.rows import CODECS, encode_image, schema, to_row
 from completesplat.data.sequences import SPLITS, PosedSequence, SequenceSource, spread_places
-from completesplat.data.validation import TooFewFrames, at, field, read_json
+from completesplat.data.validation import TooFewFrames, at, field, read_json, refused_to
+from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.files import atomic_path
+from completesplat.weights import sha256_of
 
 FEWEST_FRAMES = 2
 UNFINISHED = ".unfinished"
@@ -83,59 +87,40 @@ class ShardWriter:
             DataError: something cannot be read, and `on_bad` is "raise".
             DiskError: the disk is full.
         """
-        # ArrowWriter is public in `datasets` but undocumented. The documented functions (`from_list`, `from_generator`)
-        # hold a whole shard in memory or write it to a cache first.
-        from datasets.arrow_writer import ArrowWriter
-
         path = self.folder / plan.file
         refused: list[Refusal] = []
-        sequences, frames = [], 0
+        names, frames = [], 0
         # One record batch for each sequence, so that memory holds only one sequence.
         with atomic_path(path, f"{path.name}{UNFINISHED}") as unfinished:
-            with (
-                unfinished.open("wb") as stream,
-                ArrowWriter(features=features(), stream=stream, writer_batch_size=1) as writer,
-            ):
+            with unfinished.open("wb") as stream, pa.ipc.new_stream(stream, schema()) as writer:
                 for name in plan.names:
-                    try:
-                        sequence, usable, pictures = self._encode(plan.split, name, refused)
-                    except DataError as error:
-                        self._refuse(error, refused)
-                        continue
-                    writer.write_table(to_row(sequence, usable, pictures))
-                    sequences.append(name)
-                    frames += len(usable)
-                writer.finalize()
-            with unfinished.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-        shard = Shard(plan.file, digest, path.stat().st_size, frames, tuple(sequences))
+                    with refused_to(partial(self._refuse, refused)), at(sequence=name):
+                        row = self._encode(self.sources[plan.split].read(name), refused)
+                        writer.write_table(row)
+                        names.append(name)
+                        frames += len(row["frames"][0])
+            digest = sha256_of(unfinished)
+        shard = Shard(plan.file, digest, path.stat().st_size, frames, tuple(names))
         record = ShardRecord(plan.split, plan.names, shard, tuple(refused))
         write_json(_record_path(path), record)
         return record
 
-    def _encode(
-        self, split: str, name: str, refused: list[Refusal]
-    ) -> tuple[PosedSequence, list[int], list[EncodedPicture]]:
-        with at(sequence=name):
-            sequence = self.sources[split].read(name)
-            usable, pictures = [], []
-            for index, number in enumerate(sequence.frames):
-                try:
-                    with at(sequence=name, frame=number):
-                        pictures.append(encode_picture(sequence, index, self.codec))
-                    usable.append(index)
-                except DataError as error:
-                    self._refuse(error, refused)
-            if len(usable) < FEWEST_FRAMES:
-                raise TooFewFrames(f"{len(usable)} usable frames of {len(sequence.frames)}, {FEWEST_FRAMES} are needed")
-            return sequence, usable, pictures
+    def _encode(self, sequence: PosedSequence, refused: list[Refusal]) -> pa.Table:
+        usable, images = [], []
+        for index, number in enumerate(sequence.frames):
+            with refused_to(partial(self._refuse, refused)), at(frame=number, sequence=sequence.name):
+                images.append(encode_image(sequence, index, self.codec))
+                usable.append(index)
+        if len(usable) < FEWEST_FRAMES:
+            raise TooFewFrames(f"{len(usable)} usable frames of {len(sequence.frames)}, {FEWEST_FRAMES} are needed")
+        return to_row(sequence, usable, images)
 
-    def _refuse(self, error: DataError, refused: list[Refusal]) -> None:
+    def _refuse(self, refused: list[Refusal], error: DataError) -> None:
         if self.on_bad == "raise":
             raise error
         refused.append(Refusal.of(error))
 
-    def kept_record(self, plan: ShardPlan) -> ShardRecord | None:
+    def finished_record(self, plan: ShardPlan) -> ShardRecord | None:
         """Return the record of a shard that an earlier run wrote (without errors, if `on_bad` is "raise"), or None."""
         path = self.folder / plan.file
         try:
@@ -146,34 +131,29 @@ class ShardWriter:
         refused = record.refused and self.on_bad == "raise"
         return record if whole and record.names == plan.names and not refused else None
 
-    def plans(self, sequences_per_shard: int) -> list[ShardPlan]:
-        """Assign sequences to shards; a group of a source stays in one shard if it fits."""
-        plans = []
-        for split, source in self.sources.items():
-            parts = _parts(source, sequences_per_shard)
-            files = [f"{split}-{number:05d}-of-{len(parts):05d}.arrow" for number in range(len(parts))]
-            plans += [ShardPlan(file, split, names) for file, names in zip(files, parts, strict=True)]
-        return plans
-
 
 def _record_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.json")
 
 
-def _parts(source: SequenceSource, most: int) -> list[tuple[str, ...]]:
-    parts: list[tuple[str, ...]] = []
-    for group in source.groups(source.names):
-        names = [source.names[index] for index in group]
-        # A group that exceeds a shard is divided into nearly equal parts.
-        count = -(-len(names) // most)
-        edges = [round(len(names) * number / count) for number in range(count + 1)] if count else []
-        for start, end in pairwise(edges):
-            part = tuple(names[start:end])
-            if parts and len(parts[-1]) + len(part) <= most:
-                parts[-1] += part
-            else:
-                parts.append(part)
-    return parts
+def _plans(sources: Mapping[str, SequenceSource], sequences_per_shard: int) -> list[ShardPlan]:
+    """Assign sequences to shards; a group of a source stays in one shard if it fits."""
+    plans = []
+    for split, source in sources.items():
+        shards: list[tuple[str, ...]] = []
+        for group in source.groups(source.names):
+            # A group that exceeds a shard is divided into nearly equal parts.
+            count = -(-len(group) // sequences_per_shard)
+            edges = [round(len(group) * number / count) for number in range(count + 1)] if count else []
+            for start, end in pairwise(edges):
+                names = tuple(source.names[index] for index in group[start:end])
+                if shards and len(shards[-1]) + len(names) <= sequences_per_shard:
+                    shards[-1] += names
+                else:
+                    shards.append(names)
+        files = [f"{split}-{number:05d}-of-{len(shards):05d}.arrow" for number in range(len(shards))]
+        plans += [ShardPlan(file, split, names) for file, names in zip(files, shards, strict=True)]
+    return plans
 
 
 def _check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
@@ -183,22 +163,16 @@ def _check_space(writer: ShardWriter, plans: Sequence[ShardPlan]) -> None:
     for place in spread_places(len(names), SEQUENCES):
         split, name = names[place]
         # Sequences with errors are refused and counted when the shards are written.
-        try:
+        with suppress(DataError):
             sequence = writer.sources[split].read(name)
             for index in spread_places(len(sequence.frames), FRAMES):
-                encoded = encode_picture(sequence, index, writer.codec)
+                encoded = encode_image(sequence, index, writer.codec)
                 sizes.append(len(encoded.image) + len(encoded.mask or b""))
             frames.append(len(sequence.frames))
-        except DataError:
-            continue
-    if not frames or not sizes:
-        free = decimal(shutil.disk_usage(writer.folder).free)
-        logger.warning("no estimate of the size: none of the sequences looked at can be read; %s are free", free)
-        return
-    count = round(float(np.mean(frames)) * len(names))
-    size = round(count * (float(np.mean(sizes)) + BYTES_PER_FRAME))
-    contents = f"{count:,} frames of {len(names):,} sequences in {len(plans):,} shards"
-    require_space(size, contents, writer.folder)
+    if frames and sizes:
+        count = round(float(np.mean(frames)) * len(names))
+        size = round(count * (float(np.mean(sizes)) + BYTES_PER_FRAME))
+        require_space(size, f"{count:,} frames of {len(names):,} sequences in {len(plans):,} shards", writer.folder)
 
 
 def require_space(size: int, contents: str, folder: Path, advice: str = "") -> None:
@@ -241,9 +215,9 @@ def prepare(
     if codec not in CODECS:
         raise CompleteSplatError(f"codec={codec}: choose one of {', '.join(CODECS)}")
     writer = ShardWriter({split: sources[split] for split in sorted(sources, key=SPLITS.index)}, out, codec, on_bad)
-    plans = writer.plans(sequences_per_shard)
+    plans = _plans(writer.sources, sequences_per_shard)
     _claim(out, _plan(writer, settings, plans))
-    records = {plan: writer.kept_record(plan) for plan in plans}
+    records = {plan: writer.finished_record(plan) for plan in plans}
     missing = [plan for plan, record in records.items() if record is None]
     if is_packed(out) and not missing:
         logger.info("%s already holds these sequences", out)
@@ -266,7 +240,9 @@ def prepare(
     return out
 
 
-def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[ShardPlan]) -> dict[str, Any]:
+def _plan(
+    writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[ShardPlan]
+) -> dict[str, dict[str, Scalar]]:
     """Return everything that determines the shards' bytes."""
     shards = json.dumps([[plan.file, *plan.names] for plan in plans])
     return {
@@ -280,7 +256,7 @@ def _plan(writer: ShardWriter, settings: Mapping[str, Scalar], plans: Sequence[S
     }
 
 
-def _claim(out: Path, plan: dict[str, Any]) -> None:
+def _claim(out: Path, plan: Mapping[str, Mapping[str, Scalar]]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     path = out / PLAN
     if not path.is_file():

@@ -15,10 +15,9 @@ from completesplat.data.images.crop import cut_square, principal_square
 from completesplat.data.loading.scenes import Choice, SceneStore
 from completesplat.data.loading.view_selection import evaluation_views
 from completesplat.data.sequences import PosedSequence
-from completesplat.data.toy.disk import FORMAT_VERSION
 from completesplat.data.toy.object_scene import PATCH_COLORS, ToyScene, render_frame
-from completesplat.data.toy.objects import DRAW
 from completesplat.data.toy.raytracing import trace
+from completesplat.data.toy.writing import DRAW, FORMAT_VERSION, to_bytes
 from completesplat.data.validation import at, field, read_json
 from completesplat.errors import CompleteSplatError, DataError
 from completesplat.geometry.cameras import Cameras, invert_rigid, pinhole, pixel_centers, project, unproject
@@ -39,7 +38,7 @@ def unseen(scene: ToyScene, reference: int, frame: int, size: int) -> Bool[Tenso
     distances = offsets.norm(dim=-1)
     rays = (offsets / distances[:, None]) @ other.world_to_camera[:3, :3].mT
     pose = scene.camera_to_world[reference]
-    met = trace(scene.geometry, scene.surroundings, scene.patch, pose, np.ascontiguousarray(rays.numpy()[:, None]))[2]
+    met = trace(scene.shapes, scene.light, (scene.dome, scene.patch), pose, rays.numpy()[:, None].copy())[2]
     seen: Tensor = within & (torch.from_numpy(met) > (1 - CLOSER) * distances)
     return ~seen.view(size, size)
 
@@ -57,7 +56,7 @@ LEAK = 1.5 / 255
 # Smallest share of an image that the patch must cover.
 SMALLEST_PATCH = 0.005
 # Limit of the RMS difference between an image and its render: JPEG stays below, another patch colour above.
-SAME_PICTURE = 0.025
+SAME_IMAGE = 0.025
 
 Chosen = tuple[list[int], Float[Tensor, "mode view 3 size size"], Bool[Tensor, "view size size"]]
 
@@ -106,7 +105,7 @@ class ToyHiddenModes:
         # The scene that was drawn again must equal the one on the disk.
         drawn = torch.cat([self._render(toy, frames[reference])[None], truths[true_mode]])
         stored = torch.cat([scene.reference.images, scene.targets.images[0, list(views)]])
-        if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_PICTURE:
+        if (drawn - stored).square().mean((1, 2, 3)).sqrt().max() > SAME_IMAGE:
             raise self._other_set(name)
         hidden = [unseen(toy, frames[reference], frames[target], self.image_size) for target in targets]
         chances = torch.tensor(toy.chances, dtype=torch.float32)
@@ -131,9 +130,9 @@ class ToyHiddenModes:
 
     def _render(self, scene: ToyScene, frame: int) -> Float[Tensor, "3 size size"]:
         """Render a frame as if it was written to disk (without JPEG) and read again."""
-        picture = Image.fromarray(np.round(255 * render_frame(scene, frame, self.size)[0].clip(0, 1)).astype(np.uint8))
+        image = Image.fromarray(to_bytes(render_frame(scene, frame, self.size)[0]))
         square = principal_square((self.size / 2, self.size / 2), (self.size, self.size))
-        return cut_square(picture, square, self.image_size).float() / 255
+        return cut_square(image, square, self.image_size).float() / 255
 
     def _from_behind(self, scene: ToyScene, name: str, frames: tuple[int, ...], reference: int) -> Chosen:
         """Select views that show enough of the patch, most frontal ones first, with their truths and patch pixels."""
@@ -144,11 +143,11 @@ class ToyHiddenModes:
         for view in sorted(range(len(frames)), key=lambda view: -facing[frames[view]]):
             if len(chosen) == self.views or facing[frames[view]] <= 0:
                 break
-            pictures = self._truths(scene, frames[view])
-            region = self._differs(pictures, DIFFERENCE)
+            images = self._truths(scene, frames[view])
+            region = self._differs(images, DIFFERENCE)
             if view != reference and region.float().mean() >= SMALLEST_PATCH:
                 chosen.append(view)
-                truths.append(pictures)
+                truths.append(images)
                 regions.append(region)
         if not chosen:
             raise DataError("no view shows enough of the patch", sequence=name)

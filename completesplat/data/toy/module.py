@@ -8,8 +8,7 @@ from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.packed.manifest import is_packed
 from completesplat.data.realestate10k.module import RE10KDataModule
 from completesplat.data.toy.modes import ToyHiddenModes
-from completesplat.data.toy.objects import SUBSET, write_objects
-from completesplat.data.toy.rooms import ROOMS, write_rooms
+from completesplat.data.toy.writing import ROOMS, SUBSET, write_objects, write_rooms
 from completesplat.data.validation import MissingFile
 from completesplat.settings.schema import Natural, Positive, Side
 
@@ -91,7 +90,7 @@ class ToyRoomsDataModule(RE10KDataModule):
         home = Path(root)
         super().__init__(str(home if is_packed(home) else home / ROOMS / form), **reading)
         self.home, self.make = home, make
-        self.making: dict[str, Any] = {"scenes": scenes, "frames": frames, "size": height, "seed": data_seed}
+        self.making = scenes, frames, height, data_seed
 
     def describe(self) -> dict[str, str]:
         return super().describe() | {"data_set": ROOMS}
@@ -99,4 +98,4 @@ class ToyRoomsDataModule(RE10KDataModule):
     def prepare_data(self) -> None:
         """Write the rooms if there are none."""
         if _must_make(self.home, self.home / ROOMS, self.make):
-            write_rooms(self.home, **self.making)
+            write_rooms(self.home, *self.making)

@@ -1,14 +1,19 @@
-"""Random toy scenes: an object of one of two families, its surroundings, a hidden patch, and an orbit of cameras."""
+"""Random toy objects and minis: parts, surroundings, a hidden patch, and an orbit of cameras.
 
-import colorsys
-from dataclasses import dataclass, replace
+A mini is an ellipsoid with a nose on plain grey, the smallest scene with known alternatives for its back. The patch
+lies opposite the nose, so an image of the nose shows where the patch is, but not which of four colours it has. On
+marked minis the nose is light or dark, which determines the probability of each colour. They expose a model that
+learns only the overall frequency of the colours.
+"""
+
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TypeVar
 
 import numpy as np
 import torch
 
-from completesplat.data.toy.raytracing import (
+from completesplat.data.toy.raytracing import Dome, Light, Patch, trace
+from completesplat.data.toy.shapes import (
     CHECKS,
     ELLIPSOID,
     FRUSTUM,
@@ -16,83 +21,28 @@ from completesplat.data.toy.raytracing import (
     RIPPLES,
     STRIPES,
     Array,
-    Geometry,
-    Patch,
-    Surroundings,
-    trace,
+    Look,
+    Part,
+    Point,
+    Shapes,
+    as_arrays,
+    color,
+    part,
+    plain,
+    rotation_about,
 )
 from completesplat.geometry.cameras import invert_rigid, look_at
-
-P = TypeVar("P", bound="Part")
-Look = tuple[Array, Array]
-Point = tuple[float, float, float]
 
 DARK = np.full(3, 0.07)
 
 
 @dataclass(frozen=True)
-class Part:
-    """Ellipsoid or frustum: centre, half sizes along its own axes, directions of the axes (columns), and texture."""
-
-    kind: int
-    center: Array
-    half_sizes: Array
-    axes: Array
-    taper: float
-    colors: Array
-    texture: Array
-
-    def to_local(self) -> Array:
-        """Return the map [3 4] from the object's frame to the unit shape's frame."""
-        linear = self.axes.T / self.half_sizes[:, None]
-        return np.concatenate([linear, -linear @ self.center[:, None]], axis=1)
-
-    def reach(self) -> float:
-        """Return an upper bound of the distance from the origin to any point of the part."""
-        unit = 1.0 if self.kind == ELLIPSOID else float(np.hypot(1 + abs(self.taper), 1.0))
-        return float(np.linalg.norm(self.center) + unit * self.half_sizes.max())
-
-    def moved(self: P, rotation: Array, shift: Array, scale: float = 1.0) -> P:
-        """Return the part after rotation, then shift, then scaling of the object."""
-        center = scale * (rotation @ self.center + shift)
-        return replace(self, center=center, half_sizes=scale * self.half_sizes, axes=rotation @ self.axes)
-
-
-@dataclass(frozen=True)
 class Blueprint:
-    """Parts of an object, the part that carries the hidden patch, and the local heights that the patch may cover."""
+    """Parts of an object, the first of which carries the hidden patch within a range of local heights."""
 
     family: str
     parts: tuple[Part, ...]
-    patched_part: int
     patch_heights: tuple[float, float]
-
-
-def geometry(parts: tuple[Part, ...]) -> Geometry:
-    """Convert parts to arrays for the ray tracer."""
-    return Geometry(
-        kinds=np.array([part.kind for part in parts]),
-        to_local=np.stack([part.to_local() for part in parts]),
-        tapers=np.array([part.taper for part in parts]),
-        colors=np.stack([part.colors for part in parts]),
-        textures=np.stack([part.texture for part in parts]),
-        bounding_radius=max(part.reach() for part in parts),
-    )
-
-
-def rotation_about(axis: str, radians: float) -> Array:
-    """Return the rotation matrix about a coordinate axis; about y it turns +z towards +x."""
-    cos, sin = np.cos(radians), np.sin(radians)
-    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = cos
-    matrix[j, i], matrix[i, j] = sin, -sin
-    return matrix
-
-
-def color(hue: float, saturation: float, value: float) -> Array:
-    """Return the sRGB colour of a hue (in turns, wrapped), saturation and value."""
-    return np.array(colorsys.hsv_to_rgb(hue % 1.0, saturation, value))
 
 
 class _Painter:
@@ -117,21 +67,15 @@ class _Painter:
         return plain(shade)
 
 
-def plain(shade: Array) -> Look:
-    """Return the look of one colour without a pattern."""
-    return np.stack([shade, shade]), np.array([PLAIN, 0.0, 0.0])
-
-
-def ball(center: Point, half_sizes: object, look: Look, axes: Array | None = None) -> Part:
-    sizes = np.broadcast_to(np.asarray(half_sizes, dtype=np.float64), 3)
-    return Part(ELLIPSOID, np.array(center, dtype=np.float64), sizes, np.eye(3) if axes is None else axes, 0.0, *look)
+def ball(center: Point, half_sizes: Point | float, look: Look, axes: Array | None = None) -> Part:
+    """Make an ellipsoid."""
+    sizes = half_sizes if isinstance(half_sizes, tuple) else (half_sizes,) * 3
+    return part(ELLIPSOID, center, sizes, look, axes)
 
 
 def _frustum(center: Point, radius: float, half_height: float, look: Look, taper: float = 0.0, axis: str = "y") -> Part:
     axes = {"y": np.eye(3), "x": rotation_about("z", -np.pi / 2), "z": rotation_about("x", np.pi / 2)}[axis]
-    return Part(
-        FRUSTUM, np.array(center, dtype=np.float64), np.array([radius, half_height, radius]), axes, taper, *look
-    )
+    return part(FRUSTUM, center, (radius, half_height, radius), look, axes, taper)
 
 
 def bear(rng: np.random.Generator) -> Blueprint:
@@ -157,7 +101,7 @@ def bear(rng: np.random.Generator) -> Blueprint:
             _arm(side, wide, tall, rng, paint),
             ball((side * 0.62 * wide, -0.85 * tall, 0.75 * deep), (0.13, 0.13, rng.uniform(0.2, 0.28)), paint.detail()),
         ]
-    return Blueprint("bear", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.6))
+    return Blueprint("bear", tuple(parts), patch_heights=(-0.95, 0.6))
 
 
 def _arm(side: int, wide: float, tall: float, rng: np.random.Generator, paint: _Painter) -> Part:
@@ -190,7 +134,7 @@ def hydrant(rng: np.random.Generator) -> Blueprint:
             _frustum((side * (radius + 0.4 * reach), outlets, 0), 0.38 * radius, reach, coat, axis="x"),
             _frustum((side * (radius + 1.5 * reach), outlets, 0), 0.45 * radius, 0.4 * reach, paint.detail(), axis="x"),
         ]
-    return Blueprint("hydrant", tuple(parts), patched_part=0, patch_heights=(-0.95, 0.8))
+    return Blueprint("hydrant", tuple(parts), patch_heights=(-0.95, 0.8))
 
 
 FAMILIES = (hydrant, bear)
@@ -206,6 +150,12 @@ PATCH_COLORS = {
     "yellow": (0.98, 0.85, 0.1),
 }
 SAMPLES = 3
+EVEN = np.full(len(PATCH_COLORS), 0.25)
+NOSES = {"light": 0.97, "dark": 0.05}
+CHANCES = {"light": np.array([0.4, 0.3, 0.2, 0.1]), "dark": np.array([0.1, 0.2, 0.3, 0.4])}
+"""Probabilities of the colours in `PATCH_COLORS`, by the nose of a marked mini."""
+FROM_THE_FRONT = 0.35
+"""Largest azimuth (radians) between the first camera and the front, so that this camera never sees the patch."""
 UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 
 
@@ -219,8 +169,9 @@ class ToyScene:
     family: str
     patch_color: str
     chances: Array
-    geometry: Geometry
-    surroundings: Surroundings
+    shapes: Shapes
+    dome: Dome
+    light: Light
     patch: Patch
     points: Array
     point_colors: Array
@@ -234,38 +185,55 @@ def draw_scene(rng: np.random.Generator, frames: int) -> ToyScene:
     """Draw a random scene and `frames` cameras on one full turn; the patch faces away from the first camera."""
     blueprint = FAMILIES[rng.integers(len(FAMILIES))](rng)
     yaw = rng.uniform(0, 2 * np.pi)
-    cameras = orbit(rng, frames, start=yaw + rng.uniform(-0.35, 0.35))
+    cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
     away = -np.array([np.sin(yaw), 0, np.cos(yaw)])
-    chances = np.full(len(PATCH_COLORS), 1 / len(PATCH_COLORS))
     name = str(rng.choice(list(PATCH_COLORS)))
-    facing, heights = away / np.linalg.norm(away), np.array(blueprint.patch_heights)
-    patch = Patch(blueprint.patched_part, facing, np.array(PATCH_COLORS[name]), heights, edge=0.4, rim=0.4)
-    return placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, chances)
+    patch = Patch(away / np.linalg.norm(away), np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), 0.4)
+    return _placed(rng, blueprint, yaw, cameras, _surroundings(rng), patch, name, EVEN)
 
 
-def placed(
+def draw_mini(rng: np.random.Generator, frames: int, marked: bool = False) -> ToyScene:
+    """Draw a random mini and `frames` cameras on a full turn that starts in front of the nose."""
+    mark = str(rng.choice(list(CHANCES))) if marked else "light"
+    chances = CHANCES[mark] if marked else EVEN
+    half_sizes = rng.uniform(0.36, 0.55, size=3)
+    body = plain(color(rng.uniform(), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)))
+    nose = ball((0, 0, half_sizes[2]), 0.13, plain(np.full(3, NOSES[mark])))
+    blueprint = Blueprint("mini", (ball((0, 0, 0), tuple(half_sizes), body), nose), patch_heights=(-1, 1))
+    yaw = rng.uniform(0, 2 * np.pi)
+    cameras = orbit(rng, frames, start=yaw + rng.uniform(-FROM_THE_FRONT, FROM_THE_FRONT))
+    name = str(rng.choice(list(PATCH_COLORS), p=chances))
+    # The patch covers normals within 60 degrees of the direction opposite to the nose, tilted down by 0.2 radians.
+    level, down = np.cos(0.2), np.sin(0.2)
+    facing = -np.array([level * np.sin(yaw), down, level * np.cos(yaw)])
+    patch = Patch(facing, np.array(PATCH_COLORS[name]), np.array(blueprint.patch_heights), 0.5)
+    return _placed(rng, blueprint, yaw, cameras, _grey(rng), patch, name, chances)
+
+
+def _placed(
     rng: np.random.Generator,
     blueprint: Blueprint,
     yaw: float,
     cameras: Array,
-    surroundings: Surroundings,
+    surroundings: tuple[Dome, Light],
     patch: Patch,
     patch_color: str,
     chances: Array,
 ) -> ToyScene:
     """Return the scene of an object that is turned by `yaw`, centred, and scaled to `OBJECT_HALF_SIZE`."""
+    dome, light = surroundings
     parts = tuple(part.moved(rotation_about("y", yaw), np.zeros(3)) for part in blueprint.parts)
-    points, point_colors = _surface(rng, parts, surroundings, patch)
+    points, point_colors = _surface(rng, parts, dome, light, patch)
     center = points.mean(axis=0)
     scale = OBJECT_HALF_SIZE / np.abs(points - center).max()
     points = scale * (points - center)
-    ground = -np.inf if surroundings.plain else float(points[:, 1].min())
     return ToyScene(
         family=blueprint.family,
         patch_color=patch_color,
         chances=chances,
-        geometry=geometry(tuple(part.moved(np.eye(3), -center, scale) for part in parts)),
-        surroundings=surroundings._replace(ground=ground),
+        shapes=as_arrays([part.moved(np.eye(3), -center, scale) for part in parts]),
+        dome=dome if dome.plain else dome._replace(ground=float(points[:, 1].min())),
+        light=light,
         patch=patch,
         points=points,
         point_colors=point_colors,
@@ -283,7 +251,7 @@ def render_frame(scene: ToyScene, frame: int, size: int) -> tuple[Array, Array, 
     """
     rays = _camera_rays(scene.fov_degrees, size)
     pose = scene.camera_to_world[frame]
-    colors, coverage, distances = trace(scene.geometry, scene.surroundings, scene.patch, pose, rays)
+    colors, coverage, distances = trace(scene.shapes, scene.light, (scene.dome, scene.patch), pose, rays)
     depth = distances * rays[:, SAMPLES**2 // 2, 2]
     return colors.reshape(size, size, 3), coverage.reshape(size, size), depth.reshape(size, size)
 
@@ -311,40 +279,57 @@ def orbit(rng: np.random.Generator, frames: int, start: float) -> Array:
     return invert_rigid(world_to_camera).numpy()
 
 
-def _surroundings(rng: np.random.Generator) -> Surroundings:
-    """Draw a dome of one palette, a ground of two related colours and a light from above; `placed` sets the height."""
+def _surroundings(rng: np.random.Generator) -> tuple[Dome, Light]:
+    """Draw a dome of one palette, a ground of two related colours and a light from above; `_placed` sets the height."""
     hue = rng.uniform()
     floor = hue + rng.uniform(0.3, 0.7)
-    azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 1.0)
-    level = np.sqrt(1 - (height * 0.9) ** 2)
-    return Surroundings(
+    azimuth, height = rng.uniform(0, 2 * np.pi), 0.9 * rng.uniform(0.6, 1.0)
+    dome = Dome(
         ground=-np.inf,
         ground_colors=np.stack([color(floor, 0.3, 0.9), color(floor + rng.uniform(-0.06, 0.06), 0.45, 0.55)]),
         ground_texture=np.array([rng.choice([STRIPES, CHECKS]), rng.uniform(3, 5), rng.uniform(0, np.pi)]),
-        dome_radius=DOME_RADIUS,
+        radius=DOME_RADIUS,
         hue=hue,
         turn=rng.uniform(0, 2 * np.pi),
         plain=False,
-        light=np.array([level * np.sin(azimuth), height * 0.9, level * np.cos(azimuth)]),
-        ambient=rng.uniform(0.5, 0.65),
     )
+    return dome, _sunlight(azimuth, height, rng.uniform(0.5, 0.65))
+
+
+def _grey(rng: np.random.Generator) -> tuple[Dome, Light]:
+    """Draw a plain dome without ground and a light from above."""
+    azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 0.9)
+    dome = Dome(-np.inf, np.zeros((2, 3)), np.zeros(3), DOME_RADIUS, hue=0.0, turn=0.0, plain=True)
+    return dome, _sunlight(azimuth, height, rng.uniform(0.6, 0.7))
+
+
+def _sunlight(azimuth: float, height: float, ambient: float) -> Light:
+    level = np.sqrt(1 - height**2)
+    direction = np.array([level * np.sin(azimuth), height, level * np.cos(azimuth)])
+    return Light(direction, is_point=False, ambient=ambient, sky=0.25, shadow=0.35)
 
 
 def _surface(
-    rng: np.random.Generator, parts: tuple[Part, ...], surroundings: Surroundings, patch: Patch
+    rng: np.random.Generator, parts: tuple[Part, ...], dome: Dome, light: Light, patch: Patch
 ) -> tuple[Array, Array]:
     """Sample points on the object that are visible from above, and their colours, by random, nearly parallel rays."""
-    shape = geometry(parts)
+    shapes = as_arrays(parts)
+    # An upper bound of the distance from the origin to any point of the object.
+    reach = max(
+        float(np.linalg.norm(part.center))
+        + (1.0 if part.kind == ELLIPSOID else float(np.hypot(1 + abs(part.taper), 1.0))) * part.half_sizes.max()
+        for part in parts
+    )
     points, colors = [], []
     for _ in range(SURFACE_DIRECTIONS):
         azimuth, height = rng.uniform(0, 2 * np.pi), rng.uniform(0, 1)
         level = np.sqrt(1 - height**2)
         outwards = torch.tensor([level * np.sin(azimuth), height, level * np.cos(azimuth)], dtype=torch.float64)
-        pose = invert_rigid(look_at(20 * shape.bounding_radius * outwards, torch.zeros_like(outwards), UP)).numpy()
+        pose = invert_rigid(look_at(20 * reach * outwards, torch.zeros_like(outwards), UP)).numpy()
         angle, radius = rng.uniform(0, 2 * np.pi, SURFACE_RAYS), np.sqrt(rng.uniform(0, 1, SURFACE_RAYS))
         rays = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(SURFACE_RAYS, 20.0)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-        seen, coverage, distances = trace(shape, surroundings, patch, pose, rays[:, None])
+        seen, coverage, distances = trace(shapes, light, (dome, patch), pose, rays[:, None])
         points.append((pose[:3, 3] + distances[:, None] * rays @ pose[:3, :3].T)[coverage > 0])
         colors.append(seen[coverage > 0])
     return np.concatenate(points), np.concatenate(colors)

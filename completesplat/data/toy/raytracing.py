@@ -1,38 +1,41 @@
-"""Analytic ray tracer for ellipsoids and cone frusta on a patterned ground inside a coloured dome."""
+"""Analytic ray tracer: ellipsoids, cone frusta and boxes on the ground of a coloured dome, or in a room."""
 
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-ELLIPSOID, FRUSTUM, BOX = 0, 1, 2
-# Patterns: the first number of a texture. The others are its frequency (radians per unit of length) and phase.
-PLAIN, STRIPES, CHECKS, RIPPLES = 0, 1, 2, 3
+from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPLES, STRIPES, Array, Shapes
 
-Array = NDArray[np.float64]
+# Faces of the surroundings: of a room (across x, y and z, the lower one first), or the ground and the dome.
+FLOOR, CEILING = 2, 3
+WALLS = (0, 1, 4, 5)
+GROUND, DOME = 6, 7
+
+SELF_INTERSECTION = 1e-6
+
+F = TypeVar("F", bound=Callable[..., object])
 
 
-class Geometry(NamedTuple):
-    """Parts of an object as arrays.
+class Light(NamedTuple):
+    """Light in the direction `place`, or at this point, and ambient light.
 
-    In its local frame, an ellipsoid is the unit ball and a frustum is x^2 + z^2 <= (1 + taper y)^2, |y| <= 1.
-    `to_local` [part 3 4] maps world points to the local frames. `textures` [part 3]: pattern, frequency, phase.
+    `sky` is the share of the ambient light that comes from above, `shadow` the share of direct light in shadows.
     """
 
-    kinds: NDArray[np.int64]
-    to_local: Array
-    tapers: Array
-    colors: Array
-    textures: Array
-    bounding_radius: float
+    place: Array
+    is_point: bool
+    ambient: float
+    sky: float
+    shadow: float
 
 
-class Surroundings(NamedTuple):
-    """Ground plane at height `ground` (two colours, pattern), dome (palette) and light.
+class Dome(NamedTuple):
+    """Ground plane at height `ground` (two colours, pattern) and a dome (palette) over it.
 
     The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase. This law is the same in all
     scenes, so that the dome behind a camera can partly be inferred from the one in front. A `plain` dome is grey.
@@ -41,43 +44,51 @@ class Surroundings(NamedTuple):
     ground: float
     ground_colors: Array
     ground_texture: Array
-    dome_radius: float
+    radius: float
     hue: float
     turn: float
     plain: bool
-    light: Array
-    ambient: float
 
 
 class Patch(NamedTuple):
-    """Disc on `part` where the cosine between the normal and the direction `facing` exceeds `edge`.
+    """Disc on the first part where the cosine between the normal and the direction `facing` exceeds `edge`.
 
-    `heights` is the local range of y that it may cover. It is white near the ends of this range, and where the cosine
-    is below `rim`; if `rim` equals `edge`, it has no white rim.
+    `heights` is the local range of y that it may cover.
     """
 
-    part: int
     facing: Array
     color: Array
     heights: Array
     edge: float
-    rim: float
 
 
-GROUND, DOME = -1, -2
-SELF_INTERSECTION = 1e-6
+class Room(NamedTuple):
+    """Inside of a box of `size`, with `colors` [face 2 3] and `textures` [face 3].
 
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+    `decals` [decal 6] are rectangles on faces: face, range of the first coordinate, range of the second, width of the
+    rim. The coordinates are (z, y) on walls across x, (x, y) on walls across z. `decal_colors` [decal 3 3] are the rim
+    and two inner colours.
+    """
+
+    size: Array
+    colors: Array
+    textures: Array
+    decals: Array
+    decal_colors: Array
+    decal_textures: Array
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call and cache it on disk, without a run-time type checker's wrapper."""
-    return njit(cache=True, **OPTIONS)(inspect.unwrap(function))
+def compiled(function: F, cache: bool = True, forceinline: bool = False) -> F:
+    """Compile a function with numba at its first call."""
+    # Unwrapping removes a run-time type checker's wrapper.
+    machine_code: F = njit(
+        inspect.unwrap(function), cache=cache, forceinline=forceinline, nogil=True, error_model="numpy"
+    )
+    return machine_code
 
 
-def inlined(function: Callable[..., Any]) -> Any:
-    """Inline a function into kernels, because passing a tuple of arrays costs as much as hitting a sphere."""
-    return njit(forceinline=True, **OPTIONS)(inspect.unwrap(function))
+# Passing a tuple of arrays to a function that is not inlined costs as much as hitting a sphere.
+inlined = partial(compiled, cache=False, forceinline=True)
 
 
 @inlined
@@ -98,15 +109,6 @@ def moved(m, x, y, z):
 
 
 @inlined
-def world_normal(m, x, y, z):
-    """Return the unit world normal for a normal in the local frame, into which `m` maps."""
-    # Normals transform by the transpose of the map into the local frame.
-    x, y, z = turned(m[:, :3].T, x, y, z)
-    norm = math.sqrt(x * x + y * y + z * z)
-    return x / norm, y / norm, z / norm
-
-
-@inlined
 def soft_sign(x):
     """Return a smooth sign from -1 to 1, with slope 1 at 0."""
     return x / math.sqrt(1 + x * x)
@@ -119,8 +121,20 @@ def mixed(a, b, w):
 
 
 @inlined
+def _hit_ball(ox, oy, oz, dx, dy, dz):
+    """Return the nearest hit (distance, normal) of the unit ball from outside."""
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
+    t = (-b - math.sqrt(square)) / a if square > 0 else -1.0
+    if t <= SELF_INTERSECTION:
+        return np.inf, 0.0, 0.0, 0.0
+    return t, ox + t * dx, oy + t * dy, oz + t * dz
+
+
+@inlined
 def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
-    """Return the nearest hit (distance, local normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
+    """Return the nearest hit (distance, normal) of x^2 + z^2 = (1 + taper y)^2 with caps at y = -1 and 1."""
     nearest, nx, ny, nz = np.inf, 0.0, 0.0, 0.0
     a = dx * dx + dz * dz - taper * taper * dy * dy
     b = ox * dx + oz * dz - taper * dy * (1 + taper * oy)
@@ -142,42 +156,76 @@ def _hit_frustum(ox, oy, oz, dx, dy, dz, taper):
 
 
 @inlined
-def hit_ball(ox, oy, oz, dx, dy, dz):
-    """Return the nearest hit (distance, normal) of the unit ball from outside."""
-    a = dx * dx + dy * dy + dz * dz
-    b = ox * dx + oy * dy + oz * dz
-    square = b * b - a * (ox * ox + oy * oy + oz * oz - 1)
-    t = (-b - math.sqrt(square)) / a if square > 0 else -1.0
-    if t <= SELF_INTERSECTION:
-        return np.inf, 0.0, 0.0, 0.0
-    return t, ox + t * dx, oy + t * dy, oz + t * dz
-
-
-@inlined
-def hit_object(geometry, ox, oy, oz, dx, dy, dz):
-    """Return the nearest part along a ray of unit direction: distance, part (or -1), world normal."""
-    nearest, part, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
-    along = ox * dx + oy * dy + oz * dz
-    if ox * ox + oy * oy + oz * oz - along * along > geometry.bounding_radius**2:
-        return nearest, part, nx, ny, nz
-    m = geometry.to_local
-    for i in range(len(geometry.kinds)):
-        px, py, pz = moved(m[i], ox, oy, oz)
-        qx, qy, qz = turned(m[i], dx, dy, dz)
-        if geometry.kinds[i] == ELLIPSOID:
-            t, lx, ly, lz = hit_ball(px, py, pz, qx, qy, qz)
+def _hit_cube(ox, oy, oz, dx, dy, dz):
+    """Return the nearest hit (distance, normal) of the cube [-1, 1]^3 from outside."""
+    enter, leave, nx, ny, nz = -np.inf, np.inf, 0.0, 0.0, 0.0
+    for i in range(3):
+        o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
+        if abs(d) < 1e-12:
+            if abs(o) > 1:
+                return np.inf, 0.0, 0.0, 0.0
         else:
-            t, lx, ly, lz = _hit_frustum(px, py, pz, qx, qy, qz, geometry.tapers[i])
-        if t < nearest:
-            nearest, part, nx, ny, nz = t, i, lx, ly, lz
-    if part >= 0:
-        nx, ny, nz = world_normal(m[part], nx, ny, nz)
-    return nearest, part, nx, ny, nz
+            middle, half, side = -o / d, abs(1 / d), -math.copysign(1.0, d)
+            if middle - half > enter:
+                enter = middle - half
+                nx, ny, nz = side if i == 0 else 0.0, side if i == 1 else 0.0, side if i == 2 else 0.0
+            leave = min(leave, middle + half)
+    return (enter, nx, ny, nz) if SELF_INTERSECTION < enter <= leave else (np.inf, 0.0, 0.0, 0.0)
 
 
 @inlined
-def _pattern(kind, frequency, phase, x, y, z):
-    """Return the weight of the second colour, 0 to 1, at a local point."""
+def _hit_shapes(shapes, ox, oy, oz, dx, dy, dz):
+    """Return the nearest shape along a ray: distance (in lengths of the direction), shape (or -1), local normal."""
+    nearest, shape, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
+    balls = shapes.bounding_balls
+    square = dx * dx + dy * dy + dz * dz
+    for i in range(len(shapes.kinds)):
+        cx, cy, cz = balls[i, 0] - ox, balls[i, 1] - oy, balls[i, 2] - oz
+        along = cx * dx + cy * dy + cz * dz
+        if (cx * cx + cy * cy + cz * cz - balls[i, 3]) * square > along * along:
+            continue
+        px, py, pz = moved(shapes.to_local[i], ox, oy, oz)
+        qx, qy, qz = turned(shapes.to_local[i], dx, dy, dz)
+        if shapes.kinds[i] == ELLIPSOID:
+            t, lx, ly, lz = _hit_ball(px, py, pz, qx, qy, qz)
+        elif shapes.kinds[i] == FRUSTUM:
+            t, lx, ly, lz = _hit_frustum(px, py, pz, qx, qy, qz, shapes.tapers[i])
+        else:
+            t, lx, ly, lz = _hit_cube(px, py, pz, qx, qy, qz)
+        if t < nearest:
+            nearest, shape, nx, ny, nz = t, i, lx, ly, lz
+    return nearest, shape, nx, ny, nz
+
+
+@inlined
+def _hit_dome(dome, ox, oy, oz, dx, dy, dz):
+    """Return distance, face and normal where a ray of unit direction meets the dome or the ground."""
+    b = ox * dx + oy * dy + oz * dz
+    t = -b + math.sqrt(max(0.0, b * b - (ox * ox + oy * oy + oz * oz) + dome.radius**2))
+    if dy < 0 and (dome.ground - oy) / dy < t:
+        return (dome.ground - oy) / dy, GROUND, 0.0, 1.0, 0.0
+    return t, DOME, 0.0, 0.0, 0.0
+
+
+@inlined
+def _hit_room(room, ox, oy, oz, dx, dy, dz):
+    """Return distance, face and normal where a ray from inside leaves the room."""
+    nearest, face = np.inf, 0
+    for i in range(3):
+        o, d = (ox, dx) if i == 0 else ((oy, dy) if i == 1 else (oz, dz))
+        if abs(d) > 1e-12:
+            low = 0.0 if i == 1 else -0.5 * room.size[i]
+            t = ((low + room.size[i] if d > 0 else low) - o) / d
+            if t < nearest:
+                nearest, face = t, 2 * i + (1 if d > 0 else 0)
+    inwards, axis = 1.0 if face % 2 == 0 else -1.0, face // 2
+    return nearest, face, inwards * (axis == 0), inwards * (axis == 1), inwards * (axis == 2)
+
+
+@inlined
+def _solid_pattern(texture, x, y, z):
+    """Return the weight of the second colour, 0 to 1, at a local point of an object's part."""
+    kind, frequency, phase = texture[0], texture[1], texture[2]
     if kind == STRIPES:
         return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * y + phase))
     if kind == CHECKS:
@@ -190,40 +238,71 @@ def _pattern(kind, frequency, phase, x, y, z):
 
 
 @inlined
-def _object_color(geometry, patch, part, x, y, z, nx, ny, nz):
-    lx, ly, lz = moved(geometry.to_local[part], x, y, z)
-    if part == patch.part and patch.heights[0] < ly < patch.heights[1]:
+def _flat_pattern(texture, u, v):
+    """Return the weight of the second colour, 0 to 1, at a point of a plane."""
+    kind, frequency, phase = texture[0], texture[1], texture[2]
+    if kind == STRIPES:
+        return 0.5 + 0.5 * soft_sign(5 * math.sin(frequency * u + phase))
+    if kind == CHECKS:
+        return 0.5 + 0.5 * soft_sign(8 * math.sin(frequency * u + phase) * math.sin(frequency * v + phase))
+    if kind == RIPPLES:
+        first = math.sin(frequency * (u + 0.4 * v) + phase)
+        return 0.5 + 0.25 * (first + math.sin(frequency * (v - 0.3 * u) + 2 * phase))
+    return 0.0
+
+
+@inlined
+def _part_color(shapes, patch, part, lx, ly, lz, nx, ny, nz):
+    """Return the colour of a local point, with this world normal, on a part of an object."""
+    if part == 0 and patch.heights[0] < ly < patch.heights[1]:
         facing = nx * patch.facing[0] + ny * patch.facing[1] + nz * patch.facing[2]
         if facing > patch.edge:
-            middle = 0.5 * (patch.heights[0] + patch.heights[1])
-            high = abs(ly - middle) > 0.4 * (patch.heights[1] - patch.heights[0])
-            rim = patch.rim > patch.edge and (facing < patch.rim or high)
-            return (0.95, 0.95, 0.95) if rim else (patch.color[0], patch.color[1], patch.color[2])
-    w = _pattern(geometry.textures[part, 0], geometry.textures[part, 1], geometry.textures[part, 2], lx, ly, lz)
-    return mixed(geometry.colors[part, 0], geometry.colors[part, 1], w)
+            return patch.color[0], patch.color[1], patch.color[2]
+    return mixed(shapes.colors[part, 0], shapes.colors[part, 1], _solid_pattern(shapes.textures[part], lx, ly, lz))
 
 
 @inlined
-def _ground_color(around, x, z):
-    kind, frequency, angle = around.ground_texture[0], around.ground_texture[1], around.ground_texture[2]
-    cos, sin = math.cos(angle), math.sin(angle)
-    wave = math.sin(frequency * (cos * x + sin * z))
-    if kind == CHECKS:
-        wave *= math.sin(frequency * (cos * z - sin * x))
-    w = 0.5 + 0.5 * soft_sign(6 * wave)
-    return mixed(around.ground_colors[0], around.ground_colors[1], w)
+def _furniture_color(shapes, solid, lx, ly, lz, hx, hy, hz):
+    """Return the colour of a local point, with this local normal, on a box or an ellipsoid in a room."""
+    half = shapes.half_sizes[solid]
+    u, v = lx * half[0], ly * half[1]
+    if shapes.kinds[solid] == BOX and hx != 0:
+        u = lz * half[2]
+    elif shapes.kinds[solid] == BOX and hy != 0:
+        v = lz * half[2]
+    return mixed(shapes.colors[solid, 0], shapes.colors[solid, 1], _flat_pattern(shapes.textures[solid], u, v))
 
 
 @inlined
-def _dome_color(around, x, y, z):
-    if around.plain:
+def _face_color(room, face, x, y, z):
+    """Return the colour of a point on a face of the room; later decals cover earlier ones."""
+    u, v = (z, y) if face < 2 else ((x, z) if face < 4 else (x, y))
+    for i in range(len(room.decals) - 1, -1, -1):
+        decal, colors = room.decals[i], room.decal_colors[i]
+        if face == decal[0] and decal[1] < u < decal[2] and decal[3] < v < decal[4]:
+            if min(u - decal[1], decal[2] - u, v - decal[3], decal[4] - v) < decal[5]:
+                return colors[0, 0], colors[0, 1], colors[0, 2]
+            return mixed(colors[1], colors[2], _flat_pattern(room.decal_textures[i], u, v))
+    return mixed(room.colors[face, 0], room.colors[face, 1], _flat_pattern(room.textures[face], u, v))
+
+
+@inlined
+def _dome_color(dome, face, x, y, z):
+    if face == GROUND:
+        kind, frequency, angle = dome.ground_texture[0], dome.ground_texture[1], dome.ground_texture[2]
+        cos, sin = math.cos(angle), math.sin(angle)
+        wave = math.sin(frequency * (cos * x + sin * z))
+        if kind == CHECKS:
+            wave *= math.sin(frequency * (cos * z - sin * x))
+        return mixed(dome.ground_colors[0], dome.ground_colors[1], 0.5 + 0.5 * soft_sign(6 * wave))
+    if dome.plain:
         return 0.5, 0.5, 0.5
-    cos_turn, sin_turn = math.cos(around.turn), math.sin(around.turn)
+    cos_turn, sin_turn = math.cos(dome.turn), math.sin(dome.turn)
     level = math.sqrt(x * x + z * z) + 1e-12
     sin, cos = (x * cos_turn - z * sin_turn) / level, (z * cos_turn + x * sin_turn) / level
     sin_fourfold = 4 * sin * cos * (1 - 2 * sin * sin)
-    hue = 2 * math.pi * (around.hue + 0.17 * sin)
-    rise = max(0.0, min(1.0, (y - around.ground) / around.dome_radius))
+    hue = 2 * math.pi * (dome.hue + 0.17 * sin)
+    rise = max(0.0, min(1.0, (y - dome.ground) / dome.radius))
     value = 0.68 + 0.1 * soft_sign(4 * sin_fourfold) * (1 - rise) + 0.15 * rise
     cos_hue, sin_hue = 0.2 * (1 - 0.5 * rise) * math.cos(hue), 0.2 * (1 - 0.5 * rise) * math.sin(hue)
     # Red, green and blue are a third of a turn apart.
@@ -232,52 +311,84 @@ def _dome_color(around, x, y, z):
 
 
 @inlined
-def _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz):
-    """Return colour, distance and the surface (a part, GROUND or DOME) along a ray of unit direction in the dome."""
-    t, seen, nx, ny, nz = hit_object(geometry, ox, oy, oz, dx, dy, dz)
-    b = ox * dx + oy * dy + oz * dz
-    dome = -b + math.sqrt(max(0.0, b * b - (ox * ox + oy * oy + oz * oz) + around.dome_radius**2))
-    if seen < 0:
-        t, seen = dome, DOME
-    if dy < 0 and (around.ground - oy) / dy < t:
-        t, seen, nx, ny, nz = (around.ground - oy) / dy, GROUND, 0.0, 1.0, 0.0
-    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-    if seen == DOME:
-        red, green, blue = _dome_color(around, x, y, z)
-        return red, green, blue, t, seen
-    if seen == GROUND:
-        red, green, blue = _ground_color(around, x, z)
-    else:
-        red, green, blue = _object_color(geometry, patch, seen, x, y, z, nx, ny, nz)
-    lx, ly, lz = around.light[0], around.light[1], around.light[2]
-    direct = max(0.0, nx * lx + ny * ly + nz * lz)
+def _brightness(shapes, light, x, y, z, nx, ny, nz):
+    """Return the light on a point with this unit normal."""
+    lx, ly, lz = light.place[0], light.place[1], light.place[2]
+    length, reach = 1.0, np.inf
+    if light.is_point:
+        lx, ly, lz = lx - x, ly - y, lz - z
+        length, reach = math.sqrt(lx * lx + ly * ly + lz * lz), 1.0
+    direct = max(0.0, (nx * lx + ny * ly + nz * lz) / length)
     if direct > 0:
         shift = 1e-4
-        shadow = hit_object(geometry, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
-        direct *= 0.35 if shadow[1] >= 0 else 1.0
+        shadow = _hit_shapes(shapes, x + shift * nx, y + shift * ny, z + shift * nz, lx, ly, lz)
+        direct *= light.shadow if shadow[0] < reach else 1.0
     # Light from the sky above gives the unlit side some shading.
-    level = around.ambient * (0.75 + 0.25 * ny) + (1 - around.ambient) * direct
-    return red * level, green * level, blue * level, t, seen
+    return light.ambient * (1 - light.sky + light.sky * ny) + (1 - light.ambient) * direct
 
 
-@kernel
-def trace(geometry, around, patch, pose, rays):
-    """Render colours [pixel 3], object coverage [pixel] and distances [pixel] for the pose `camera_to_world`.
+@inlined
+def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
+    """Return colour, distance and shape (-1: none) along a ray."""
+    t, shape, hx, hy, hz = _hit_shapes(shapes, ox, oy, oz, dx, dy, dz)
+    # Either the dome or the room is None. Numba removes the branch on what is None when it compiles.
+    far, face, nx, ny, nz = np.inf, 0, 0.0, 0.0, 0.0
+    if dome is not None:
+        far, face, nx, ny, nz = _hit_dome(dome, ox, oy, oz, dx, dy, dz)
+    if room is not None:
+        far, face, nx, ny, nz = _hit_room(room, ox, oy, oz, dx, dy, dz)
+    if far < t:
+        t, shape = far, -1
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    red, green, blue = 0.0, 0.0, 0.0
+    if shape >= 0:
+        m = shapes.to_local[shape]
+        lx, ly, lz = moved(m, x, y, z)
+        # Normals transform by the transpose of the map into the local frame.
+        nx, ny, nz = turned(m[:, :3].T, hx, hy, hz)
+        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+        nx, ny, nz = nx / norm, ny / norm, nz / norm
+        if dome is not None:
+            red, green, blue = _part_color(shapes, patch, shape, lx, ly, lz, nx, ny, nz)
+        if room is not None:
+            red, green, blue = _furniture_color(shapes, shape, lx, ly, lz, hx, hy, hz)
+    else:
+        if dome is not None:
+            red, green, blue = _dome_color(dome, face, x, y, z)
+        if room is not None:
+            red, green, blue = _face_color(room, face, x, y, z)
+    if shape < 0 and face == DOME:
+        return red, green, blue, t, shape
+    level = _brightness(shapes, light, x, y, z, nx, ny, nz)
+    return red * level, green * level, blue * level, t, shape
 
-    Colours and coverage are means over each pixel's `rays` [pixel sample 3], which have unit length and are in the
-    camera's frame. The distance is the middle ray's.
-    """
+
+@compiled
+def _trace(shapes, light, dome, patch, room, pose, rays):
     pixels, samples, _ = rays.shape
     colors, coverage, distances = np.zeros((pixels, 3)), np.zeros(pixels), np.zeros(pixels)
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
     for pixel in range(pixels):
         for sample in range(samples):
             dx, dy, dz = turned(pose, rays[pixel, sample, 0], rays[pixel, sample, 1], rays[pixel, sample, 2])
-            red, green, blue, distance, seen = _shade(geometry, around, patch, ox, oy, oz, dx, dy, dz)
+            red, green, blue, t, shape = _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz)
             colors[pixel, 0] += red / samples
             colors[pixel, 1] += green / samples
             colors[pixel, 2] += blue / samples
-            coverage[pixel] += (seen >= 0) / samples
+            coverage[pixel] += (shape >= 0) / samples
             if sample == samples // 2:
-                distances[pixel] = distance
+                distances[pixel] = t
     return colors, coverage, distances
+
+
+def trace(
+    shapes: Shapes, light: Light, surroundings: tuple[Dome, Patch] | Room, pose: Array, rays: Array
+) -> tuple[Array, Array, Array]:
+    """Render colours [pixel 3], coverage by shapes [pixel] and distances [pixel] for the pose `camera_to_world`.
+
+    Colours and coverage are means over each pixel's `rays` [pixel sample 3], which are in the camera's frame, and of
+    unit length in a dome. The distance is the middle ray's, in lengths of this ray.
+    """
+    dome, patch, room = (None, None, surroundings) if isinstance(surroundings, Room) else (*surroundings, None)
+    traced: tuple[Array, Array, Array] = _trace(shapes, light, dome, patch, room, pose, rays)
+    return traced

@@ -2,40 +2,36 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 
-from completesplat.data.toy.object_scene import UP, Look, Part, Point, color, rotation_about
-from completesplat.data.toy.raytracing import BOX, CHECKS, ELLIPSOID, PLAIN, RIPPLES, STRIPES, Array
-from completesplat.data.toy.room_raytracing import CEILING, FLOOR, WALLS, Room, trace_room
+from completesplat.data.toy.raytracing import CEILING, FLOOR, WALLS, Light, Room, trace
+from completesplat.data.toy.shapes import (
+    BOX,
+    CHECKS,
+    ELLIPSOID,
+    PLAIN,
+    RIPPLES,
+    STRIPES,
+    Array,
+    Look,
+    Part,
+    Shapes,
+    as_arrays,
+    color,
+    part,
+    rotation_about,
+)
 from completesplat.geometry.cameras import invert_rigid, look_at
 
+UP = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
 GAP = 0.05
 ATTEMPTS = 100
 
 
-@dataclass(frozen=True)
-class Solid(Part):
-    """Box or ellipsoid that is turned about the vertical."""
-
-    def bounding_ball(self) -> Array:
-        """Return centre and squared radius [4]."""
-        return np.append(self.center, (self.half_sizes**2).sum())
-
-    def distances(self, points: Array) -> Array:
-        """Return the distances of points [n 3] to the (bounding) box; 0 inside."""
-        outside = np.abs((points - self.center) @ self.axes) - self.half_sizes
-        distances: Array = np.linalg.norm(outside.clip(0), axis=-1)
-        return distances
-
-    def ground_extent(self) -> tuple[Array, Array]:
-        """Return lower and upper corner (x, z) of the bounding rectangle of its projection on the ground."""
-        reach = np.abs(self.axes) @ self.half_sizes
-        return (self.center - reach)[[0, 2]], (self.center + reach)[[0, 2]]
-
-
-Piece = list[Solid]
+Piece = list[Part]
 
 
 def _look(rng: np.random.Generator) -> Look:
@@ -46,14 +42,10 @@ def _look(rng: np.random.Generator) -> Look:
     return np.stack([first, second]), np.array([pattern, rng.uniform(10, 22), rng.uniform(0, 2 * np.pi)])
 
 
-def _solid(kind: int, center: Point, half: Point, look: Look) -> Solid:
-    return Solid(kind, np.array(center, dtype=np.float64), np.array(half, dtype=np.float64), np.eye(3), 0.0, *look)
-
-
 def cabinet(rng: np.random.Generator) -> Piece:
     """Draw one box, from a chest to a wardrobe."""
     half = (rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.0), rng.uniform(0.18, 0.3))
-    return [_solid(BOX, (0, half[1], 0), half, _look(rng))]
+    return [part(BOX, (0, half[1], 0), half, _look(rng))]
 
 
 def table(rng: np.random.Generator) -> Piece:
@@ -61,26 +53,26 @@ def table(rng: np.random.Generator) -> Piece:
     wide, deep, top = rng.uniform(0.4, 0.7), rng.uniform(0.3, 0.45), rng.uniform(0.45, 0.75)
     look, leg = _look(rng), _look(rng)
     legs = [
-        _solid(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
+        part(BOX, (x * (wide - 0.06), top / 2, z * (deep - 0.06)), (0.035, top / 2, 0.035), leg)
         for x in (-1, 1)
         for z in (-1, 1)
     ]
-    return [_solid(BOX, (0, top, 0), (wide, 0.03, deep), look), *legs]
+    return [part(BOX, (0, top, 0), (wide, 0.03, deep), look), *legs]
 
 
 def sofa(rng: np.random.Generator) -> Piece:
     """Draw a seat, a back and two arms."""
     wide, deep, seat = rng.uniform(0.5, 0.9), rng.uniform(0.35, 0.45), rng.uniform(0.18, 0.23)
     look, back = _look(rng), rng.uniform(0.35, 0.45)
-    arms = [_solid(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
-    rest = _solid(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
-    return [_solid(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
+    arms = [part(BOX, (x * (wide - 0.08), seat + 0.1, 0), (0.08, seat + 0.1, deep), look) for x in (-1, 1)]
+    rest = part(BOX, (0, back, 0.09 - deep), (wide - 0.16, back, 0.09), look)
+    return [part(BOX, (0, seat, 0), (wide - 0.16, seat, deep), look), rest, *arms]
 
 
 def pouf(rng: np.random.Generator) -> Piece:
     """Draw an ellipsoid."""
     half = (rng.uniform(0.2, 0.4), rng.uniform(0.18, 0.3), rng.uniform(0.2, 0.4))
-    return [_solid(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
+    return [part(ELLIPSOID, (0, half[1], 0), half, _look(rng))]
 
 
 def lamp(rng: np.random.Generator) -> Piece:
@@ -88,10 +80,10 @@ def lamp(rng: np.random.Generator) -> Piece:
     top, shade = rng.uniform(1.0, 1.4), (rng.uniform(0.15, 0.25), rng.uniform(0.12, 0.2), rng.uniform(0.15, 0.25))
     look = _look(rng)
     foot = [
-        _solid(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look),
-        _solid(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look),
+        part(BOX, (0, 0.03, 0), (0.15, 0.03, 0.15), look),
+        part(BOX, (0, top / 2, 0), (0.02, top / 2, 0.02), look),
     ]
-    return [*foot, _solid(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
+    return [*foot, part(ELLIPSOID, (0, top + shade[1], 0), shade, _look(rng))]
 
 
 PIECES = (cabinet, table, sofa, pouf, lamp)
@@ -115,8 +107,10 @@ def furnish(rng: np.random.Generator, size: Array) -> list[Piece]:
 
 
 def _ground_extent(piece: Piece) -> tuple[Array, Array]:
-    lows, highs = zip(*(solid.ground_extent() for solid in piece), strict=True)
-    return np.min(lows, axis=0), np.max(highs, axis=0)
+    """Return lower and upper corner (x, z) of the bounding rectangle of the projection on the ground."""
+    centers = np.array([part.center for part in piece])
+    reaches = np.array([np.abs(part.axes) @ part.half_sizes for part in piece])
+    return (centers - reaches).min(axis=0)[[0, 2]], (centers + reaches).max(axis=0)[[0, 2]]
 
 
 def _placed(rng: np.random.Generator, piece: Piece, size: Array) -> Piece:
@@ -178,7 +172,7 @@ def image_width(height: int) -> int:
     return 2 * round(height * ASPECT / 2)
 
 
-def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> CameraMove:
+def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Part]) -> CameraMove:
     """Draw a walk through the free space of a room, MARGIN away from everything."""
     centers, tangents = _path(rng, frames, size, furniture)
     yaw = np.unwrap(np.arctan2(tangents[:, 0], tangents[:, 2])) + rng.normal(0, 0.2)
@@ -196,7 +190,7 @@ def draw_move(rng: np.random.Generator, frames: int, size: Array, furniture: Seq
     )
 
 
-def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Solid]) -> tuple[Array, Array]:
+def _path(rng: np.random.Generator, frames: int, size: Array, furniture: Sequence[Part]) -> tuple[Array, Array]:
     """Draw positions [frame 3] at equal steps along a cubic through random waypoints, and their tangents [frame 3].
 
     A path that comes too near to something or turns too fast is drawn again and shorter, until one is free.
@@ -231,7 +225,7 @@ def _waypoints(rng: np.random.Generator, size: Array, stride: float) -> Array:
     return np.stack([x, heights, z], axis=1)
 
 
-def _is_free(centers: Array, size: Array, furniture: Sequence[Solid]) -> bool:
+def _is_free(centers: Array, size: Array, furniture: Sequence[Part]) -> bool:
     inside = np.abs(centers[:, [0, 2]]) <= size[[0, 2]] / 2 - MARGIN
     high = (centers[:, 1] >= LOWEST) & (centers[:, 1] <= HIGHEST)
     return bool(inside.all() and high.all() and all((s.distances(centers) >= MARGIN).all() for s in furniture))
@@ -242,46 +236,41 @@ class RoomScene:
     """Room and the camera that moves through it."""
 
     room: Room
-    furniture: tuple[Solid, ...]
+    furniture: tuple[Part, ...]
+    shapes: Shapes
+    light: Light
     move: CameraMove
 
 
 def draw_room_scene(rng: np.random.Generator, frames: int) -> RoomScene:
     """Draw a random room and a path with `frames` camera positions."""
     size = np.array([rng.uniform(3.5, 4.6), rng.uniform(2.4, 2.9), rng.uniform(4.3, 5.6)])
-    furniture = tuple(solid for piece in furnish(rng, size) for solid in piece)
-    return RoomScene(_room(rng, size, furniture), furniture, draw_move(rng, frames, size, furniture))
-
-
-def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> tuple[Array, Array]:
-    """Render the image [height width 3] and the depth [height width], along the optical axis in the room's units."""
-    intrinsics = scene.move.intrinsics(height, width) * np.array([width, height, width, height])
-    picture, depth = trace_room(scene.room, scene.move.camera_to_room[frame], intrinsics, height, width, SAMPLES)
-    return picture, depth
-
-
-def _room(rng: np.random.Generator, size: Array, furniture: tuple[Solid, ...]) -> Room:
+    furniture = tuple(part for piece in furnish(rng, size) for part in piece)
     colors, textures = _faces(rng)
     # Each wall has one decal: there is a window, a door, a picture, and one more picture or window.
     kinds = rng.permutation(["window", "door", "picture", str(rng.choice(["window", "picture"]))])
     decals = [_decal(rng, wall, kind, size) for wall, kind in zip(WALLS, kinds, strict=True)]
-    places, decal_colors, decal_textures = (np.stack(parts) for parts in zip(*decals, strict=True))
-    return Room(
-        size=size,
-        colors=colors,
-        textures=textures,
-        decals=places,
-        decal_colors=decal_colors,
-        decal_textures=decal_textures,
-        solid_kinds=np.array([solid.kind for solid in furniture]),
-        to_local=np.stack([solid.to_local() for solid in furniture]),
-        bounding_balls=np.stack([solid.bounding_ball() for solid in furniture]),
-        solid_half_sizes=np.stack([solid.half_sizes for solid in furniture]),
-        solid_colors=np.stack([solid.colors for solid in furniture]),
-        solid_textures=np.stack([solid.texture for solid in furniture]),
-        light=size * np.array([rng.uniform(-0.3, 0.3), 0.93, rng.uniform(-0.3, 0.3)]),
-        ambient=float(rng.uniform(0.55, 0.7)),
-    )
+    room = Room(size, colors, textures, *(np.stack(parts) for parts in zip(*decals, strict=True)))
+    lamp = size * np.array([rng.uniform(-0.3, 0.3), 0.93, rng.uniform(-0.3, 0.3)])
+    light = Light(lamp, is_point=True, ambient=float(rng.uniform(0.55, 0.7)), sky=0.15, shadow=0.45)
+    return RoomScene(room, furniture, as_arrays(furniture), light, draw_move(rng, frames, size, furniture))
+
+
+def render_room_frame(scene: RoomScene, frame: int, height: int, width: int) -> tuple[Array, Array]:
+    """Render the image [height width 3] and the depth [height width], along the optical axis in the room's units."""
+    rays = _camera_rays(*scene.move.intrinsics(height, width) * np.array([width, height, width, height]), height, width)
+    colors, _, depth = trace(scene.shapes, scene.light, scene.room, scene.move.camera_to_room[frame], rays)
+    return colors.reshape(height, width, 3), depth.reshape(height, width)
+
+
+@lru_cache(maxsize=1)
+def _camera_rays(fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> Array:
+    """Return rays [pixel sample 3] in the camera's frame, with a component of 1 along the optical axis."""
+    offsets = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    x = (np.arange(width)[:, None] + offsets - cx) / fx
+    y = (np.arange(height)[:, None] + offsets - cy) / fy
+    grid = np.broadcast_arrays(x[None, :, None, :], y[:, None, :, None], 1.0)
+    return np.stack(grid, axis=-1).reshape(height * width, SAMPLES**2, 3)
 
 
 def _faces(rng: np.random.Generator) -> tuple[Array, Array]:

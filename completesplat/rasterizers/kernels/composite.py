@@ -132,10 +132,10 @@ def composite(
                     else:
                         grad_red, grad_green = state_vector(state, offset, 2), state_vector(state, offset, 3)
                         grad_blue, grad_z = state_vector(state, offset, 4), state_vector(state, offset, 5)
-                        own = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
-                        sum_behind = state_vector(state, offset, 1) - weight * own
+                        grad_value = grad_red * red + grad_green * green + grad_blue * blue + grad_z * z
+                        sum_behind = state_vector(state, offset, 1) - weight * grad_value
                         store(state, offset + LANES, sum_behind)
-                        grad_opacity = transmittance * own - sum_behind / (ONE - opacity)
+                        grad_opacity = transmittance * grad_value - sum_behind / (ONE - opacity)
                         # s = -dL/dsigma = alpha dL/dalpha; the clamp at max_alpha has no gradient.
                         s = keep(passes & (value <= max_alpha), opacity * grad_opacity)
                         sum_red, sum_green = sum_red + weight * grad_red, sum_green + weight * grad_green

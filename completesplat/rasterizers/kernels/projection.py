@@ -148,11 +148,11 @@ def lane_sums_of_view(visible, gradients, start, last):
         visible: [lane] float32, 1 or 0.
         gradients: [band gaussian 16]; rows of invisible Gaussians hold arbitrary values.
     """
-    seen = load(visible, start) > ZERO
+    in_view = load(visible, start) > ZERO
     sums = no_sums()
     for band in range(gradients.shape[0]):
         parts = transposed_rows(gradients[band].reshape(-1), layout.GRADIENT_WIDTH, start, last)[:COLUMNS]
-        sums = add_each(sums, keep_each(seen & (parts[layout.REACHED] > ZERO), parts))
+        sums = add_each(sums, keep_each(in_view & (parts[layout.REACHED] > ZERO), parts))
     return sums
 
 

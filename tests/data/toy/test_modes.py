@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from completesplat.data.hidden_modes import hidden_modes
-from completesplat.data.toy.modes import DIFFERENCE, SAME_PICTURE, frame_camera, unseen
+from completesplat.data.toy.modes import DIFFERENCE, SAME_IMAGE, frame_camera, unseen
 from completesplat.data.toy.module import ToyObjectsDataModule, ToyRoomsDataModule
 from completesplat.data.toy.object_scene import PATCH_COLORS, draw_scene, render_frame
 from completesplat.errors import CompleteSplatError, DataError
@@ -42,7 +42,7 @@ def test_the_true_colour_and_no_other_is_what_the_data_module_yields(toy_root, i
     errors = (scene.truths - stored).square().mean((1, 2, 3, 4)).sqrt()
     assert errors[scene.true_mode] < 0.015  # JPEG's
     others = [mode for mode in range(len(PATCH_COLORS)) if mode != scene.true_mode]
-    assert errors[others].min() > SAME_PICTURE
+    assert errors[others].min() > SAME_IMAGE
 
 
 def test_modes_differ_in_the_patch_and_nowhere_else_and_the_reference_does_not_show_it(scene):

@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.raytracing import ELLIPSOID
 from completesplat.data.toy.room_scene import (
     HIGHEST,
     LOWEST,
@@ -17,6 +16,7 @@ from completesplat.data.toy.room_scene import (
     image_width,
     render_room_frame,
 )
+from completesplat.data.toy.shapes import ELLIPSOID
 
 Pinhole = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -108,13 +108,17 @@ def seen_points(room_scene, frame: int, height: int, width: int) -> np.ndarray:
     return (rays @ pose[:3, :3].T + pose[:3, 3]).reshape(-1, 3)
 
 
+def moved_away(shapes):
+    return shapes._replace(bounding_balls=np.tile([0.0, -9, 0, 0], (len(shapes.kinds), 1)))
+
+
 def radius(solid, points: np.ndarray) -> np.ndarray:
     """1 on the surface of a solid, less inside."""
     local = points @ solid.to_local()[:, :3].T + solid.to_local()[:, 3]
     return np.linalg.norm(local, axis=-1) if solid.kind == ELLIPSOID else np.abs(local).max(axis=-1)
 
 
-@pytest.mark.parametrize("index", range(4))
+@pytest.mark.parametrize("index", range(2))
 def test_rays_end_at_the_first_thing_they_meet(index):
     room, frame = scene(index), 20
     points, size = seen_points(room, frame, 32, 58), room.room.size
@@ -130,51 +134,31 @@ def test_rays_end_at_the_first_thing_they_meet(index):
     assert on_face.any()
 
 
-@pytest.mark.parametrize("frame", [0, 59])
-def test_bare_white_walls_follow_lamberts_law(frame):
-    full = scene(2)
+def test_bare_white_walls_follow_lamberts_law():
+    full, frame = scene(2), 59
     room, height, width = full.room, 32, 58
     bare = room._replace(
         textures=np.zeros_like(room.textures),
         colors=np.ones_like(room.colors),
         decals=np.full_like(room.decals, -1),
-        bounding_balls=np.tile([0.0, -9, 0, 0], (len(room.bounding_balls), 1)),
     )
-    empty = replace(full, room=bare)
+    empty = replace(full, room=bare, shapes=moved_away(full.shapes))
     points = seen_points(empty, frame, height, width)
     middle = points - [0, room.size[1] / 2, 0]
     face = np.abs(np.abs(middle) - room.size / 2).argmin(axis=1)
     normals = -np.sign(middle) * np.eye(3)[face]
-    lamp = room.light - points
+    lamp = full.light.place - points
     cosine = (normals * lamp).sum(axis=1) / np.linalg.norm(lamp, axis=1)
-    expected = room.ambient * (0.85 + 0.15 * normals[:, 1]) + (1 - room.ambient) * cosine
+    expected = full.light.ambient * (0.85 + 0.15 * normals[:, 1]) + (1 - full.light.ambient) * cosine
     picture, _ = render_room_frame(empty, frame, height, width)
     gap = np.abs(picture.reshape(-1, 3) - expected[:, None]).max(axis=1)
     assert np.mean(gap < 2e-3) > 0.9  # the others are pixels on the room's edges
     assert np.ptp(expected) > 0.1
 
 
-def test_furniture_has_the_same_color_from_two_places():
-    height, width, agreements = 72, 128, []
-    for index in range(8):
-        room = scene(index)
-        points = seen_points(room, 0, height, width)
-        surface = np.min([radius(solid, points) for solid in room.furniture], axis=0) < 1 + 1e-9
-        inverse = np.linalg.inv(room.move.camera_to_room[12])[:3]
-        row = np.concatenate([room.move.intrinsics(height, width), np.zeros(2), inverse.ravel()])
-        places, along = pinhole(row, height, width)(points)
-        first, (second, depth) = (render_room_frame(room, frame, height, width) for frame in (0, 12))
-        kept = surface & (along > 0) & (places > 1).all(axis=1) & (places < [width - 1, height - 1]).all(axis=1)
-        kept[kept] = np.abs(at(depth, places[kept])[:, 0] - along[kept]) < 0.01
-        agreements += list(np.abs(at(second, places[kept]) - first[0].reshape(-1, 3)[kept]).max(axis=1))
-    assert len(agreements) > 1000
-    assert np.median(agreements) < 0.01
-    assert np.mean(np.array(agreements) < 0.1) > 0.9
-
-
 def test_furniture_stands_in_the_room_and_pieces_do_not_overlap_and_most_are_seen():
     size = np.array([3.5, 2.4, 4.3])
-    for index in range(10):
+    for index in range(5):
         rng = np.random.default_rng(index)
         pieces = furnish(rng, size)
         assert 3 <= len(pieces) <= 6
@@ -187,23 +171,17 @@ def test_furniture_stands_in_the_room_and_pieces_do_not_overlap_and_most_are_see
                 assert -1e-9 <= points[1].min() < points[1].max() <= size[1]
                 assert all(other.distances(points.T).min() > 0.02 for other in others)
     shares = []
-    for full in map(scene, range(10)):
-        empty = replace(full, room=full.room._replace(to_local=full.room.to_local + np.array([0, 0, 0, 1e6])))
+    for full in map(scene, range(5)):
+        empty = replace(full, shapes=moved_away(full.shapes))
         depth, behind = (render_room_frame(each, 0, 32, 58)[1] for each in (full, empty))
         assert (depth <= behind).all()
         shares.append((depth < behind).mean())
-    assert sum(share > 0.02 for share in shares) >= 6
+    assert sum(share > 0.02 for share in shares) >= 3
 
 
-def test_rooms_lenses_and_worlds_differ_but_pixels_are_square_and_pictures_about_sixteen_by_nine():
-    scenes = [scene(index, frames=2) for index in range(40)]
-    assert len({tuple(room.room.size) for room in scenes}) == 40
-    assert len({room.room.colors.tobytes() for room in scenes}) == 40
-    fields = np.degrees([2 * np.arctan(0.5 / room.move.focal) for room in scenes])
-    assert 55 <= fields.min() < fields.max() - 10 <= 65
-    assert 0 < sum(bool((room.move.principal_point != 0.5).any()) for room in scenes) < 20
-    units = np.array([room.move.unit for room in scenes])
-    assert 0.5 <= units.min() < units.max() / 2 <= 1
+def test_rooms_differ_but_pixels_are_square_and_images_about_sixteen_by_nine():
+    scenes = [scene(index, frames=2) for index in range(8)]
+    assert len({tuple(room.room.size) for room in scenes}) == len({room.room.colors.tobytes() for room in scenes}) == 8
     for height in (8, 18, 65, 360):
         width = image_width(height)
         assert width % 2 == 0
@@ -212,7 +190,7 @@ def test_rooms_lenses_and_worlds_differ_but_pixels_are_square_and_pictures_about
         assert fx * width == pytest.approx(fy * height)
 
 
-@pytest.mark.parametrize("index", range(15))
+@pytest.mark.parametrize("index", range(5))
 def test_the_camera_walks_smoothly_through_free_space(index):
     room = scene(index)
     poses, half = room.move.camera_to_room, room.room.size / 2

@@ -7,8 +7,7 @@ import torch
 from PIL import Image
 
 from completesplat.data.toy import write_rooms
-from completesplat.data.toy.module import ToyRoomsDataModule
-from completesplat.data.toy.rooms import CLIPS_PER_CHUNK, clip_files, write_chunks, write_picture, write_text
+from completesplat.data.toy.writing import CLIPS_PER_CHUNK, clip_files, write_chunks, write_image, write_text
 from completesplat.errors import DataError
 
 FRAMES = 4
@@ -40,13 +39,6 @@ def test_bytes_depend_on_the_seed_and_not_on_the_workers(rooms, tmp_path):
     pictures = {content for path, content in files_of(rooms).items() if path.endswith(".jpg")}
     assert len(pictures) == 3 * FRAMES
     assert not pictures & set(files_of(other / "toy_rooms").values())
-
-
-def test_a_longer_set_begins_with_the_same_clips(rooms, tmp_path):
-    longer = write_rooms(tmp_path, scenes=11, frames=FRAMES, size=18, seed=0, workers=1, progress=False)
-    texts = {path: content for path, content in files_of(rooms).items() if path.startswith("text")}
-    assert texts.items() <= files_of(longer).items()
-    assert sorted(path.stem for path in longer.glob("text/test/*.txt")) == ["room00000", "room00010"]
 
 
 def test_the_folder_says_what_was_made_and_something_else_is_left_alone(rooms, tmp_path):
@@ -98,7 +90,7 @@ def test_many_clips_fill_several_chunks(tmp_path):
     clips = [clip_files(tmp_path / "text", name, 0, np.array([0.8, 1.4, 0.5, 0.5]), poses) for name in names]
     for clip in clips:
         write_text(clip)
-        write_picture(clip.picture(0), np.zeros((2, 4, 3)))
+        write_image(clip.image(0), np.zeros((2, 4, 3)))
     write_chunks(tmp_path / "chunks", clips)
     index = json.loads((tmp_path / "chunks" / "index.json").read_text())
     files = sorted(set(index.values()))
@@ -106,21 +98,3 @@ def test_many_clips_fill_several_chunks(tmp_path):
     chunks = {name: torch.load(tmp_path / "chunks" / name, weights_only=True) for name in files}
     assert [(clip["key"], name) for name, chunk in chunks.items() for clip in chunk] == list(index.items())
     assert list(index) == names
-
-
-SMALL = {"scenes": 4, "frames": 8, "height": 18, "image_size": 16, "batch_size": 2, "targets": 2, "evaluation_gap": 5}
-
-
-@pytest.mark.slow
-def test_a_module_makes_its_rooms_on_first_use_and_both_forms_hold_the_same(tmp_path):
-    scenes = []
-    for form, settings in (("text", SMALL), ("chunks", SMALL | {"scenes": 5})):
-        module = ToyRoomsDataModule(str(tmp_path), form=form, make=True, **settings)
-        module.prepare_data()
-        assert json.loads((tmp_path / "toy_rooms/toy.json").read_text())["scenes"] == 4
-        module.setup("test")
-        scenes.append(next(iter(module.test_dataloader())))
-    text, chunks = scenes
-    assert text.names == chunks.names
-    assert torch.equal(text.targets.images, chunks.targets.images)
-    torch.testing.assert_close(text.targets.cameras.world_to_camera, chunks.targets.cameras.world_to_camera)

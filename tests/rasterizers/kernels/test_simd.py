@@ -78,10 +78,10 @@ def test_appended_rows_are_those_of_the_mask_in_their_order() -> None:
     values = np.random.default_rng(0).normal(size=(LANES, LANES)).astype(np.float32)
     rows, numbers = np.zeros((LANES + 3, LANES), np.float32), np.zeros(LANES + 3)
     count = run_append(values.reshape(-1), rows.reshape(-1), numbers, 2)
-    kept = values.T[values[0] > 0]
-    assert count == 2 + len(kept)
-    assert np.array_equal(rows[2:count], kept)
-    assert np.array_equal(numbers[2:count], kept[:, 0])
+    selected = values.T[values[0] > 0]
+    assert count == 2 + len(selected)
+    assert np.array_equal(rows[2:count], selected)
+    assert np.array_equal(numbers[2:count], selected[:, 0])
     assert not rows[:2].any()
 
 

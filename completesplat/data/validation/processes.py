@@ -6,9 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
-from typing import Any, TypeVar
-
-import torch
+from typing import TypeVar, cast
 
 from completesplat.errors import CompleteSplatError
 from completesplat.signals import Interrupted, end_with_parent
@@ -34,7 +32,7 @@ def map_in_processes(
     contents = pickle.dumps(function)
     with ProcessPoolExecutor(workers, get_context("spawn"), _start, (contents,)) as pool:
         try:
-            yield from pool.map(_call, items)
+            yield from cast(Iterator[Result], pool.map(_call, items))
         except BrokenProcessPool:
             advice = "run the same command again, with fewer workers"
             raise CompleteSplatError(f"a worker process ended unexpectedly (out of memory?): {advice}") from None
@@ -46,18 +44,20 @@ def map_in_processes(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-_function: Callable[[Any], Any]
+_function: Callable[[object], object]
 
 
 def _start(contents: bytes) -> None:
     """Prepare a new process and store its function."""
+    import torch
+
     global _function
     end_with_parent()
     torch.set_num_threads(1)  # There is one process for each core.
     _function = pickle.loads(contents)  # written by the parent process
 
 
-def _call(item: Any) -> Any:
+def _call(item: object) -> object:
     try:
         return _function(item)
     except Interrupted as stop:

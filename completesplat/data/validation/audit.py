@@ -5,16 +5,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from completesplat.data.processes import map_in_processes
 from completesplat.data.sequences import SequenceSource, overlaps, shared_names
 from completesplat.data.validation import TooFewFrames, at, refused_to
+from completesplat.data.validation.processes import map_in_processes
 from completesplat.errors import DataError
 from completesplat.files import printable, write_text
 
@@ -55,7 +54,7 @@ class Findings:
             kinds.setdefault(kind, []).append(error)
         return dict(sorted(kinds.items(), key=lambda item: -len(item[1])))
 
-    def json(self) -> dict[str, Any]:
+    def json(self) -> dict[str, object]:
         """Return the content of `check.json`."""
         parts = ("sequence", "frame", "file", "reason")
         return {

@@ -1,0 +1,299 @@
+"""Writers of toy data: objects as a CO3D category, rooms in both of RealEstate10K's forms."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+from rich.progress import track
+
+from completesplat.data.co3d.annotations import sequence_annotation, viewpoint, write_annotations, write_points
+from completesplat.data.images.files import save_image
+from completesplat.data.toy.object_scene import ToyScene, draw_mini, draw_scene, render_frame
+from completesplat.data.toy.room_scene import draw_room_scene, image_width, render_room_frame
+from completesplat.data.toy.shapes import Array
+from completesplat.data.validation.processes import map_in_processes
+from completesplat.errors import DataError
+from completesplat.files import atomic_folder
+from completesplat.settings.schema import Natural, Positive, Range, Side
+
+FORMAT_VERSION = 2
+MOST_FRAMES = 1000
+FRAMES_PER_SECOND, ROOM_FRAMES_PER_SECOND = 10.0, 30
+MICROSECONDS = 1_000_000
+LATEST_START = 9000
+CLIPS_PER_CHUNK = 16
+ROOMS = "toy_rooms"
+SUBSET = "fewview_train"
+DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
+    "toy_objects": draw_scene,
+    "toy_minis": draw_mini,
+    "toy_marked_minis": partial(draw_mini, marked=True),
+}
+"""Functions that draw a scene, by category: (random generator, number of frames) -> scene."""
+
+Result = TypeVar("Result")
+Annotation = dict[str, Any]
+Written = tuple[str, list[Annotation], Annotation]
+"""Split of a sequence, and annotations of its frames and of itself."""
+
+
+def write_once(folder: Path, fill: Callable[[Path], None], progress: bool, fewest: int, **numbers: int) -> Path:
+    """Make `folder`, let `fill` write into it, and finally write the numbers to `toy.json`.
+
+    The bytes depend only on `scenes` (at least `fewest`), `frames`, `size` and `seed`. A folder that was made with the
+    same numbers remains unchanged.
+
+    Raises:
+        DataError: a number is out of its range, or the folder holds something else.
+        DiskError: the disk is full.
+    """
+    for name, rule in {"scenes": Range(fewest), "frames": Range(2, MOST_FRAMES), "size": Range(8)}.items():
+        if (reason := rule.refusal(numbers[name])) is not None:
+            raise DataError(f"{folder.name}: {name}={numbers[name]}: {reason}")
+    parameters = {"format": FORMAT_VERSION, **numbers}
+    if folder.exists():
+        try:
+            existing = json.loads((folder / "toy.json").read_text())
+        except (OSError, ValueError):
+            existing = None
+        if existing != parameters:
+            raise DataError(f"{folder} already holds something else: remove it or choose another folder")
+        if progress:
+            Console().print(f"{folder} already holds these scenes")
+        return folder
+    with atomic_folder(folder) as unfinished:
+        fill(unfinished)
+        (unfinished / "toy.json").write_text(json.dumps(parameters, indent=1) + "\n")
+    return folder
+
+
+def write_scenes(
+    write: Callable[[tuple[int, str]], Result], splits: Sequence[str], workers: int | None, name: str, progress: bool
+) -> list[Result]:
+    """Call `write` with (index, split) of every scene in `workers` processes (None: one for each core), in order."""
+    written = map_in_processes(write, list(enumerate(splits)), workers)
+    return list(track(written, f"Rendering {name}", len(splits), disable=not progress))
+
+
+def to_bytes(values: Array) -> UInt8[np.ndarray, "..."]:
+    """Convert colours or shares in [0, 1] to bytes."""
+    return np.round(255 * values.clip(0, 1)).astype(np.uint8)
+
+
+def write_image(path: Path, image: Array) -> None:
+    """Write colours in [0, 1], [height width 3], as a JPEG."""
+    save_image(Image.fromarray(to_bytes(image)), path, quality=95, subsampling=0)
+
+
+def _write_frame(
+    folder: Path, category: str, name: str, scene: ToyScene, frame: int, size: int, split: str
+) -> Annotation:
+    stem = f"frame{frame + 1:06d}"
+    files = {
+        "image": f"{name}/images/{stem}.jpg",
+        "mask": f"{name}/masks/{stem}.png",
+        "depth": f"{name}/depths/{stem}.jpg.geometric.png",
+        "depth_mask": f"{name}/depth_masks/{stem}.png",
+    }
+    image, coverage, depth = render_frame(scene, frame, size)
+    mask = to_bytes(coverage)
+    write_image(folder / files["image"], image)
+    save_image(Image.fromarray(mask), folder / files["mask"])
+    # CO3D stores depth as a 16-bit image whose bits are float16, in units of `scale_adjustment`.
+    save_image(Image.fromarray(depth.astype(np.float16).view(np.uint16)), folder / files["depth"])
+    save_image(Image.fromarray(np.full_like(mask, 255)), folder / files["depth_mask"])
+    paths = {key: f"{category}/{path}" for key, path in files.items()}
+    # The world has the scene's unit and origin.
+    world_to_camera = np.linalg.inv(scene.camera_to_world[frame])
+    rotation = world_to_camera[:3, :3]
+    translation = scene.unit * world_to_camera[:3, 3] - rotation @ scene.origin
+    focal = float(1 / np.tan(np.radians(scene.fov_degrees) / 2))
+    return {
+        "sequence_name": name,
+        "frame_number": frame,
+        "frame_timestamp": frame / FRAMES_PER_SECOND,
+        "image": {"path": paths["image"], "size": [size, size]},
+        "mask": {"path": paths["mask"], "mass": float(coverage.sum())},
+        "depth": {"path": paths["depth"], "scale_adjustment": scene.unit, "mask_path": paths["depth_mask"]},
+        "viewpoint": viewpoint(rotation, translation, [focal, focal], [0.0, 0.0]),
+        "meta": {"frame_type": f"{split}_known"},
+    }
+
+
+def write_objects(
+    out: Path,
+    scenes: int,
+    frames: int,
+    size: int,
+    seed: int,
+    workers: int | None = None,
+    progress: bool = True,
+    category: str = "toy_objects",
+) -> Path:
+    """Write `scenes` sequences of `frames` square images with masks, depth, point clouds and annotations.
+
+    The subset `fewview_train` splits the sequences: about 85 % train, 5 % val, 10 % test. `<seq>/toy.json` reveals the
+    family and the colour of the patch on the back. See `write_once` for the numbers; `workers` are processes (None: one
+    for each core). Return the folder of the category (a key of `DRAW`).
+    """
+
+    def fill(folder: Path) -> None:
+        write = partial(_write_scene, folder, category, frames, size, seed)
+        _write_lists(folder, write_scenes(write, _splits(scenes), workers, category, progress))
+
+    return write_once(out / category, fill, progress, 1, scenes=scenes, frames=frames, size=size, seed=seed)
+
+
+def _splits(scenes: int) -> list[str]:
+    """Return the split of every sequence in order; with at least three scenes, each split has one or more."""
+    test = max(1, round(0.1 * scenes)) if scenes > 1 else 0
+    val = max(1, round(0.05 * scenes)) if scenes > 2 else 0
+    return ["train"] * (scenes - val - test) + ["val"] * val + ["test"] * test
+
+
+def _write_scene(root: Path, category: str, frames: int, size: int, seed: int, place: tuple[int, str]) -> Written:
+    """Write one sequence, drawn from a separate random generator, and return its split and annotations."""
+    index, split = place
+    scene = DRAW[category](np.random.default_rng([seed, index]), frames)
+    name = f"{index:05d}_{scene.family}"
+    for folder in ("images", "masks", "depths", "depth_masks"):
+        (root / name / folder).mkdir(parents=True)
+    annotations = [_write_frame(root, category, name, scene, frame, size, split) for frame in range(frames)]
+    points = scene.unit * scene.points + scene.origin
+    write_points(root / name / "pointcloud.ply", points, to_bytes(scene.point_colors))
+    hidden = {"family": scene.family, "patch_color": scene.patch_color}
+    (root / name / "toy.json").write_text(json.dumps(hidden) + "\n")
+    return split, annotations, sequence_annotation(category, name, len(points))
+
+
+def _write_lists(category: Path, written: list[Written]) -> None:
+    lists: dict[str, list[list[str | int]]] = {"train": [], "val": [], "test": []}
+    for split, frames, _ in written:
+        lists[split] += [[f["sequence_name"], f["frame_number"], f["image"]["path"]] for f in frames]
+    annotations = [frame for _, frames, _ in written for frame in frames]
+    write_annotations(category, annotations, [sequence for _, _, sequence in written], SUBSET, lists)
+
+
+@dataclass(frozen=True)
+class ClipFiles:
+    """Clip of a room in the text form: `folder`/`key`.txt and `folder`/`key`/`timestamp`.jpg.
+
+    `cameras` [frame 18] are the numbers in the text: fx fy cx cy as fractions of width or height, two zeros, and
+    `world_to_camera` by rows.
+    """
+
+    folder: Path
+    key: str
+    timestamps: list[int]
+    cameras: NDArray[np.float32]
+
+    @property
+    def url(self) -> str:  # no real video
+        return f"https://example.com/toy/{self.key}"
+
+    def image(self, frame: int) -> Path:
+        """Return the path of a frame's image."""
+        return self.folder / self.key / f"{self.timestamps[frame]}.jpg"
+
+
+def clip_files(folder: Path, key: str, start: int, intrinsics: Array, world_to_camera: Array) -> ClipFiles:
+    """Return a clip whose first frame is `start` frames into its video; poses are [frame 3 4]."""
+    frames = len(world_to_camera)
+    timestamps = [round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND) for frame in range(frames)]
+    rows = [np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), world_to_camera.reshape(frames, 12)]
+    return ClipFiles(folder, key, timestamps, np.concatenate(rows, axis=1).astype(np.float32))
+
+
+def write_text(clip: ClipFiles) -> None:
+    """Write the text (the address, then timestamp and camera of each frame in a line) and make the frames' folder."""
+    (clip.folder / clip.key).mkdir(parents=True)
+    lines = [clip.url]
+    for time, row in zip(clip.timestamps, clip.cameras, strict=True):
+        # Nine digits identify a float32 exactly, so text and chunks hold the same numbers.
+        lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
+    (clip.folder / f"{clip.key}.txt").write_text("\n".join(lines) + "\n")
+
+
+def write_chunks(folder: Path, clips: list[ClipFiles]) -> None:
+    """Write `folder`/NNNNNN.torch from the text form's frames, and `folder`/index.json."""
+    folder.mkdir(parents=True)
+    index = {clip.key: f"{number // CLIPS_PER_CHUNK:06d}.torch" for number, clip in enumerate(clips)}
+    for name in sorted(set(index.values())):
+        torch.save([_chunk_entry(clip) for clip in clips if index[clip.key] == name], folder / name)
+    (folder / "index.json").write_text(json.dumps(index) + "\n")
+
+
+def _chunk_entry(clip: ClipFiles) -> dict[str, object]:
+    images = [clip.image(frame).read_bytes() for frame in range(len(clip.timestamps))]
+    return {
+        "url": clip.url,
+        "timestamps": torch.tensor(clip.timestamps, dtype=torch.int64),
+        "cameras": torch.from_numpy(clip.cameras),
+        "images": [torch.frombuffer(bytearray(image), dtype=torch.uint8) for image in images],
+        "key": clip.key,
+    }
+
+
+def write_rooms(
+    out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
+) -> Path:
+    """Write `scenes` clips of `frames` images, `size` high and 16 / 9 as wide, with poses and intrinsics.
+
+    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg; `chunks`/<split>/ has the same clips in NNNNNN.torch and
+    index.json. The first and every tenth clip after it are in the split `test`, the others in `train`. See `write_once`
+    for the numbers; `workers` are processes (None: one for each core). Return the folder, `out`/toy_rooms.
+    """
+    splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
+
+    def fill(folder: Path) -> None:
+        write = partial(_write_clip, folder / "text", frames, size, seed)
+        clips = write_scenes(write, splits, workers, ROOMS, progress)
+        for split in ("train", "test"):
+            write_chunks(folder / "chunks" / split, [clip for clip in clips if clip.folder.name == split])
+
+    return write_once(out / ROOMS, fill, progress, 2, scenes=scenes, frames=frames, size=size, seed=seed)
+
+
+def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> ClipFiles:
+    """Write the text form of one clip, drawn from a separate random generator."""
+    index, split = place
+    rng = np.random.default_rng([seed, index])
+    scene = draw_room_scene(rng, frames)
+    width, start = image_width(size), int(rng.integers(LATEST_START))
+    intrinsics = scene.move.intrinsics(size, width)
+    clip = clip_files(text / split, f"room{index:05d}", start, intrinsics, scene.move.world_to_camera())
+    write_text(clip)
+    for frame in range(frames):
+        image, _ = render_room_frame(scene, frame, size, width)
+        write_image(clip.image(frame), image)
+    return clip
+
+
+KINDS: dict[str, Callable[..., Path]] = {
+    "objects": write_objects,
+    "minis": partial(write_objects, category="toy_minis"),
+    "marked_minis": partial(write_objects, category="toy_marked_minis"),
+    "rooms": write_rooms,
+}
+
+
+def write(
+    kind: str, out: Path, scenes: int, frames: int, size: Side, seed: Natural, workers: Positive | None = None
+) -> Path:
+    """Write scenes of a kind (a key of `KINDS`) and return their folder.
+
+    Raises:
+        DataError: the kind is unknown, or the folder holds something else.
+    """
+    if kind not in KINDS:
+        raise DataError(f"no toy data of kind {kind!r}; there are: {', '.join(KINDS)}")
+    return KINDS[kind](out, scenes, frames, size, seed, workers)
