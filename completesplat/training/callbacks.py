@@ -18,7 +18,6 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from completesplat.data.loading.distributed import gathered
 from completesplat.errors import DivergenceError
 from completesplat.settings.schema import Positive, Share
-from completesplat.training.sharding import local_part, whole
 
 BAD_STEPS = "train/bad_steps"
 
@@ -72,7 +71,7 @@ class BadSteps(Callback):
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
         gradients = [p.grad for p in pl_module.parameters() if p.grad is not None]
-        norm = whole(torch.nn.utils.get_total_norm(gradients)).to(pl_module.device)
+        norm = torch.nn.utils.get_total_norm(gradients).to(pl_module.device)
         finite = torch.stack([*self.losses, norm]).isfinite().all()
         self.losses = []
         # Processes have different losses, but the same gradients.
@@ -98,7 +97,7 @@ def _divergence(trainer: Trainer, module: LightningModule, steps: int) -> str:
     logged = {name.removeprefix("train/"): x for name, x in trainer.callback_metrics.items() if "train/" in name}
     terms = [f"{name} is {value.item()}" for name, value in logged.items() if not value.isfinite()]
     terms.sort(key=lambda term: term.startswith("loss "))  # the sum says less than its terms
-    layers = [n for n, p in module.named_parameters() if p.grad is not None and not local_part(p.grad).isfinite().all()]
+    layers = [n for n, p in module.named_parameters() if p.grad is not None and not p.grad.isfinite().all()]
     results = gathered((terms, layers))
     term = next((f"loss term {terms[0]}" for terms, _ in results if terms), "the last losses are finite")
     layer = next((f"that of {layers[0]} is the first" for _, layers in results if layers), "their norm is too large")
@@ -116,12 +115,7 @@ class ExponentialMovingAverage(WeightAveraging):
     """
 
     def __init__(self, decay: Share) -> None:
-        average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-
-        def update(averaged: list[Tensor], weights: list[Tensor], steps: Tensor | int) -> None:
-            average([local_part(value) for value in averaged], [local_part(value) for value in weights], steps)
-
-        super().__init__(multi_avg_fn=update)
+        super().__init__(multi_avg_fn=get_ema_multi_avg_fn(decay))  # type: ignore[no-untyped-call]
 
     @contextmanager
     def in_place(self, module: LightningModule) -> Iterator[None]:

@@ -23,7 +23,6 @@ from completesplat.files import atomic_path, make_folder
 from completesplat.settings.schema import Positive
 from completesplat.signals import keep_signals
 from completesplat.training.loggers import ContinuedCSVLogger
-from completesplat.training.sharding import local_part, remove_unused_shards
 from completesplat.training.stopping import agreed_signal, end_training
 from completesplat.weights.checkpoint_reading import CHECKSUM, DIGEST_BYTES, check_whole, not_finite, read_checkpoint
 
@@ -126,7 +125,6 @@ class Checkpoints(Checkpoint):
             self._save(trainer, pl_module)
         if trainer.is_global_zero:
             (self.folder / PREVIOUS).unlink(missing_ok=True)
-            remove_unused_shards(self.folder)
         keep_signals(False)
         if (number := agreed_signal(trainer)) is not None:
             end_training(trainer, number)
@@ -155,8 +153,7 @@ class Checkpoints(Checkpoint):
         return trainer.strategy.broadcast(monotonic() - self.saved_at >= 60 * self.every_minutes)
 
     def _save(self, trainer: Trainer, module: LightningModule) -> None:
-        local = not_finite({name: local_part(value) for name, value in module.state_dict().items()})
-        if (name := next(filter(None, gathered(local)), None)) is not None:
+        if (name := next(filter(None, gathered(not_finite(module.state_dict()))), None)) is not None:
             message = f"{name} is not finite; no checkpoint is written of it, earlier ones stay in {self.folder}"
             raise DivergenceError(f"step {trainer.global_step}: {message}")
         self.due = False

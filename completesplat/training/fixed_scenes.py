@@ -30,7 +30,6 @@ from completesplat.scene import SceneBatch
 from completesplat.settings.schema import Natural, Positive
 from completesplat.tensors import stack
 from completesplat.training.callbacks import ExponentialMovingAverage
-from completesplat.training.sharding import whole_networks
 from completesplat.training.stage import Stage
 
 ERROR_GAIN = 4
@@ -88,17 +87,13 @@ class DrawsFixedScenes(Callback):
 
 @contextmanager
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Switch to evaluation, with averaged weights if there are any, and restore everything, random numbers too.
-
-    All processes have to enter it, because divided networks are whole inside.
-    """
+    """Switch to evaluation, with averaged weights if there are any, and restore everything, random numbers too."""
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices), ExitStack() as contexts:
         for callback in trainer.callbacks:  # type: ignore[attr-defined]
             if isinstance(callback, ExponentialMovingAverage):
                 contexts.enter_context(callback.in_place(module))
-        contexts.enter_context(whole_networks(module))
         module.eval()
         try:
             yield

@@ -46,7 +46,6 @@ class LatentDiffusion(Stage):
     """
 
     draws_samples = True
-    networks = ("completesplat.denoiser", "completesplat.conditioning")
 
     def __init__(
         self,

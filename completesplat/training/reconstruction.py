@@ -38,8 +38,6 @@ class ReconstructionModule(Stage):
         **rendering_and_optimization: see `Stage`.
     """
 
-    networks = ("model",)
-
     def __init__(
         self,
         model: nn.Module,

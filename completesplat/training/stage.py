@@ -81,9 +81,6 @@ class Stage(LightningModule):
     draws_samples = False
     """Whether the model has several answers for one image."""
 
-    networks: tuple[str, ...] = ()
-    """Names of the trained networks, which are called as a whole: `trainer=fsdp` divides each over the processes."""
-
     def __init__(
         self,
         rasterizer: Rasterizer,

@@ -21,16 +21,10 @@ from torch import Tensor, nn
 
 from completesplat.errors import TensorFileError, WeightsError
 from completesplat.settings.schema import shown
-from completesplat.weights import sha256_of
 
 END, END_BYTES = b"PK\5\6", 22
 """First bytes of a zip archive's last record, and the record's length without the comment at its end."""
 CHECKSUM, DIGEST_BYTES = b"sha256:", 64
-SHARDS, SHARDS_SUFFIX = "shards", ".shards"
-"""Entry of a checkpoint that several processes wrote: the folder beside it with the files of their divided tensors, and
-the SHA-256 of each file."""
-DIVIDED = "divided:"
-"""Prefix of the name that replaces a divided tensor."""
 ZIP = b"PK\3\4"
 MOST_REPEATED = 2**22
 """Largest number of elements of a tensor that has more of them than its file, because it repeats them."""
@@ -156,7 +150,7 @@ def _is_plain_call(function: str, arguments: tuple[Step, ...]) -> bool:
 
 
 def check_whole(path: Path) -> None:
-    """Raise WeightsError if a checkpoint, or a shard that another process wrote, has changed since it was written.
+    """Raise WeightsError if a checkpoint has changed since it was written.
 
     Without a checksum, as in files that torch wrote, only the end is checked.
     """
@@ -176,48 +170,6 @@ def check_whole(path: Path) -> None:
             left -= len(part)
     if end[-DIGEST_BYTES:] != digest.hexdigest().encode():
         raise WeightsError(f"{path}: not a readable checkpoint (damaged: its checksum is another)")
-    shards = shards_of(path)
-    for name, checksum in shards.get("files", {}).items():
-        shard = path.parent / Path(shards["folder"]).name / Path(name).name
-        if not shard.is_file() or sha256_of(shard) != checksum:
-            raise WeightsError(f"{path}: not a readable checkpoint (damaged: {shard} is missing or another)")
-
-
-def shards_of(path: Path) -> dict[str, Any]:
-    """Return the folder and files of a checkpoint's divided tensors; {} if it has none or is unreadable."""
-    if not any(path.parent.glob(f"*{SHARDS_SUFFIX}")):
-        return {}
-    try:
-        return dict(read_tensor_file(path, mmap=True).get(SHARDS, {}))
-    except Exception:
-        return {}
-
-
-def _put_together(path: Path, contents: dict[str, Any]) -> dict[str, Any]:
-    """Put the divided tensors of a checkpoint back into its contents, as if one process had written it."""
-    if (shards := contents.pop(SHARDS, None)) is None:
-        return contents
-    from torch.distributed.checkpoint.hf_storage import HuggingFaceStorageReader  # slow to import
-    from torch.distributed.checkpoint.metadata import TensorStorageMetadata
-    from torch.distributed.checkpoint.state_dict_loader import load
-
-    folder = path.parent / Path(shards["folder"]).name
-    reader = HuggingFaceStorageReader(str(folder))
-    entries: dict[str, TensorStorageMetadata] = reader.read_metadata().state_dict_metadata  # type: ignore[assignment]
-    needed = sum(entry.size.numel() * entry.properties.dtype.itemsize for entry in entries.values())
-    if needed > sum(file.stat().st_size for file in folder.iterdir()):
-        raise WeightsError(f"{path}: not a readable checkpoint (its tensors are larger than the files in {folder})")
-    tensors = {name: torch.empty(entry.size, dtype=entry.properties.dtype) for name, entry in entries.items()}
-    load(tensors, storage_reader=reader, no_dist=True)  # safetensors, so this runs no code of the files
-
-    def filled(value: Any) -> object:
-        if isinstance(value, str) and value.startswith(DIVIDED):
-            return tensors[value.removeprefix(DIVIDED)]
-        if isinstance(value, dict):
-            return {key: filled(part) for key, part in value.items()}
-        return type(value)(map(filled, value)) if isinstance(value, list | tuple) else value
-
-    return {key: filled(part) for key, part in contents.items()}
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -231,7 +183,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise WeightsError(f"{path}: no such checkpoint")
     check_whole(Path(path))
     try:
-        contents = _put_together(Path(path), read_tensor_file(Path(path)))
+        contents: dict[str, Any] = read_tensor_file(Path(path))
         name = not_finite(contents["state_dict"])
     except WeightsError:
         raise
