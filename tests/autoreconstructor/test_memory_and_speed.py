@@ -77,21 +77,6 @@ def test_gradient_checkpointing_keeps_less_and_leaves_loss_and_gradients_as_they
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_blocks_run_twice_in_training_only(scenes, model):
-    checkpointed = module(model, f"{MODELS[model]}.gradient_checkpointing=true")
-    network = checkpointed.model.encoder.network if model == "var" else checkpointed.model.network
-    calls = []
-    network.down_blocks[0].resnets[0].conv1.register_forward_hook(lambda *_: calls.append(1))
-    loss(checkpointed.train(), scenes).backward()
-    assert len(calls) == 2
-    loss(checkpointed.eval(), scenes).backward()
-    assert len(calls) == 3
-    with torch.no_grad():
-        loss(checkpointed.train(), scenes)
-    assert len(calls) == 4
-
-
-@pytest.mark.parametrize("model", MODELS)
 def test_channels_last_holds_for_weights_and_images_and_changes_no_output(scenes, model):
     plain, other = pair(model, "model.channels_last=true")
     seen: list[Tensor] = []
