@@ -32,7 +32,6 @@ UNHELPFUL_WARNINGS = (
     "Experiment logs directory .* exists.*",
     ".*logging interval.*",
     "Checkpoint directory .* exists and is not empty.*",
-    "FSDP2-wrapped module .* returned a view tensor.*",
     ".*torch.distributed is disabled, unavailable or uninitialized.*",
 )
 

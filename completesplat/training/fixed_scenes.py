@@ -77,9 +77,9 @@ class DrawsFixedScenes(Callback):
             return
         assert isinstance(module, Stage)
         self.drawn = trainer.global_step
+        if not trainer.is_global_zero:
+            return
         with untouched(trainer, module):
-            if not trainer.is_global_zero:
-                return
             if not self.scenes:
                 self.scenes = fixed_scenes(module.data.val_dataloader(), self.count, self.views)
             self.draw(trainer, module, self.scenes)

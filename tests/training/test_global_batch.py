@@ -79,3 +79,17 @@ def test_a_batch_that_the_devices_do_not_share_is_refused_before_they_start(toy_
     settings = ["experiment=toy_var", f"data.root={toy_root}", *SMALL, "data.batch_size=3", "rasterizer=reference"]
     line = refused("fit", *settings, "trainer.devices=2", "trainer.strategy=ddp", "out=run")
     assert line.startswith("data.batch_size=3 is the batch of an optimizer step")
+
+
+def test_launchers_say_how_many_processes_there_are(monkeypatch):
+    for name in ("LOCAL_WORLD_SIZE", "GROUP_WORLD_SIZE", "SLURM_NTASKS_PER_NODE", "SLURM_NNODES"):
+        monkeypatch.delenv(name, raising=False)
+    trainer = compose_config("fit", "trainer=ddp").trainer
+    assert (trainer.devices, trainer.num_nodes) == ("auto", 1)
+    monkeypatch.setenv("SLURM_NTASKS_PER_NODE", "8")
+    monkeypatch.setenv("SLURM_NNODES", "3")
+    slurm = compose_config("fit", "trainer=slurm").trainer
+    assert (trainer.devices, trainer.num_nodes) == (slurm.devices, slurm.num_nodes) == (8, 3)
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "4")
+    monkeypatch.setenv("GROUP_WORLD_SIZE", "2")
+    assert (trainer.devices, trainer.num_nodes) == (4, 2)
