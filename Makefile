@@ -71,7 +71,7 @@ test-browser: $(READY) ## Viewer and report page in Chromium (apt-get install ch
 
 # What hypothesis finds is kept in .hypothesis/ and tried first the next time.
 fuzz: $(READY) ## Damaged files for each of seven readers, FUZZ_MINUTES=10 each
-	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q -p no:logging --numprocesses auto --maxprocesses 7 tests/test_fuzzed_readers.py
+	FUZZ_MINUTES=$(FUZZ_MINUTES) $(BIN)/python -m pytest -q -m "" -p no:logging --numprocesses auto --maxprocesses 7 tests/test_fuzzed_readers.py
 
 check: $(READY) ## Lint, formatting and types
 	$(BIN)/ruff check
