@@ -158,7 +158,7 @@ def check_architecture(architecture: object, file: Path | None = None) -> None:
         raise (error if file is None else WeightsError(f"{file}: {error}")) from None
 
 
-def _check_settings(place: str, hints: Mapping[str, object], settings: Mapping[str, object]) -> None:
+def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str, object]) -> None:
     for name, value in settings.items():
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:

@@ -160,8 +160,7 @@ def test_the_second_part_of_stage_one_is_swept_from_the_jobs_of_the_first(comman
 def test_a_run_goes_on_with_another_number_of_processes(whole, tmp_path):
     job = whole / "seed-0"
     config = OmegaConf.to_container(OmegaConf.load(job / "config.yaml"))
-    ddp = {"_target_": "lightning.pytorch.strategies.DDPStrategy"}
-    others = {"devices": 2, "num_nodes": 3, "strategy": ddp}
+    others = {"devices": 2, "num_nodes": 3, "strategy": "ddp"}
     assert is_finished(job, config | {"trainer": config["trainer"] | others})
     with pytest.raises(CompleteSplatError, match=r"with another trainer\.precision"):
         is_finished(job, config | {"trainer": config["trainer"] | {"precision": "64-true"}})

@@ -1,5 +1,4 @@
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -73,15 +72,6 @@ def test_whole_sequences_are_split_by_seed_also_where_there_are_set_lists(tmp_pa
     assert all(len(frames) == 2 for split in SPLITS for frames in category.splits[split].frames.values())
     assert taken != names(read(tmp_path, subset=None, rule=SeededSplit(0.2, 0.3, 1)))
     assert taken == names(read(tmp_path, subset=None))
-
-
-@pytest.mark.parametrize(("val", "test"), [(0.1, 0.05)])
-def test_a_split_by_seed_holds_out_the_asked_shares(tmp_path, val, test):
-    """Within four standard deviations of a binomial share."""
-    annotate(tmp_path, many(400))
-    taken = names(read(tmp_path, subset=None, rule=SeededSplit(val, test, 0)))
-    for split, share in (("val", val), ("test", test)):
-        assert abs(len(taken[split]) - 400 * share) < 4 * math.sqrt(400 * share * (1 - share))
 
 
 def test_sequences_stay_in_their_split_when_others_come(tmp_path):

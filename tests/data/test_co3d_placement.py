@@ -11,11 +11,10 @@ from completesplat.data.co3d.source import from_depth_maps, object_placement
 from completesplat.data.co3d.splits import Filters, SeededSplit, read_category
 from completesplat.data.placement import Axes, Placement, from_cameras, from_points, upright_axes
 from completesplat.data.toy.writing import SUBSET
-from completesplat.data.validation import BadImage, BadPlacement, MissingFile, UnreadableFile, read_points
+from completesplat.data.validation import BadImage, BadPlacement, MissingFile, read_points
 
 CENTER = np.array([3.0, -2.0, 5.0])
 AXES = np.eye(3)
-HEAD = "ply\nformat {} 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 
 
 def from_cloud(path: Path, axes: Axes) -> Placement:
@@ -67,20 +66,6 @@ def test_placement_of_a_known_cloud_and_of_none(tmp_path):
         assert caught.value.file == str(tmp_path / "cloud.ply")
     with pytest.raises(MissingFile, match=r"none\.ply"):
         from_cloud(tmp_path / "none.ply", AXES)
-
-
-@pytest.mark.parametrize(
-    "head",
-    [
-        "not a ply",
-        HEAD.format("ascii", 10**12),
-        HEAD.format("ascii", 2).replace(" x", " w"),
-    ],
-)
-def test_clouds_with_impossible_headers_are_refused(tmp_path, head):
-    (tmp_path / "cloud.ply").write_text(head + "0 0 0\n1 1 1\n")
-    with pytest.raises(UnreadableFile, match=r"cloud\.ply"):
-        from_cloud(tmp_path / "cloud.ply", AXES)
 
 
 def frame(viewpoint: dict, size: tuple[int, int] = (24, 32), depth: DepthMap | None = None) -> CO3DFrame:

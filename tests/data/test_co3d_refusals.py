@@ -3,20 +3,17 @@
 import math
 import os
 import shutil
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from co3d_trees import CATEGORY, FRAMES, SEQUENCES, SET_LIST, SUBSET, change, depth_bits, write_tree
 from PIL import Image
 
 from completesplat.data.co3d.module import CO3DDataModule
 from completesplat.data.co3d.splits import Category, Filters, SeededSplit, read_category
-from completesplat.data.sequences import SPLITS
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
@@ -31,9 +28,7 @@ from completesplat.errors import DataError
 
 POLICIES = pytest.mark.parametrize("policy", ["raise", "skip"])
 NAN = float("nan")
-ITEMS = 4  # of a sequence in an epoch
 Edit = Callable[[Any], object]
-Seen = tuple[str, int]  # sequence, number of the frame
 
 
 @pytest.fixture(scope="module")
@@ -241,54 +236,5 @@ def test_what_is_broken_is_refused_by_the_source_with_its_place(name, category):
 
 def module(root: Path, policy: str, **settings: Any) -> CO3DDataModule:
     """Small images, one scene in a batch that shows all frames, and no limit on what is skipped."""
-    defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "references_per_sequence": ITEMS, "subset": SUBSET}
+    defaults = {"image_size": 8, "batch_size": 1, "targets": 3, "subset": SUBSET}
     return CO3DDataModule(str(root), CATEGORY, **{**defaults, "on_bad": policy, "max_bad_fraction": 10.0, **settings})
-
-
-@pytest.fixture(scope="module")
-def intact_images(intact: Path) -> dict[bytes, Seen]:
-    """All images of the tree that nothing is wrong with; no two are alike."""
-    data, found = module(intact.parent, "raise"), {}
-    for split in SPLITS:
-        for name in data.source(split).names:
-            sequence = data.source(split).read(name)
-            for index, number in enumerate(sequence.frames):
-                found[sequence.read(index).image.numpy().tobytes()] = name, number
-    return found
-
-
-def epoch(loader: Any, intact_images: dict[bytes, Seen], number: int = 0) -> set[Seen]:
-    """The frames that an epoch of training shows, exactly as they are. It has all of its scenes, whatever is broken."""
-    loader.sampler.set_epoch(number)
-    batches, seen = list(loader), set()
-    assert len(batches) == len(loader) == len(loader.dataset)
-    for batch in batches:
-        views = batch.all_views()
-        assert all(t.isfinite().all() for t in (views.masks, views.cameras.world_to_camera, batch.depth_range))
-        found = {intact_images[(255 * image).round().to(torch.uint8).numpy().tobytes()] for image in views.images[0]}
-        assert {(sequence,) for sequence, _ in found} == {batch.names}
-        seen |= found
-    return seen
-
-
-@POLICIES
-@pytest.mark.parametrize("name", ["image_is_text", "missing_cloud"])
-def test_what_is_broken_never_gets_into_a_batch(name, policy, category, intact_images, monkeypatch):
-    damage, kind, file, frame = DAMAGES[name]
-    damage(category)
-    data = module(category.parent, policy)
-    data.setup("fit")
-    loader, source, readings = data.train_dataloader(), data.source("train"), Counter[str]()
-    whole = source.read
-    monkeypatch.setattr(source, "read", lambda name: (readings.update([name]), whole(name))[1])
-    if policy == "raise":
-        with pytest.raises(DataError) as caught:
-            list(loader)
-        assert place(caught.value) == (kind, str(category / file), "a", frame)
-        return
-    for number in (0, 1):
-        readings.clear()
-        assert {name for name, _ in epoch(loader, intact_images, number)} == {"b"}
-        # Its own items come every epoch; what is drawn in their place may be others of them.
-        assert len(loader.refused) == readings["a"] >= ITEMS
-        assert {place(error) for error in loader.refused} == {(kind, str(category / file), "a", frame)}

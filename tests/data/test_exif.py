@@ -1,6 +1,5 @@
 import math
 import struct
-import warnings
 
 import numpy as np
 import pytest
@@ -105,15 +104,6 @@ def test_without_a_usable_focal_length_the_default_stands(tmp_path, tags):
     infinite = {0x920A: 35.0, 0xA20E: 100.0, 0xA002: math.inf, 0xA003: math.inf}
     assert crop_fov(infinite, (60, 40)) == pytest.approx(degrees(40, 35 * 100 / 25.4))
     assert crop_fov({0xA405: math.inf}, (60, 40)) is None
-
-
-@pytest.mark.parametrize("name", ["a.jpg", "a.webp"])
-@pytest.mark.parametrize("record", [b"garbage", b"MM\0*\0\0", b"MM\0*\0\0\0\x08\xff\xff" + b"\x01" * 50])
-def test_a_damaged_exif_record_is_none(tmp_path, name, record):
-    Image.new("RGB", (SIZE, SIZE)).save(tmp_path / name, exif=b"Exif\0\0" + record)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert read_photograph(tmp_path / name, SIZE).fov_source == "default"
 
 
 def test_a_damaged_inner_record_leaves_the_orientation(tmp_path):

@@ -3,7 +3,6 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -191,8 +190,8 @@ BAD: dict[str, tuple[bytes, str, str]] = {
     "transparent_palette_entry": (saved(Image.fromarray(LARGE).quantize(16), transparency=0), "RGB", "transparent"),
     "coloured_mask": (saved(LARGE), "L", "has colours"),
     "float_tiff": (saved(LARGE_GREY.astype(np.float32) / 255, "TIFF"), "RGB", "colour mode F"),
-    "other_size": (saved(LARGE[:23]), "RGB", "has 23 x 32 pixels, its annotation says 24 x 32"),
-    "annotated_before_rotation": (saved(LARGE, orientation=6), "RGB", "before it is turned as its EXIF orientation 6"),
+    "other_size": (saved(LARGE[:23]), "RGB", "has 23 x 32 pixels when upright, its annotation says 24 x 32"),
+    "annotated_before_rotation": (saved(LARGE, orientation=6), "RGB", "has 32 x 24 pixels when upright"),
 }  # fmt: skip
 
 
@@ -235,16 +234,6 @@ def test_whatever_a_decoder_raises_is_a_data_error(monkeypatch, error):
     monkeypatch.undo()
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     refuse(lambda: decode(cut(saved(RGB)), "name", "RGB"), "name", "LOAD_TRUNCATED_IMAGES")
-
-
-def test_no_flipped_bit_changes_the_pixels_of_a_png():
-    """Checksums cover every chunk; flips in the last one, which is empty, may pass."""
-    good = saved(RGB, compress_level=0)
-    for bit in range(0, 8 * len(good), 3):
-        content = bytearray(good)
-        content[bit // 8] ^= 1 << bit % 8
-        with suppress(DataError):
-            assert np.array_equal(np.asarray(decode(bytes(content), "flipped", "RGB", (6, 8))), RGB)
 
 
 DEPTH = np.array([[0.0, 0.5, 1.25], [3.0, 65504.0, 2.0**-14]], dtype=np.float16)

@@ -53,11 +53,6 @@ def test_each_format_gives_its_views(root, tmp_path, content, form, tests):
     assert f"in {form}'s format, SHA-256 " in data.describe()["protocol_views"]
 
 
-def test_two_lists_are_two_protocols(root, tmp_path):
-    lists = (PIXELSPLAT, MVSPLAT360, {**PIXELSPLAT, "test3": PAIR})
-    assert len({data_of(root, content, tmp_path).describe()["protocol_views"] for content in lists}) == 3
-
-
 def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
     missing = {f"gone{i}": PAIR for i in range(7)}
     data_of(root, {**PIXELSPLAT, **missing}, tmp_path).store("test")
@@ -72,7 +67,7 @@ def test_what_a_list_leaves_out_is_counted_and_named(root, tmp_path, caplog):
     [
         ({"test0": {**PAIR, "overlap": 0.5}}, "test0: neither null"),
         ({"test0": 3}, "test0: neither null"),
-        ({"test0": PAIR, "test1": [PAIR]}, "test1: in the format of latentSplat, clips before it in that"),
+        ({"test0": PAIR, "test1": [PAIR]}, "test1: formats of several works: pixelSplat, latentSplat"),
         ({"test0": {"context": [1], "target": [2.5]}}, "test0: context and target must be lists of frame numbers"),
         ({"test0": [{"context": [], "target": [1]}]}, "test0: context and target must be lists of frame numbers"),
         ({"test0": None}, "no clip with views"),

@@ -27,7 +27,7 @@ from completesplat.data.placement import (
 from completesplat.data.sequences import MaskedImage, PosedSequence, SequenceSource
 from completesplat.data.validation import MissingFile, at, refused_to
 from completesplat.errors import DataError
-from completesplat.settings.schema import Positive, Range, Share
+from completesplat.settings.schema import Positive, Range
 
 # Points whose distance from the median point exceeds this multiple of the median distance are outliers, because the
 # farthest point determines the scale of the scene.
@@ -44,7 +44,7 @@ def members(hold_out: int, held_out: bool, frames: int) -> list[int]:
     return [frame for frame in range(frames) if (frame % step == 0) == held_out]
 
 
-def read_capture(folder: Path, most_missing: float) -> Capture | None:
+def read_capture(folder: Path) -> Capture | None:
     """Read the capture in a folder: `transforms.json`, or `sparse/0` or `sparse` with `images` and perhaps `masks`.
 
     `folder` may also be a JSON file, such as `transforms_train.json` of NeRF.
@@ -54,7 +54,7 @@ def read_capture(folder: Path, most_missing: float) -> Capture | None:
     """
     transforms = folder if folder.suffix == ".json" else folder / "transforms.json"
     if transforms.is_file():
-        return read_transforms(transforms, most_missing)
+        return read_transforms(transforms)
     for model in (folder / "sparse/0", folder / "sparse"):
         if any((model / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
             masks = folder / "masks"
@@ -129,7 +129,6 @@ class CaptureDataModule(SceneDataModule):
     Args:
         root: folder or file of a capture (`read_capture`), a folder of such folders, or prepared captures.
         hold_out: one of every `hold_out` frames is for validation and test.
-        most_missing: largest share of the frames of a `transforms.json` that may lack an image and are left out.
         evaluation_targets: at most this many evenly spaced targets of the reference, the first held-out frame; None:
             all other held-out frames.
         spread_targets: spread the training targets evenly around the reference, for a posterior that sees them.
@@ -141,7 +140,6 @@ class CaptureDataModule(SceneDataModule):
         self,
         root: str,
         hold_out: Annotated[int, Range(2)] = 8,
-        most_missing: Share = 0.5,
         evaluation_targets: Positive | None = None,
         spread_targets: bool = False,
         depth_before: float = 2.0,
@@ -150,7 +148,6 @@ class CaptureDataModule(SceneDataModule):
     ) -> None:
         super().__init__(root, **settings)
         self.hold_out = hold_out
-        self.most_missing = most_missing
         self.evaluation_targets = evaluation_targets
         self.spread_targets = spread_targets
         self.framing = ObjectFraming(self.image_size, depth_before, depth_after)
@@ -165,7 +162,7 @@ class CaptureDataModule(SceneDataModule):
         }
 
     def packed_settings(self) -> dict[str, Scalar]:
-        return {"hold_out": self.hold_out, "most_missing": self.most_missing, **vars(self.framing)}
+        return {"hold_out": self.hold_out, **vars(self.framing)}
 
     def open(self, split: str) -> Mapping[str, CaptureSource]:
         """Read the cameras of all captures; the error of one capture is only raised if no other can be read."""
@@ -175,7 +172,7 @@ class CaptureDataModule(SceneDataModule):
         for folder in folders:
             name = folder.resolve().name or "capture"
             with refused_to(refused.append), at(sequence=name):
-                if (capture := read_capture(folder, self.most_missing)) is not None:
+                if (capture := read_capture(folder)) is not None:
                     captures[name] = capture
             if folder == self.root and (captures or refused):
                 break

@@ -23,7 +23,6 @@ from completesplat.data.sequences import shortened
 from completesplat.data.validation import (
     BadAnnotation,
     BadCamera,
-    MissingFile,
     at,
     field,
     finite_array,
@@ -49,7 +48,7 @@ Entry = Mapping[str, object]
 SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # NeRF (synthetic) leaves the suffix out.
 
 
-def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
+def read_transforms(path: Path) -> Capture:
     """Read `transforms.json`; values of a frame override those of the file.
 
     `transform_matrix` is camera-to-world with OpenGL's axes (+x right, +y up, +z backward; nerfstudio, "Data
@@ -59,13 +58,13 @@ def read_transforms(path: Path, most_missing: float = 0.5) -> Capture:
     `mask_path` is the foreground. `ply_file_path` is in the world of the poses (`create_ply_from_colmap`, ibid.).
     Paths are relative to the file's folder and stay in it.
 
-    Frames without an image are left out (up to the share `most_missing`), as in instant-ngp for frames with a
-    `sharpness` (`nerf_loader.cu`); its capture of a fox lists 67 frames and has 50 images.
+    Frames without an image are left out, as in instant-ngp for frames with a `sharpness` (`nerf_loader.cu`); its
+    capture of a fox lists 67 frames and has 50 images.
 
     Raises:
         DataError: something is missing, malformed or impossible; the error has the file and the frame's number.
     """
-    frames, content = _read_frames(path, most_missing)
+    frames, content = _read_frames(path)
     with at(path):
         ordered = in_order(frames)
         if content.get("ply_file_path") is None:
@@ -85,7 +84,7 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
         DataError: as in `read_transforms`, except for too few frames; or EXIF turns a photo, or its size differs.
         CompleteSplatError: a photo is not in the file.
     """
-    frames = {frame.image.resolve(): frame for frame in _read_frames(path, most_missing=1)[0]}
+    frames = {frame.image.resolve(): frame for frame in _read_frames(path)[0]}
     squares, cameras = [], []
     for image in images:
         frame = frames.get(image.resolve())
@@ -101,7 +100,7 @@ def read_photographs(images: Sequence[Path], path: Path, size: int) -> Views:
     return Views(torch.stack(squares), placed.relative_to(placed[0]), torch.ones(len(squares), 1, size, size))
 
 
-def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], Entry]:
+def _read_frames(path: Path) -> tuple[list[CapturedFrame], Entry]:
     """Return all frames that have images, and the file's content."""
     content = read_json(path, allow_nan=True)  # NaN is refused later, with the number of its frame.
     root, frames, missing = path.parent, [], []
@@ -120,17 +119,10 @@ def _read_frames(path: Path, most_missing: float) -> tuple[list[CapturedFrame], 
                 mask = require_file(inside(root, field(entry, "mask_path", str))) if masked else None
                 lens, pose = _read_lens({**content, **entry}, image), _read_pose(entry.get("transform_matrix"))
                 frames.append(CapturedFrame(number, image, mask, lens, pose))
-        if missing:
-            _account(path, missing, len(entries), most_missing)
+    if missing:
+        counted = f"{len(missing)} of {len(entries)} frames have no image and are left out"
+        logger.warning("%s: %s: %s", path, counted, shortened(missing))
     return frames, content
-
-
-def _account(path: Path, missing: list[str], frames: int, most_missing: float) -> None:
-    """Warn of frames without an image, or refuse too many."""
-    counted, named = f"{len(missing)} of {frames} frames have no image", shortened(missing)
-    if len(missing) > most_missing * frames:
-        raise MissingFile(f"{counted}, more than most_missing={most_missing:g}: {named}")
-    logger.warning("%s: %s and are left out: %s", path, counted, named)
 
 
 def _read_pose(matrix: object) -> Float[np.ndarray, "4 4"]:

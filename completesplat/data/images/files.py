@@ -23,7 +23,6 @@ MOST_BYTES = 2**28
 EIGHT_BIT_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "CMYK", "YCbCr")
 SIXTEEN_BIT_MODES = ("I;16", "I;16B", "I;16L")
 TIFF_BITS, TIFF_PHOTOMETRIC = 258, 262
-QUARTER_TURNS = (5, 6, 7, 8)
 TRANSPARENT = "has transparent pixels; lay it over a background first"
 LARGEST_SCALE = 2.0**112  # its product with the largest float16 still fits into float32
 
@@ -50,10 +49,9 @@ def decode(
             has pixels whose meaning in this mode is unclear.
     """
     with _loaded(source, file, FORMATS) as (stored, exif):
-        orientation = exif.get(ORIENTATION)
-        image = upright(stored, orientation)
+        image = upright(stored, exif.get(ORIENTATION))
         if image_size is not None:
-            check_annotated_size(image, image_size, orientation)
+            check_annotated_size(image, image_size)
         return _eight_bits(image, getattr(stored, "tag_v2", {}), mode)
 
 
@@ -189,13 +187,11 @@ def _loaded(source: Path | bytes, file: str, formats: tuple[str, ...]) -> Iterat
             yield image, read_exif(image)
 
 
-def check_annotated_size(image: Image.Image, annotated: tuple[int, int], orientation: object = None) -> None:
-    """Refuse an image whose (height, width) differs from its annotation."""
+def check_annotated_size(image: Image.Image, annotated: tuple[int, int]) -> None:
+    """Refuse an upright image whose (height, width) differs from its annotation."""
     if image.size != annotated[::-1]:
-        actual = f"has {image.height} x {image.width} pixels, its annotation says {annotated[0]} x {annotated[1]}"
-        if orientation in QUARTER_TURNS and image.size == annotated:
-            actual += f": its size before it is turned as its EXIF orientation {orientation} says; save it upright"
-        raise ImageError(actual)
+        expected = f"its annotation says {annotated[0]} x {annotated[1]}"
+        raise ImageError(f"has {image.height} x {image.width} pixels when upright, {expected}")
 
 
 def _eight_bits(image: Image.Image, tiff_tags: Mapping[int, object], mode: Literal["RGB", "L"]) -> Image.Image:

@@ -67,7 +67,7 @@ def read_photograph(
 
     Args:
         source: a JPEG, PNG, WebP, TIFF, AVIF, JPEG 2000, BMP, GIF or PPM file, recognized by its content; a PIL image;
-            an array [height, width, 3] or tensor [3, height, width] of bytes, or of floats in [0, 1].
+            an array [height, width, 3] or tensor [3, height, width] of bytes, or floats in [0, 1] (rounded to bytes).
         fov_degrees: field of view of the square crop, if it is known.
         default_fov_degrees: the same for images without usable EXIF focal length (50 is close to a phone's camera).
         remove_background: see `without_background`; applied to the square, or with `object_share` to the whole image.
@@ -101,10 +101,6 @@ def _square(
     """Return the resized central or object square, and the central square's EXIF field of view in degrees, if any."""
     if isinstance(source, (np.ndarray, Tensor)):
         source = _pixels(source)
-        if isinstance(source, np.ndarray):
-            if remove_background:
-                raise ImageError("an image whose background is to be removed is given in bytes, not in floats")
-            return _resized(source, size), None
     if not isinstance(source, Image.Image):
         _check_file(Path(source))
     with nullcontext(source) if isinstance(source, Image.Image) else opened(source, FORMATS) as file:
@@ -159,8 +155,8 @@ def _central_square(width: int, height: int) -> tuple[int, int, int, int]:
     return left, top, left + side, top + side
 
 
-def _pixels(image: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "height width 3"]:
-    """Convert an array (channel last) or tensor (channel first): bytes to an image, floats to a float32 array."""
+def _pixels(image: np.ndarray | Tensor) -> Image.Image:
+    """Convert an array (channel last) or tensor (channel first) of bytes, or of floats, which are rounded to bytes."""
     channel = 0 if isinstance(image, Tensor) else -1
     if image.ndim != 3 or image.shape[channel] != 3:
         raise ImageError(f"{tuple(image.shape)} in shape; arrays are [height, width, 3], tensors [3, height, width]")
@@ -173,16 +169,7 @@ def _pixels(image: np.ndarray | Tensor) -> Image.Image | Float[np.ndarray, "heig
         raise ImageError(f"values are {values.dtype}; bytes, or floats in [0, 1], have one meaning")
     if not ((values >= 0) & (values <= 1)).all():
         raise ImageError("values outside of [0, 1]")
-    return values.astype(np.float32)
-
-
-def _resized(pixels: Float[np.ndarray, "height width 3"], size: int) -> Float[Tensor, "3 size size"]:
-    height, width = pixels.shape[:2]
-    _check_side(width, height)
-    box = _central_square(width, height)
-    channels = [Image.fromarray(np.ascontiguousarray(channel)).crop(box) for channel in np.moveaxis(pixels, -1, 0)]
-    resized = [np.asarray(channel.resize((size, size), Image.Resampling.LANCZOS)) for channel in channels]
-    return torch.from_numpy(np.stack(resized).clip(0, 1))
+    return Image.fromarray(np.rint(255 * values.astype(np.float32)).astype(np.uint8))
 
 
 def _check_file(path: Path) -> None:

@@ -10,7 +10,6 @@ from completesplat.data.sequences import PosedSequence, SequenceSource, shortene
 from completesplat.data.validation import BadAnnotation, at, read_json, read_text
 
 CONTEXT, TARGET, SCORED = "context", "target", "target_quantify"
-FORMS = {frozenset((CONTEXT, TARGET)): "pixelSplat", frozenset((CONTEXT, TARGET, SCORED)): "MVSplat360"}
 LINE = "KEY source target target target"
 
 logger = logging.getLogger(__name__)
@@ -112,36 +111,31 @@ def choose_clips(source: SequenceSource, index: EvaluationIndex | None, listed: 
 def _from_table(content: object) -> EvaluationIndex:
     if not isinstance(content, dict):
         raise BadAnnotation("not a table of clips")
-    form, views = None, dict[str, list[Choice]]()
+    forms, views = dict[str, None](), dict[str, list[Choice]]()
     for key, value in content.items():
         with at(sequence=key):
             entries = [] if value is None else value if isinstance(value, list) else [value]
-            entry_form = form if value is None else _form(value)
-            if form is not None and entry_form != form:
-                raise BadAnnotation(f"in the format of {entry_form}, clips before it in that of {form}")
-            form, views[key] = entry_form, [_choice(entry) for entry in entries]
-    if form is None or not any(views.values()):
+            views[key] = [_choice(entry) for entry in entries]
+            if value is not None:
+                scored = any(SCORED in entry for entry in entries)
+                forms["latentSplat" if isinstance(value, list) else "MVSplat360" if scored else "pixelSplat"] = None
+            if len(forms) > 1:
+                raise BadAnnotation(f"formats of several works: {', '.join(forms)}")
+    if not any(views.values()):
         raise BadAnnotation("no clip with views")
-    return EvaluationIndex(form, views)
+    return EvaluationIndex(next(iter(forms)), views)
 
 
-def _form(value: object) -> str:
-    if isinstance(value, list):
-        if all(isinstance(entry, dict) and entry.keys() == {CONTEXT, TARGET} for entry in value):
-            return "latentSplat"
-    elif isinstance(value, dict) and frozenset(value) in FORMS:
-        return FORMS[frozenset(value)]
-    raise BadAnnotation(
-        "neither null, {context, target} (pixelSplat), {context, target, target_quantify} (MVSplat360) "
-        "nor a list of {context, target} (latentSplat)"
-    )
-
-
-def _choice(entry: dict[str, list[int]]) -> Choice:
+def _choice(entry: object) -> Choice:
+    if not isinstance(entry, dict) or entry.keys() - {SCORED} != {CONTEXT, TARGET}:
+        raise BadAnnotation(
+            "neither null, {context, target} (pixelSplat), {context, target, target_quantify} (MVSplat360) "
+            "nor a list of {context, target} (latentSplat)"
+        )
     for frames in entry.values():
         if not isinstance(frames, list) or not frames or not all(type(f) is int and f >= 0 for f in frames):
             raise BadAnnotation("context and target must be lists of frame numbers")
-    return entry[CONTEXT][0], entry.get(SCORED, entry[TARGET])
+    return entry[CONTEXT][0], entry[SCORED if SCORED in entry else TARGET]
 
 
 def _from_lines(text: str) -> EvaluationIndex:
