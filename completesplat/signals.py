@@ -104,26 +104,22 @@ def end_with_parent() -> None:
     """Make a worker process raise Interrupted on its parent's SIGTERM, and end when the parent has ended."""
     leave_to_parent()
     signal.signal(signal.SIGTERM, _raise)
-    threading.Thread(target=_outlive_nobody, daemon=True).start()
+    parent = parent_process()
+    assert parent is not None
+    assert parent.pid is not None
+    end_with(parent.pid)
 
 
 def end_with(starter: int) -> None:
     """End this process when the process that started it has ended, for whatever reason."""
-    threading.Thread(target=_outlive, args=(starter,), daemon=True).start()
 
+    def outlive() -> None:
+        while os.getppid() == starter:
+            time.sleep(1)
+        os._exit(1)
 
-def _outlive(starter: int) -> None:
-    while os.getppid() == starter:
-        time.sleep(1)
-    os._exit(1)
+    threading.Thread(target=outlive, daemon=True).start()
 
 
 def _raise(number: int, frame: object) -> None:
     raise Interrupted(number)
-
-
-def _outlive_nobody() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

@@ -20,9 +20,7 @@ from itertools import chain, product
 from pathlib import Path
 from typing import NamedTuple
 
-import pandas
-import torch
-from support import SMALL, script, strict_json, waited_for
+from support import SMALL, script, waited_for
 
 from completesplat import cli
 from completesplat.commands.jobs import LOCK
@@ -93,13 +91,11 @@ def forked(folder: Path, *arguments: str) -> int:
         os._exit(status)
 
 
-def must_work(folder: Path, *arguments: str) -> float:
-    """Run the command; how long it took."""
-    begun = time.monotonic()
+def must_work(folder: Path, *arguments: str) -> None:
+    """Run the command."""
     _, status = os.waitpid(forked(folder, *arguments), 0)
     if status:
         raise RuntimeError(f"status {status} of {' '.join(arguments)}\n{(folder / 'log.txt').read_text()[-3000:]}")
-    return time.monotonic() - begun
 
 
 # kill -9
@@ -127,46 +123,6 @@ def killed(material: Material, number: int, times: int) -> list[str]:
             found.append(f"kill {one} of run {number}: {error}")
     shutil.rmtree(folder)
     return found
-
-
-# Killed and continued
-
-
-def of_a_whole_run(material: Material, stage: str) -> list[str]:
-    given = [*material.arguments(stage), "trainer.max_steps=40", "ckpt_path=last", "trainer.val_check_interval=4"]
-    given += ["callbacks.checkpoint.every_n_train_steps=2", "callbacks.pictures.every_n_steps=4"]
-    return [*given, "trainer.log_every_n_steps=2", "data.references_per_sequence=4"]
-
-
-def comparable(out: Path) -> tuple[pandas.DataFrame, dict]:
-    """Rows and figures without times, speeds, and what names the run."""
-    times = ("speed/", "memory/")
-    table = pandas.read_csv(out / "metrics.csv")
-    table = table[[column for column in table if not column.startswith(times) and "seconds" not in column]]
-    found = {key: value for key, value in strict_json(out / "metrics.json").items() if not key.startswith(times)}
-    for key in ("machine", "command", "checkpoint"):
-        found["test"]["protocol"].pop(key)
-    found["test"]["model"].pop("seconds")
-    return table, found
-
-
-def resumed(material: Material, number: int, stage: str, whole: Path, duration: float) -> list[str]:
-    """Kill a run up to three times, let it end, and compare it with one that was not killed; what is different."""
-    folder, chance = material.folder / f"resumed{number}", random.Random(number)
-    given = [*of_a_whole_run(material, stage), f"out={folder}"]
-    for _ in range(chance.randint(1, 3)):
-        process = forked(material.folder, *given)
-        time.sleep(chance.uniform(0.2, 0.9) * duration)
-        os.killpg(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-    must_work(material.folder, *given)
-    (expected, figures), (table, found) = comparable(whole), comparable(folder)
-    differing = [] if expected.equals(table) else ["rows of metrics.csv"]
-    differing += [] if figures == found else ["figures in metrics.json"]
-    weights, continued = (read_checkpoint(run / "checkpoints/last.ckpt")["state_dict"] for run in (whole, folder))
-    differing += [name for name, value in weights.items() if not torch.equal(value, continued[name])]
-    shutil.rmtree(folder)
-    return [f"continued run {number} ({stage}): other {', '.join(differing)}"] if differing else []
 
 
 # Signals
@@ -307,17 +263,11 @@ def joined(lists: list[list[str]]) -> list[str]:
     return list(chain.from_iterable(lists))
 
 
-def measured(material: Material, kills: int, resumes: int, repeated: int, seconds: float) -> Iterator[Row]:
-    wholes = {stage: material.folder / f"whole_{stage}" for stage in ("var", "diffusion")} if resumes else {}
-    took = {s: must_work(material.folder, *of_a_whole_run(material, s), f"out={out}") for s, out in wholes.items()}
+def measured(material: Material, kills: int, repeated: int, seconds: float) -> Iterator[Row]:
     with multiprocessing.get_context("fork").Pool(LANES) as lanes:
         shares = [min(KILLS_OF_A_RUN, kills - first) for first in range(0, kills, KILLS_OF_A_RUN)]
         found = lanes.starmap(killed, [(material, n, share) for n, share in enumerate(shares)], chunksize=1)
         yield Row("`kill -9` while every step writes a checkpoint: it loads, the run goes on", kills, joined(found))
-        stages = [("var", "diffusion")[number % 2] for number in range(resumes)]
-        runs = [(material, number, s, wholes[s], took[s]) for number, s in enumerate(stages)]
-        found = lanes.starmap(resumed, runs, chunksize=1)
-        yield Row("killed 1 to 3 times: weights, rows and figures of a whole run", resumes, joined(found))
         for label, tries in signal_rows(material, repeated):
             found = lanes.starmap(signalled, [(material, *one, seconds) for one in tries], chunksize=1)
             yield Row(f"{', '.join(KINDS)}, {TWICE}: {label}", len(tries), joined(found))
@@ -331,13 +281,12 @@ def main() -> None:
         import_module(f"completesplat.{module}")
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
-    parser.add_argument("--resumes", type=int, default=40, help="runs that are killed and continued to their end")
     parser.add_argument("--signals", type=int, default=1, help="how often each signal is sent at each place")
     parser.add_argument("--seconds", type=float, default=10, help="that a process has to end after a signal")
     given, begun = parser.parse_args(), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="reliability") as name:
         script(Path(name))
-        counted = measured(make(Path(name), 40), given.kills, given.resumes, given.signals, given.seconds)
+        counted = measured(make(Path(name), 40), given.kills, given.signals, given.seconds)
         rows = [row for row in counted if row.tried]
     here = machine()
     print("| fault | tried | as it should be |\n|---|---|---|")

@@ -5,7 +5,6 @@ import os
 import re
 import resource
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -256,42 +255,3 @@ def test_a_folder_that_cannot_be_made_is_named_whoever_makes_it(tmp_path, number
     # What is not there, or may not be read, is a fault of its own; and a file without a name is better shown with all.
     assert refusal(FileNotFoundError(errno.ENOENT, "no such file", "x")) is None
     assert refusal(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))) is None
-
-
-FULL = """
-import gc, os, shutil, sys
-from pathlib import Path
-import torch
-from rich.filesize import decimal
-from completesplat.errors import DiskError
-from completesplat.training.checkpoints import CheckpointFiles, read_checkpoint
-
-disk = Path(sys.argv[1])
-save = lambda value: CheckpointFiles().save_checkpoint({"state_dict": {"a": torch.full((50_000,), value)}}, last)
-last, ballast, refused = disk / "last.ckpt", disk / "ballast", 0
-save(1.0)
-for tenth in range(20):
-    gc.collect()  # the error before holds a file open that has no name any more
-    ballast.write_bytes(bytes(shutil.disk_usage(disk).free - tenth * 10_000))
-    said = f"200.0 kB or more are needed, {decimal(shutil.disk_usage(disk).free)} are free on this disk"
-    try:
-        save(2.0)
-    except DiskError as error:
-        refused += str(error) == f"{last}: No space left on device: {said}"
-    assert read_checkpoint(last)["state_dict"]["a"].eq(1).all()
-    assert sorted(os.listdir(disk)) == ["ballast", "last.ckpt"]
-    ballast.unlink()
-print(refused)
-"""
-
-
-def test_a_full_file_system_keeps_the_old_checkpoint(tmp_path):
-    """On a small file system, mounted in a separate name space, for which nobody needs to be root."""
-    (tmp_path / "disk").mkdir()
-    mounted = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
-    mount = f"mount -t tmpfs -o size=1m none {tmp_path}/disk"
-    if not shutil.which("unshare") or subprocess.run([*mounted, mount], capture_output=True).returncode:
-        pytest.skip("no file system can be mounted here")
-    (tmp_path / "full.py").write_text(FULL)
-    started = f"{mount} && {sys.executable} {tmp_path}/full.py {tmp_path}/disk"
-    assert subprocess.run([*mounted, started], capture_output=True, text=True, check=True).stdout == "20\n"

@@ -5,11 +5,10 @@ import platform
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from omegaconf import DictConfig
 from packaging.requirements import Requirement
@@ -21,18 +20,14 @@ from rich.text import Text
 from completesplat import __version__
 from completesplat.commands.protocol import write_json
 from completesplat.errors import WeightsError
-from completesplat.weights import SHIPPED, SUMS_FILE, WEIGHTS_FILE, check_folder
+from completesplat.weights import SHIPPED, SUMS_FILE, check_folder
 
-ALWAYS_NAMED = ("torch", "lightning", "hydra-core", "numba", "diffusers", "wandb")
-EXTRAS = {"cuda": "to draw on an NVIDIA GPU", "view": "to show scenes in a browser, live"}
-EXTRAS |= {"colmap": "to read captures whose lens distorts", "slurm": "to spread sweeps over a cluster"}
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000
 """Bytes that the files of a few predictions take."""
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """Result of one check: present ("yes"), absent but not necessary ("no"), or "broken", which stops predictions.
 
     `details` are a version, a place, or the reason and what to do.
@@ -44,38 +39,33 @@ class Finding:
 
 
 def check_packages() -> Iterator[Finding]:
-    """Yield the versions of Python and this package, and the findings of `required_packages`."""
-    yield Finding("completesplat", "yes", __version__)
-    yield Finding("python", "yes", f"{platform.python_version()} on {platform.system()}")
+    """Yield the versions of Python and this package, and the packages that it requires."""
+    yield Finding("completesplat", "yes", f"{__version__}, Python {platform.python_version()} on {platform.system()}")
     try:
-        yield from required_packages([Requirement(line) for line in requires("completesplat") or ()])
+        yield from required_packages(map(Requirement, requires("completesplat") or ()))
     except PackageNotFoundError:
         message = "runs from its source without being installed; `pip install -e .` there also fetches what it needs"
         yield Finding("installation", "no", message)
 
 
 def required_packages(requirements: Iterable[Requirement]) -> Iterator[Finding]:
-    """Yield well-known, missing and mismatched packages and those of extras; count the others."""
+    """Yield missing and mismatched packages, without those of extras, and the number of the others."""
     others = 0
     for requirement in requirements:
-        name, marker = requirement.name, requirement.marker
-        extra = next((key for key in ("", *EXTRAS) if marker is None or marker.evaluate({"extra": key})), None)
-        if extra is None:  # for another system, or for developers
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         try:
-            installed = version(name)
+            installed = version(requirement.name)
         except PackageNotFoundError:
-            package = f"completesplat[{extra}]" if extra else f"{name}{requirement.specifier}"
-            message = f'missing; `pip install "{package}"`{f" {EXTRAS[extra]}" if extra else ""}'
-            yield Finding(name, "no" if extra else "broken", message)
+            message = f'missing; `pip install "{requirement.name}{requirement.specifier}"`'
+            yield Finding(requirement.name, "broken", message)
             continue
-        if not requirement.specifier.contains(installed, prereleases=True):
-            yield Finding(name, "no", f"{installed}, which is not {requirement.specifier}: it may or may not work")
-        elif extra or name in ALWAYS_NAMED:
-            yield Finding(name, "yes", installed)
-        else:
+        if requirement.specifier.contains(installed, prereleases=True):
             others += 1
-    yield Finding("others", "yes", f"{others} more, in versions that fit")
+        else:
+            message = f"{installed}, which is not {requirement.specifier}: it may or may not work"
+            yield Finding(requirement.name, "no", message)
+    yield Finding("packages", "yes", f"{others} in versions that fit")
 
 
 def check_imports() -> Iterator[Finding]:
@@ -86,9 +76,10 @@ def check_imports() -> Iterator[Finding]:
 
 
 def check_device() -> Iterator[Finding]:
-    """Yield CPU and GPUs. A missing GPU is no error: small models draw samples in seconds without one."""
+    """Yield CPU, GPUs and rasterizers. A missing GPU is no error: small models draw samples in seconds without one."""
     import torch
 
+    from completesplat.rasterizers.selection import FASTER, failure
     from completesplat.results.machine import machine
 
     yield Finding("CPU", "yes", f"{machine()['processor']}, {os.cpu_count()} cores")
@@ -99,77 +90,48 @@ def check_device() -> Iterator[Finding]:
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         reason = f"torch {torch.__version__}, built {built}, finds none (nvidia-smi shows the driver's)"
         yield Finding("GPU", "no", f"{reason}; all works on the CPU, slower")
-
-
-def check_rasterizers() -> Iterator[Finding]:
-    """Yield the rasterizers that may not work here, fastest first; `reference` needs nothing but torch."""
-    from completesplat.rasterizers.selection import FASTER, failure
-
-    reasons = {name: failure(name, None) for name in FASTER}
-    for name, reason in reasons.items():
-        yield Finding(name, "no" if reason else "yes", reason or "a test rendering agrees with the reference")
-    if all(reasons.values()):
-        yield Finding("reference", "yes", "draws everything here, which is very slow")
+    for name in FASTER:
+        reason = failure(name, None) or ""
+        message = reason or "a test rendering agrees with the reference"
+        yield Finding(f"rasterizer {name}", "no" if reason else "yes", message)
 
 
 def check_weights(folder: Path = SHIPPED) -> Iterator[Finding]:
     """Yield the weights that come with the package, in subfolders of `folder`."""
-    for path in sorted(path for path in folder.iterdir() if (path / SUMS_FILE).is_file()):
+    for path in sorted(path.parent for path in folder.glob(f"*/{SUMS_FILE}")):
         try:
             check_folder(path)
-            size = decimal((path / WEIGHTS_FILE).stat().st_size)
-            yield Finding(path.name, "yes", f"with the package, {size}: predict weights={path.name}")
+            yield Finding(path.name, "yes", f"with the package: predict weights={path.name}")
         except WeightsError as error:
             yield Finding(path.name, "broken", f"{error}; install completesplat again")
 
 
 def check_tools(place: Path) -> Iterator[Finding]:
-    """Yield ffmpeg (for videos; a package brings it), programs for exports, and free space on `place`'s disk."""
-    from completesplat.export.splat_transform import PACKAGE, PROGRAM
-
+    """Yield ffmpeg (for videos; a package brings it), Node.js (for exports) and free space on `place`'s disk."""
     try:
         import imageio_ffmpeg
 
-        yield Finding("ffmpeg", "yes", f"{imageio_ffmpeg.get_ffmpeg_version()}, {imageio_ffmpeg.get_ffmpeg_exe()}")
-    except Exception as error:  # the program is missing, cannot be run, or prints nothing
-        message = f"{_one_line(error)}; for videos, `pip install --force-reinstall imageio-ffmpeg`"
-        yield Finding("ffmpeg", "broken", message)
-    missing = {"node": f"version 20 or newer runs {PROGRAM}: https://nodejs.org"}
-    missing[PROGRAM] = f"for formats spz, sog and html: `npm install -g {PACKAGE}`; npx also fetches it when needed"
-    for program, message in missing.items():
-        path = shutil.which(program)
-        yield Finding(program, "yes" if path else "no", path or message)
+        yield Finding("ffmpeg", "yes", imageio_ffmpeg.get_ffmpeg_exe())
+    except Exception as error:  # the program is missing or cannot be run
+        yield Finding("ffmpeg", "broken", f"{error}; for videos, `pip install --force-reinstall imageio-ffmpeg`")
+    node = shutil.which("node")
+    yield Finding("node", "yes" if node else "no", node or "formats spz, sog and html need it: https://nodejs.org")
     free = shutil.disk_usage(place).free
     short = ": too little for a prediction's files" if free < LEAST_SPACE else ""
     yield Finding("free disk", "broken" if short else "yes", f"{decimal(free)} in {place}{short}")
 
 
-def _one_line(error: BaseException) -> str:
-    """Return an exception's type and message, without line breaks and of limited length."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}".removesuffix(": ")
-
-
 def run(config: DictConfig, out: Path) -> None:
     """Print the table and write `doctor.json`; exit with status 1 if something that a prediction needs is broken."""
-    checks: dict[str, Callable[[], Iterable[Finding]]] = {
-        "packages": check_packages,
-        "imports": check_imports,
-        "device": check_device,
-        "rasterizers": check_rasterizers,
-        "weights": check_weights,
-        "tools": lambda: check_tools(Path.cwd()),
-    }
-    table = Table(title="completesplat doctor", title_justify="left")
-    for heading in ("part", "what", "here", "which, or why not"):
-        table.add_column(heading, overflow="fold")
-    rows = []
-    for part, check in checks.items():
-        for index, finding in enumerate(findings_of(check)):
-            rows.append({"part": part, **vars(finding)})
-            state = Text(finding.state, style=STYLES[finding.state])
-            table.add_row("" if index else part, Text(finding.name), state, Text(finding.details))
+    checks = {"packages": check_packages, "imports": check_imports, "device": check_device, "weights": check_weights}
+    table = Table("part", "what", "here", "which, or why not", title="completesplat doctor", title_justify="left")
+    rows, broken = [], []
+    for part, check in (checks | {"tools": lambda: check_tools(Path.cwd())}).items():
+        for finding in findings_of(check):
+            rows.append({"part": part, **finding._asdict()})
+            table.add_row(part, Text(finding.name), Text(finding.state, STYLES[finding.state]), Text(finding.details))
+            broken += [f"{part}, {finding.name}: {finding.details}"] if finding.state == "broken" else []
         table.add_section()
-    broken = [f"{row['part']}, {row['name']}: {row['details']}" for row in rows if row["state"] == "broken"]
     write_json(out / "doctor.json", {"works": not broken, "findings": rows})
     Console(width=None if Console().is_terminal else 160).print(table)
     if broken:
@@ -184,4 +146,4 @@ def findings_of(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
     try:
         return list(check())
     except Exception as error:  # of any library: the other checks still run
-        return [Finding("check", "broken", _one_line(error))]
+        return [Finding("check", "broken", " ".join(f"{type(error).__name__}: {error}".split())[:200])]

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from completesplat.commands.jobs import at_work, importing
-from completesplat.errors import CompleteSplatError, DataError
+from completesplat.errors import CompleteSplatError
 from completesplat.files import printable
 from completesplat.settings.checks import REMOVE, check_parts
 from completesplat.signals import Interrupted
@@ -18,7 +18,6 @@ from completesplat.weights import CONFIG_FILE, NEWEST, RUN_CHECKPOINT, SCENES, W
 
 WEIGHT_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 KINDS = {".ply": "scene", ".ckpt": "weights", ".pth": "weights"}
-MOST_CAMERAS = 24
 PAUSE = 2.0  # seconds between two checks for new scenes of a run
 SCENE_FILES = ("sample_*.ply", "scene.ply")
 LOADING = "**Loading** what the page shows: the model, or scenes. The controls come with it."
@@ -116,8 +115,7 @@ def make_page(server: Any, config: DictConfig, out: Path) -> Any:
     photograph = None
     if model is not None and config.image is not None:
         photograph = model.read(Path(config.image), config.fov, remove)
-    cameras = None if config.get("data") is None else data_cameras(config.data)
-    splats = SplatView(server, up, cameras)
+    splats = SplatView(server, up)
     splats.show(samples)
     rasterizer = partial(instantiate, config.rasterizer, _convert_="all")
     saver = Saver(out, splats, rasterizer, config.frames, background)
@@ -170,28 +168,6 @@ def show_newest(page: Any, run: Path) -> None:
         return  # the scenes are just being written, or were removed: the page stays as it is
     if steps != {step} and samples:
         page.show(samples, step_of(samples))
-
-
-def data_cameras(config: DictConfig) -> Any:
-    """Return at most 24 evenly spaced cameras of the first readable training sequence, relative to its first camera.
-
-    Raises:
-        DataError: no sequence can be read.
-    """
-    import torch
-    from hydra.utils import instantiate
-
-    data = instantiate(config, _convert_="all")
-    data.prepare_data()
-    source = data.source("train")
-    for name in source.names:
-        try:
-            cameras = source.read(name).cameras.to(dtype=torch.float32)
-        except DataError:
-            continue
-        count = len(cameras.world_to_camera)
-        return cameras.relative_to(cameras[0])[:: -(-count // MOST_CAMERAS)]
-    raise DataError("no training sequence can be read", str(config.root))
 
 
 def export(page: Any, path: Path) -> None:

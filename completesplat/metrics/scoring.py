@@ -147,12 +147,10 @@ class Evaluation:
         """Keep a scene's scores, and describe its images [view 3 height width] in each region for set metrics."""
         self.scores[predictor][name] = scores
         self.views[name] = len(truth.images) - 1
-        # Seeds depend on names only, so that the same images have the same scores in every run.
-        seeds = [zlib.crc32(f"{name} {view}".encode()) for view in range(1, len(truth.images))]
         for region in REGIONS:
             for owner, views in ((predictor, images[region]), (ImageSets.TRUE, truth.images)):
                 with torch.autocast(views.device.type, enabled=False):
-                    self.sets.add(owner, region, name, _region(views.float(), truth, region)[1:], seeds)
+                    self.sets.add(owner, region, name, _region(views.float(), truth, region)[1:])
 
     def gather(self) -> None:
         """Merge the scores of all processes; each of them must call this."""

@@ -15,6 +15,7 @@ from completesplat.geometry.cameras import Cameras, transform_points
 from completesplat.geometry.rotations import normalize_quaternion
 from completesplat.rasterizers import Rendering, RenderingConstants, require_float32
 from completesplat.rasterizers.reference import LARGEST_PROJECTION
+from completesplat.settings.options import gsplat_constants
 
 DEVICE = "cuda"
 WARP = 32
@@ -22,8 +23,7 @@ WARP = 32
 # gradients through the depth image become NaN, because gsplat multiplies coordinates before it divides them.
 FARTHEST = 1e12
 SMALLEST_BLUR, SMALLEST_NEAR_PLANE = 1e-5, 1e-6
-# Compiled into gsplat 1.5.3 (`RasterizeToPixels3DGSFwd.cu`, `Common.h`, `Utils.cuh`).
-COMPILED = {"max_alpha": 0.999, "min_alpha": 1 / 255, "min_transmittance": 1e-4, "frustum_margin": 0.3}
+FRUSTUM_MARGIN = 0.3  # in gsplat's `Utils.cuh`
 
 
 class CudaRasterizer:
@@ -53,7 +53,7 @@ class CudaRasterizer:
         except ImportError as error:
             message = f'the cuda rasterizer needs gsplat ({error}): pip install "completesplat[cuda]"'
             raise CompleteSplatError(message) from error
-        for name, value in COMPILED.items():
+        for name, value in (gsplat_constants() | {"frustum_margin": FRUSTUM_MARGIN}).items():
             if not math.isclose(getattr(self.constants, name), value, rel_tol=1e-6):
                 raise CompleteSplatError(
                     f"gsplat {gsplat.__version__} is compiled with {name} = {value:g}, not "

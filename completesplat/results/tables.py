@@ -13,9 +13,9 @@ from completesplat.results.runs import UPPER_BOUND, flat
 if TYPE_CHECKING:
     from rich.table import Table as PrintedTable
 
-METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID", "swd": "SWD"}
-FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f", "swd": ".2f"}
-LOWER_IS_BETTER = {"lpips", "fid", "kid", "swd"}
+METRICS = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "fid": "FID", "kid": "KID"}
+FORMATS = {"psnr": ".2f", "ssim": ".3f", "lpips": ".3f", "fid": ".1f", "kid": ".4f"}
+LOWER_IS_BETTER = {"lpips", "fid", "kid"}
 GROUPS = {
     "full_novel": "all pixels, novel views",
     "object_novel": "object pixels, novel views",
@@ -39,7 +39,7 @@ LEGEND = f"{ABSENT}: not reported, or of another data set than the row's. {BLANK
 Column = tuple[str, str, str]  # heading, key of the record, and format of its values (empty for text)
 LABELS = {"full": "all\npixels", "object": "object\npixels"}
 EVALUATED = ["_".join((*place, name)) for place in product(LABELS, ("novel", "reference")) for name in ("psnr", "ssim")]
-EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid", "swd")]
+EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid")]
 """Scores in the table of an evaluation, if they were measured."""
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 

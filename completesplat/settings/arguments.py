@@ -113,22 +113,15 @@ def _refuse_unreadable(argument: str, sweep: bool) -> None:
     try:
         override = OverridesParser.create().parse_override(argument)
     except HydraException:
-        example = f'"{key}={_readable(value)}"'
-        message = "cannot be read; a text with such characters wants quotes"
-        raise CompleteSplatError(f"{_short(argument)}: {message}: {_short(example)}") from None
+        text = "['TEXT','TEXT']" if value.startswith("[") else quoted(value)
+        example = _short(f'"{key}={text}"')
+        message = f"cannot be read; a text with such characters wants quotes: {example}"
+        raise CompleteSplatError(f"{_short(argument)}: {message}") from None
     if override.is_sweep_override() and not sweep:
         message = f"several values; -m makes a run of each, and a list is {key}=[{value}]"
         raise CompleteSplatError(f"{_short(argument)}: {_short(message)}")
     if override.key_or_group == "out" and not override.is_sweep_override() and override.value() in ("", None):
         raise CompleteSplatError(f"{argument}: names no folder; give out=DIR")
-
-
-def _readable(value: str) -> str:
-    """Quote a value, or each entry of a list."""
-    if not (value.startswith("[") and value.endswith("]")):
-        return quoted(value)
-    entries = re.split(r",(?![^\[\]]*\])", value[1:-1])  # an inner list is not split
-    return f"[{','.join(quoted(entry.strip()) for entry in entries)}]"
 
 
 def _short(text: str) -> str:

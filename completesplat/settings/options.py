@@ -5,8 +5,10 @@ nor OmegaConf is imported, because shells call `completesplat --complete WORDS` 
 """
 
 import re
+import runpy
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from difflib import get_close_matches
+from importlib.util import find_spec
 from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
@@ -254,3 +256,18 @@ def _behind_verb(verb: str, words: Sequence[str]) -> list[str]:
     # Nested keys are offered once their dots, or three characters, are typed.
     near = [name for name in keys if name.count(".") <= max(key.count("."), 0) or len(key) > 2]
     return [*(tasks if len(words) == 1 else []), *near, "--help"]
+
+
+def gsplat_constants() -> dict[str, float]:
+    """Return the constants compiled into the kernels of the installed gsplat, without importing it.
+
+    Releases from 1.6 on state them in `gsplat/cuda/_constants.py`. Release 1.5.3 has them in its kernels only
+    (`RasterizeToPixels3DGSFwd.cu`, `Common.h`); its values are the defaults, also where gsplat is not installed.
+    """
+    spec = find_spec("gsplat")
+    files = [Path(folder, "cuda", "_constants.py") for folder in (spec and spec.submodule_search_locations) or ()]
+    stated = {"MAX_ALPHA": 0.999, "ALPHA_THRESHOLD": 1 / 255, "TRANSMITTANCE_THRESHOLD": 1e-4}
+    for file in filter(Path.is_file, files):
+        stated |= runpy.run_path(str(file))
+    names = {"max_alpha": "MAX_ALPHA", "min_alpha": "ALPHA_THRESHOLD", "min_transmittance": "TRANSMITTANCE_THRESHOLD"}
+    return {name: stated[constant] for name, constant in names.items()}

@@ -80,9 +80,6 @@ Widths = Annotated[Sequence[Width], Entries(1), Entries(most=8)]
 Levels = Annotated[Sequence[Annotated[int, Range(0, 7)]], Entries(most=8)]
 Few = Annotated[int, Range(1, 16)]
 
-Target = Callable[..., object] | type
-"""A function or class, or a `TypedDict`, whose annotations are the schema of settings."""
-
 
 class Refused(NamedTuple):
     """A refused value: its place inside the setting (`.key`, empty for the setting itself) and the reason."""
@@ -92,7 +89,7 @@ class Refused(NamedTuple):
     reason: str
 
 
-def check_settings(function: Target, settings: Mapping[str, object]) -> None:
+def check_settings(function: object, settings: Mapping[str, object]) -> None:
     """Check settings against the annotations of the same names, of a function's arguments or in a `TypedDict`.
 
     Numbers, choices, lists, mappings and `TypedDict`s are checked, with `Range`, `OneOf` and `Entries`; any
@@ -113,7 +110,7 @@ def check_value(key: str, annotation: object, value: object) -> None:
         raise CompleteSplatError(f"{key}{place}={part}: {reason}{example}")
 
 
-def hints_of(function: Target) -> dict[str, object]:
+def hints_of(function: object) -> dict[str, object]:
     """Return annotations by name, of a function's arguments or a `TypedDict`; expand `**name: Unpack[...]`."""
     hints = get_type_hints(function, include_extras=True)
     for shared in [get_args(hint)[0] for hint in hints.values() if get_origin(hint) is Unpack]:
@@ -121,7 +118,7 @@ def hints_of(function: Target) -> dict[str, object]:
     return hints
 
 
-def arguments_of(target: Target) -> tuple[dict[str, object], bool]:
+def arguments_of(target: Callable[..., object] | type) -> tuple[dict[str, object], bool]:
     """Return annotations of a class's or function's arguments, by name, and whether these are all the arguments.
 
     If a class passes further settings on to its base class, the arguments of the base class are included.

@@ -149,7 +149,7 @@ class Page:
         self.server, self.view, self.saver = server, view, saver
         self.worker = Worker(self.tell)
         self.status = server.gui.add_markdown("", order=0)
-        self.looking = add_looking(server.gui, layers, view.data_cameras is not None)
+        self.looking = add_looking(server.gui, layers)
         self._connect_looking()
         self.saving = add_saving(server.gui, FORMATS)
         self.saving.save.on_click(self._save)

@@ -65,12 +65,12 @@ def add_drawing(gui: viser.GuiApi, model: SceneModel, start: dict[str, Any]) -> 
         )
 
 
-def add_looking(gui: viser.GuiApi, layers: int, data_cameras: bool) -> SimpleNamespace:
+def add_looking(gui: viser.GuiApi, layers: int) -> SimpleNamespace:
     """Add the folder `View`; return handles of the `chosen` sample, of `layers` by number, and of `cameras` by name.
 
     The handles also include `thumbnails` above all folders, filled by `thumbnail_row`, and `keys`, commands by digit.
     """
-    names = ["reference", "orbit", *(["data set"] if data_cameras else [])]
+    names = ["reference", "orbit"]
     commands = {str(i): f"Show sample {i}" for i in range(1, KEYS + 1)} | {"0": "Show all samples side by side"}
     key: Any = gui.add_command
     thumbnails = gui.add_html("", order=0.5)

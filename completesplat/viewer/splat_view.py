@@ -22,7 +22,7 @@ from completesplat.viewer.sample import Sample
 LARGEST_COVARIANCE = 3e4
 GAP, NARROWEST_WINDOW, SAME = 1.25, 1.1, 0.15
 ORBIT_CAMERAS = 12
-REFERENCE_COLOR, ORBIT_COLOR, DATA_COLOR = (200, 60, 40), (60, 60, 60), (40, 90, 200)
+REFERENCE_COLOR, ORBIT_COLOR = (200, 60, 40), (60, 60, 60)
 
 
 @dataclass(frozen=True)
@@ -93,15 +93,14 @@ class SplatView:
     """Splats and cameras on the page: one sample or all side by side, all layers or some, in colour or by depth.
 
     `refresh` draws everything anew from the attributes, under a lock because callbacks come from several threads. The
-    direction up and the cameras [view] of a data set are in the reference camera's frame.
+    direction up is in the reference camera's frame.
 
     Side by side, only the middle part of each sample is shown, because scenes are wider than an image and would hide
     each other.
     """
 
-    def __init__(self, server: viser.ViserServer, up: Sequence[float], data_cameras: Cameras | None = None) -> None:
+    def __init__(self, server: viser.ViserServer, up: Sequence[float]) -> None:
         self.server = server
-        self.data_cameras = data_cameras
         self.samples: list[Sample] = []
         self.chosen: int | None = 0
         self.hidden_layers: set[int] = set()
@@ -206,11 +205,10 @@ class SplatView:
             groups = {
                 "reference": (reference[None], REFERENCE_COLOR),
                 "orbit": (orbit(reference, arrangement.pivots[i], up, ORBIT_CAMERAS), ORBIT_COLOR),
-                "data set": (self.data_cameras, DATA_COLOR),
             }
             for name, (cameras, color) in groups.items():
-                if name in self.cameras and cameras is not None:
-                    self._add_frusta(f"/cameras/{i}/{name.replace(' ', '_')}", cameras, color, arrangement, i)
+                if name in self.cameras:
+                    self._add_frusta(f"/cameras/{i}/{name}", cameras, color, arrangement, i)
 
     def _add_frusta(
         self, name: str, cameras: Cameras, color: tuple[int, int, int], arrangement: Arrangement, index: int

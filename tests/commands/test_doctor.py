@@ -9,10 +9,9 @@ from support import strict_json
 
 from completesplat.commands import doctor
 from completesplat.commands.doctor import Finding, findings_of, required_packages
-from completesplat.rasterizers import selection
 from completesplat.weights import write_sums
 
-PARTS = ["packages", "imports", "device", "rasterizers", "weights", "tools"]
+PARTS = ["packages", "imports", "device", "weights", "tools"]
 
 
 def states(findings):
@@ -43,12 +42,11 @@ def test_failing_imports_and_packages_that_are_missing_or_of_another_version_are
     assert finding.state == "broken"
     assert "ModuleNotFoundError" in finding.details
     lines = ["no-such-package>=2.5", "numpy<1.0", "torch>=99; python_version < '3'", "no-viewer; extra == 'view'"]
-    missing, older, extra, others = required_packages(map(Requirement, lines))
+    missing, older, others = required_packages(map(Requirement, lines))
     assert (missing.name, missing.state, older.name, older.state) == ("no-such-package", "broken", "numpy", "no")
     assert 'pip install "no-such-package>=2.5"' in missing.details
     assert "<1.0: it may or may not work" in older.details
     assert others.details.startswith("0 ")
-    assert (extra.state, 'pip install "completesplat[view]"' in extra.details) == ("no", True)
 
 
 def test_weights_are_broken_if_changed_or_incomplete(tmp_path):
@@ -65,20 +63,11 @@ def test_weights_are_broken_if_changed_or_incomplete(tmp_path):
     assert states(doctor.check_weights(tmp_path)) == {"small": "broken"}
 
 
-def test_missing_programs_are_no_error_but_ffmpeg_and_space_are_needed(tmp_path, monkeypatch):
+def test_a_missing_node_is_no_error_but_ffmpeg_and_space_are_needed(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    found = {"ffmpeg": "yes", "node": "no", "splat-transform": "no", "free disk": "yes"}
-    assert states(doctor.check_tools(tmp_path)) == found
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "nothing"))
+    expected = {"ffmpeg": "yes", "node": "no", "free disk": "yes"}
+    assert states(doctor.check_tools(tmp_path)) == expected
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: 1 / 0)
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda place: usage._replace(free=10_000_000))
-    assert states(doctor.check_tools(tmp_path)) == found | {"ffmpeg": "broken", "free disk": "broken"}
-
-
-def test_the_slow_rasterizer_is_named_where_no_faster_one_works(monkeypatch):
-    working = {name for name in selection.FASTER if selection.failure(name, None) is None}
-    assert {name for name, state in states(doctor.check_rasterizers()).items() if state == "yes"} == working
-    monkeypatch.setattr(selection, "failure", lambda name, constants: "broken kernel")
-    findings = list(doctor.check_rasterizers())
-    assert states(findings) == {"cuda": "no", "tiled": "no", "reference": "yes"}
-    assert findings[0].details == "broken kernel"
+    assert states(doctor.check_tools(tmp_path)) == expected | {"ffmpeg": "broken", "free disk": "broken"}

@@ -81,7 +81,7 @@ def test_test_does_not_end_as_if_all_was_well(command, pipeline, tmp_path, signa
 
 
 def test_latents_leave_no_half_store(command, pipeline, packed_toys, tmp_path, signalled):
-    signalled(encoding.Moments, "add", signal.SIGTERM)
+    signalled(encoding, "moment_sums", signal.SIGTERM)
     given = ["data_task=latents", f"ckpt={pipeline.var / 'checkpoints/last.ckpt'}", "trust=true"]
     given += [f"overrides=['data.root={packed_toys}']", f"out={tmp_path / 'latents'}"]
     finished = command("data", *given)

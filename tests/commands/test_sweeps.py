@@ -24,7 +24,7 @@ def root_with(*overrides: str):
 
 
 def settings(root: Path) -> list[str]:
-    given = [f"data.root={root}", *SMALL, "trainer.max_steps=1", "callbacks.pictures=null"]
+    given = [f"data.root={root}", *SMALL, "trainer.max_steps=1", "callbacks.pictures=null", "test=false"]
     return ["fit", "-m", "experiment=toy_var", *given]
 
 
@@ -122,7 +122,7 @@ def test_two_processes_a_job_train_the_same_job_and_start_no_sweep_of_their_own(
     (tmp_path / "process_notes.py").write_text(NOTE)
     sweep = tmp_path / "sweep"
     note = "+callbacks.note={_target_: process_notes.Note, folder: '${out}/notes', seed: '${seed}'}"
-    more = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", "test=false", note]
+    more = ["trainer.devices=2", "trainer.strategy=ddp", "rasterizer=reference", note]
     in_a_process_of_its_own([*settings(toy_root), "seed=3,4", f"out={sweep}", *more], tmp_path)
 
     assert sorted(job.name for job in sweep.iterdir() if job.is_dir()) == ["seed-3", "seed-4"]

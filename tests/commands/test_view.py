@@ -15,7 +15,7 @@ from viewer_scenes import balls
 from written_commands import ROOT
 
 from completesplat.commands.jobs import alone_in
-from completesplat.commands.view import LOADING, data_cameras, newest_scenes, settings_of, show_newest
+from completesplat.commands.view import LOADING, newest_scenes, settings_of, show_newest
 from completesplat.errors import CompleteSplatError
 from completesplat.export.ply import write_ply
 from completesplat.settings.checks import View
@@ -162,11 +162,3 @@ def test_an_offline_page_is_written_from_a_scene_and_of_what_is_drawn(command, p
     assert finished.status == 2
     assert "there is nothing to export" in finished.err
     assert not (tmp_path / "other.html").exists()
-
-
-def test_cameras_of_a_data_set_are_read(toy_root):
-    given = ["data=toy_objects", f"data.root={toy_root}", "data.image_size=32"]
-    cameras = data_cameras(compose_config("view", *given).data)
-    assert cameras.world_to_camera.shape == (4, 4, 4)  # four frames
-    assert cameras.centers[0].tolist() == pytest.approx([0, 0, 0], abs=1e-6)
-    assert (cameras.centers[1:].norm(dim=-1) > 0.1).all()

@@ -1,17 +1,33 @@
-"""Degenerate Gaussians: the image and all gradients stay finite, and the healthy ones do not change."""
+"""Degenerate Gaussians: images and gradients stay finite, and the healthy Gaussians do not change."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
-from degenerate_gaussians import DRAWN, NEVER_DRAWN, assert_changes_nothing, changed, draw, healthy
+from degenerate_gaussians import (
+    DRAWN,
+    NEVER_DRAWN,
+    SIZE,
+    assert_changes_nothing,
+    assert_drawn_as_by_the_reference,
+    camera,
+    changed,
+    draw,
+    healthy,
+)
+from rasterizer_scenes import CONSTANTS, assert_agrees
 from torch import Tensor
 
 from completesplat.gaussians import Gaussians, concatenate
+from completesplat.geometry.cameras import Cameras
 from completesplat.rasterizers import RenderingConstants
 from completesplat.rasterizers.reference import ReferenceRasterizer, alphas_at
+from completesplat.rasterizers.tiled import TiledRasterizer
 
 DTYPES = [torch.float32, torch.float64]
+RASTERIZERS = [(ReferenceRasterizer(), torch.float32), (ReferenceRasterizer(), torch.float64)]
+RASTERIZERS += [(TiledRasterizer(), torch.float32)]
 
 LEFT_OUT = NEVER_DRAWN | {
     "on the camera's plane": {"means": (1.0, 0.5, 0.0)},
@@ -43,10 +59,20 @@ def assert_finite(image: Tensor, gradients: dict[str, Tensor]) -> None:
     assert [name for name, gradient in gradients.items() if not gradient.isfinite().all()] == []
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("rasterizer", "dtype"), RASTERIZERS)
 @pytest.mark.parametrize("kind", LEFT_OUT)
-def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, dtype: torch.dtype) -> None:
-    assert_changes_nothing(ReferenceRasterizer(), degenerate(LEFT_OUT[kind], dtype))
+def test_a_gaussian_that_cannot_be_drawn_changes_nothing(kind: str, rasterizer, dtype: torch.dtype) -> None:
+    assert_changes_nothing(rasterizer, degenerate(LEFT_OUT[kind], dtype))
+
+
+@pytest.mark.parametrize(("rasterizer", "dtype"), RASTERIZERS)
+@pytest.mark.parametrize("count", [0, 3])
+def test_nothing_to_draw(count: int, rasterizer, dtype: torch.dtype) -> None:
+    gaussians = healthy(count).to(dtype)
+    images, gradients = draw(rasterizer, replace(gaussians, means=gaussians.means - 100))
+    assert images.shape == (1, 1, 5, *SIZE)
+    assert all(gradients[name].shape == tensor.shape for name, tensor in vars(gaussians).items())
+    assert not any(tensor.any() for tensor in (images, *gradients.values()))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -76,16 +102,6 @@ def test_nothing_is_drawn_where_rounding_makes_the_exponent_positive() -> None:
     assert alphas[0, 0] == 0
 
 
-@pytest.mark.parametrize("count", [0, 5])
-def test_scenes_in_which_nothing_is_visible_are_empty_with_zero_gradients(count: int) -> None:
-    image, gradients = render_and_differentiate(
-        concatenate([healthy(0), *[changed(NEVER_DRAWN["behind the camera"])] * count])
-    )
-    assert not image.any()
-    assert gradients["means"].shape == (1, count, 3)
-    assert not any(gradient.any() for gradient in gradients.values())
-
-
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
     """Equal depths keep their order, and a transmittance that underflows does no harm."""
@@ -95,3 +111,29 @@ def test_many_gaussians_at_one_place(dtype: torch.dtype) -> None:
     swapped, _ = render_and_differentiate(concatenate([back, front]))
     assert image[0, 0, 0].max() < swapped[0, 0, 0].max()
     assert_finite(*render_and_differentiate(concatenate([degenerate({"opacities": 1.0}, dtype)] * 400)))
+
+
+@pytest.mark.parametrize("kind", DRAWN)
+def test_an_extreme_gaussian_is_drawn_as_by_the_float64_reference(kind: str) -> None:
+    assert_drawn_as_by_the_reference(TiledRasterizer(), kind)
+
+
+def test_all_at_one_depth_keep_their_order() -> None:
+    gaussians = healthy(12)
+    gaussians.means[..., 2] = 2.0
+    assert_agrees(TiledRasterizer(), CONSTANTS, gaussians, camera(), 1)
+    (there, _), (back, _) = (draw(TiledRasterizer(), g) for g in (gaussians, gaussians.map(lambda t: t.flip(1))))
+    assert not torch.allclose(there, back)
+
+
+def test_thousands_of_gaussians_on_one_pixel() -> None:
+    """All are faint, so that a pixel is opaque only after hundreds."""
+    one = changed({"opacities": 0.01, "scales": (0.001, 0.001, 0.001), "means": (0.0, 0.0, 2.0)})
+    many = one.map(lambda tensor: tensor.expand(1, 10_000, *tensor.shape[2:]).clone())
+    many.colors[:] = torch.rand(many.colors.shape, generator=torch.Generator().manual_seed(0))
+    cameras = Cameras(torch.eye(4)[None, None], torch.tensor([[[[2.0, 0, 1.5], [0, 2.0, 1.5], [0, 0, 1]]]]), (3, 3))
+    assert_agrees(TiledRasterizer(), CONSTANTS, many, cameras, 1)
+    images, gradients = draw(TiledRasterizer(), many, cameras)
+    assert images[0, 0, 4, 1, 1] > 0.99
+    assert gradients["opacities"].count_nonzero() > 500
+    assert not gradients["opacities"][0, 5_000:].any()
