@@ -5,7 +5,7 @@ import logging
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal
 
 from completesplat.errors import CompleteSplatError, DataError, WeightsError
 from completesplat.files import write_text
@@ -17,21 +17,7 @@ Split = Literal["train", "val", "test"]
 Splits = Annotated[Sequence[Split], Entries(1)]
 
 
-@runtime_checkable
-class DataModule(Protocol):
-    """Parts of `SceneDataModule`, which takes seconds to import."""
-
-    root: Path
-    policy: tuple[str, float]
-
-    def prepare_data(self) -> None: ...
-
-    def source(self, split: str) -> Any: ...
-
-    def packed_settings(self) -> dict[str, str | int | float | bool | None]: ...
-
-
-def check(data: DataModule, splits: Splits, workers: Positive | None, out: Path) -> None:
+def check(data: Any, splits: Splits, workers: Positive | None, out: Path) -> None:
     """Read everything once and write `check.json`; exit with status 1 when no sequence is usable."""
     from completesplat.data.validation import audit
 
@@ -46,7 +32,7 @@ def check(data: DataModule, splits: Splits, workers: Positive | None, out: Path)
         sys.exit(1)
 
 
-def stats(data: DataModule, splits: Splits, out: Path) -> None:
+def stats(data: Any, splits: Splits, out: Path) -> None:
     """Write `stats.json` and `stats.png`, and print the numbers."""
     from rich.progress import track
 
@@ -60,7 +46,7 @@ def stats(data: DataModule, splits: Splits, out: Path) -> None:
     show_statistics(results)
 
 
-def show(data: DataModule, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
+def show(data: Any, split: Split, scenes: Annotated[int, Range(1, 8)], pictures: Positive, out: Path) -> None:
     """Write `show.png`: images and cameras of some sequences, evenly spread over a split."""
     from completesplat.studies.contact_sheet import show as draw
 
@@ -74,7 +60,7 @@ def show(data: DataModule, split: Split, scenes: Annotated[int, Range(1, 8)], pi
 
 
 def prepare(
-    data: DataModule,
+    data: Any,
     splits: Splits,
     out: Path,
     codec: str,
@@ -83,7 +69,7 @@ def prepare(
     on_bad: Literal["raise", "skip"],
     max_bad_fraction: float,
 ) -> None:
-    """Write the prepared form into `out`; see `completesplat.data.packed.writing.prepare`."""
+    """Write packed data into `out`; see `completesplat.data.packed.writing.prepare`."""
     from completesplat.data.packed import manifest, writing
 
     if manifest.is_packed(data.root):
@@ -131,7 +117,7 @@ def latents(
     logger.info("standard deviation of the latents' channels: %s", " ".join(f"{value:.4g}" for value in store.std))
 
 
-def _sources(data: DataModule, splits: Sequence[str]) -> dict[str, Any]:
+def _sources(data: Any, splits: Sequence[str]) -> dict[str, Any]:
     """Return the sources of the splits that exist; each source collects the errors in its files instead of raising."""
     data.policy = "skip", 1.0
     data.prepare_data()

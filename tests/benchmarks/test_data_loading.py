@@ -10,7 +10,6 @@ from support import strict_json
 
 from completesplat.benchmarks import data_loading
 from completesplat.benchmarks.data_loading import Epoch, rows
-from completesplat.data.toy import rooms
 
 QUICK = [
     *("bench", "data", "repeats=1"),
@@ -48,8 +47,6 @@ def test_forms_take_turns_and_the_median_counts_without_the_first_epoch(monkeypa
 @pytest.fixture
 def quick(command, tmp_path, monkeypatch):
     """Run the benchmark; return its results, its output and its folder."""
-    # Twelve clips that are not for testing, one of which is for validation, in three chunks.
-    monkeypatch.setattr(rooms, "CLIPS_PER_CHUNK", 4)
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few files
 
     def run(*arguments: str) -> tuple[dict[str, Any], str, Path]:

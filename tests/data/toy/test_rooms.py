@@ -30,17 +30,6 @@ def read_text(path: Path) -> tuple[str, list[int], np.ndarray]:
     return url, [int(row[0]) for row in columns], np.array([[float(number) for number in row[1:]] for row in columns])
 
 
-@pytest.mark.slow
-def test_bytes_depend_on_the_seed_and_not_on_the_workers(rooms, tmp_path):
-    again, other = tmp_path / "again", tmp_path / "other"
-    write_rooms(again, scenes=3, frames=FRAMES, size=18, seed=0, workers=2, progress=False)
-    assert files_of(again / "toy_rooms") == files_of(rooms)
-    write_rooms(other, scenes=3, frames=FRAMES, size=18, seed=1, workers=1, progress=False)
-    pictures = {content for path, content in files_of(rooms).items() if path.endswith(".jpg")}
-    assert len(pictures) == 3 * FRAMES
-    assert not pictures & set(files_of(other / "toy_rooms").values())
-
-
 def test_the_folder_says_what_was_made_and_something_else_is_left_alone(rooms, tmp_path):
     description = json.loads((rooms / "toy.json").read_text())
     assert description == {"format": 2, "scenes": 3, "frames": FRAMES, "size": 18, "seed": 0}
