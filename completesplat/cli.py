@@ -23,8 +23,6 @@ def main() -> None:
         from completesplat import __version__
 
         return print(f"completesplat {__version__}")
-    if arguments[0] in ("--complete", "completion"):
-        return _complete(arguments[1:], script=arguments[0] == "completion")
     if arguments[0] not in VERBS:
         from completesplat.settings.options import did_you_mean
 
@@ -57,18 +55,6 @@ def _help() -> None:
     for verb in VERBS:
         descriptions = {setting.key: setting.value for setting in read(verb).settings}
         print(f"  {verb:9} {descriptions['description']}")
-    print("\ncompletesplat completion bash|zsh|fish prints a script that makes this shell complete verbs and settings")
-
-
-def _complete(words: list[str], script: bool) -> None:
-    """Print completions of the last word, or the script with which a shell asks for them."""
-    from completesplat.settings.options import SCRIPTS, candidates
-
-    if not script:
-        return print("\n".join(candidates(words, VERBS)))
-    if len(words) != 1 or words[0] not in SCRIPTS:
-        sys.exit(_refuse(f"name a shell: completesplat completion {'|'.join(SCRIPTS)}"))
-    return print(SCRIPTS[words[0]], end="")
 
 
 def _refuse(message: str, status: int = 2) -> int:

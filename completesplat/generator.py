@@ -150,7 +150,7 @@ class CompleteSplat(SceneModel):
         images = images if visible is None else images * visible
         conditioning = self.conditioning(images)
         stage1 = self.autoreconstructor
-        features = stage1.encoder.features(images, stage1.reconstructor.feature_levels) if weight else []
+        features = stage1.encoder.features(images * 2 - 1, stage1.reconstructor.feature_levels) if weight else []
         shape = (self.denoiser.latent_channels, *conditioning.shape[-2:])
         noise = draw_noise(len(images), samples, shape, seed).to(images.device)
         image_of = torch.arange(len(images), device=images.device).repeat_interleave(samples)

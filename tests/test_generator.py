@@ -121,20 +121,6 @@ def half(model):
     return visible
 
 
-@pytest.mark.parametrize(("batch", "guidance_weight"), [(1, 0.5), (3, 0.0), (7, 0.0)])
-def test_how_many_samples_are_computed_at_a_time_changes_rounding_only(model, picture, batch, guidance_weight):
-    sizes = []
-    reconstructor = model.autoreconstructor.reconstructor
-    hook = reconstructor.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
-    settings = {"samples": 5, "seed": 1, "steps": 2, "guidance_weight": guidance_weight}
-    together, split = model(picture, **settings), model(picture, **settings, batch=batch)
-    hook.remove()
-    assert sizes == [5, *[batch] * (5 // batch), *[5 % batch] * (5 % batch > 0)] if batch < 5 else [5, 5]
-    for one, other in zip(together, split, strict=True):
-        for name in vars(one):
-            torch.testing.assert_close(getattr(one, name), getattr(other, name), atol=1e-4, rtol=1e-4)
-
-
 def calls_of(model, **settings) -> dict[str, list[int]]:
     """Batch sizes with which the networks are called in a drawing of one picture."""
     encoder, reconstructor = model.autoreconstructor.encoder.network, model.autoreconstructor.reconstructor

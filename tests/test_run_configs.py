@@ -123,15 +123,6 @@ def test_modules_of_the_users_own_are_named_where_the_run_is_the_users_or_truste
         configuration(run)
 
 
-def test_a_module_of_a_foreign_folder_is_not_found(run, tmp_path, monkeypatch):
-    (run / "evil.py").write_text(f"open({str(tmp_path / 'sprung')!r}, 'w')\n")
-    name(run, {"_target_": "evil.Evil"})
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(WeightsError, match=r"names evil\.Evil"):
-        configuration(run, trust=True)
-    assert not (tmp_path / "sprung").exists()
-
-
 def test_modules_of_the_working_folder_are_the_users_own_and_a_strangers_run_is_not_trusted_for_them(
     run, elsewhere, tmp_path, monkeypatch
 ):

@@ -82,18 +82,15 @@ class Encoder(nn.Module):
     ) -> tuple[Posterior, list[Float[Tensor, "batch _ _ _"]]]:
         """Encode values around zero without rescaling them; `forward` describes the result."""
         network: Any = self.network
-        features = self._features(values, len(network.down_blocks))
+        features = self.features(values, len(network.down_blocks))
         hidden = self._run(network.mid_block, features[-1])
         hidden = network.conv_act(network.conv_norm_out(hidden))
         return from_moments(self.quant_conv(network.conv_out(hidden))), features
 
     def features(
-        self, images: Float[Tensor, "batch 3 height width"], levels: int
+        self, values: Float[Tensor, "batch channel height width"], levels: int
     ) -> list[Float[Tensor, "batch _ _ _"]]:
-        """Return the features of the first levels as `forward` does, without computing anything after them."""
-        return self._features(images * 2 - 1, levels)
-
-    def _features(self, values: Tensor, levels: int) -> list[Tensor]:
+        """Return the features of the first levels as `encode` does, without computing anything after them."""
         network: Any = self.network
         hidden, features = network.conv_in(values), list[Tensor]()
         for level, block in enumerate(network.down_blocks[:levels]):

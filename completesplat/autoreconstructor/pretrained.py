@@ -46,13 +46,16 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     """
     part = "conditioning" if reconstructor is None else "autoreconstructor"
     folder = _vae_folder(source, part)
-    weights = {_current_name(name): value for name, value in _read_weights(folder).items()}
+    try:
+        config = dict(json.loads((folder / CONFIG_FILE).read_text()))
+        weights = _read_weights(folder)
+    except Exception as error:  # torch and safetensors raise many kinds for a damaged file
+        raise WeightsError(f"{folder}: damaged, or no VAE ({first_line(error)}); fetch it again") from error
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
     else:
         decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
-    config = _read_config(folder / CONFIG_FILE)
     # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
     vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
     expected, given = ({k: x for k, x in named.items() if k not in HEAD} for named in (vae.state_dict(), weights))
@@ -60,6 +63,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
     if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
         reason = f"its group normalisation has {groups} groups and {encoder.network.conv_norm_out.num_groups} here"
+    if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # nor this
+        reason = f"its activation is {activation} and silu here"
     if reason is not None:
         raise WeightsError(f"{folder}: {reason}; {_needed_settings(config, part)}")
     vae.load_state_dict(given, strict=False)
@@ -80,61 +85,31 @@ def _needed_settings(config: Mapping[str, object], part: str) -> str:
 
 def _vae_folder(source: str, part: str) -> Path:
     """Return the folder of the VAE's files; download it from the hub if `source` is not a folder."""
-    local = Path(source).expanduser()
-    if local.exists():
-        hint = "give a folder from `hf download CompVis/stable-diffusion-v1-4 --local-dir DIR`"
-        folder = _find(local)
-    elif HUB_ID.fullmatch(source):
-        hint = _fetch_hint(source, part)
-        names = [[f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)] for file in WEIGHTS_FILES]
-        folder = _find(from_hub(source, names[0], hint)) or _find(from_hub(source, names[1], hint))
-    else:
-        raise WeightsError(f"{source}: no such folder; {_fetch_hint('CompVis/stable-diffusion-v1-4', part)}")
-    if folder is None:
-        files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
-        raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {hint}")
-    return folder
-
-
-def _find(folder: Path) -> Path | None:
-    for candidate in (folder / place for place in PLACES):
-        if (candidate / CONFIG_FILE).is_file() and any((candidate / name).is_file() for name in WEIGHTS_FILES):
-            return candidate
-    return None
-
-
-def _fetch_hint(hub_id: str, part: str) -> str:
-    return (
+    local, is_id = Path(source).expanduser(), HUB_ID.fullmatch(source) is not None
+    hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
+    advice = (
         f"where there is a network, `hf download {hub_id} --local-dir DIR` fetches it (of a whole pipeline, "
         f"`--include 'vae/*'` is enough); then give {part}.pretrained=DIR"
     )
-
-
-def _read_config(path: Path) -> dict[str, object]:
-    try:
-        config = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise WeightsError(f"{path}: cannot be read: {first_line(error)}") from error
-    config = config if isinstance(config, dict) else {}
-    kind = config.get("_class_name")
-    if kind != "AutoencoderKL":
-        raise WeightsError(f"{path}: describes {kind or 'no model'}; give the folder of an AutoencoderKL")
-    if config.get("act_fn", "silu") != "silu":
-        raise WeightsError(f"{path}: activation {config['act_fn']}, but Stable Diffusion's VAE has silu")
-    return config
+    if not local.exists() and not is_id:
+        raise WeightsError(f"{source}: no such folder; {advice}")
+    for file in WEIGHTS_FILES:
+        names = [f"{place}{name}" for place in PLACES for name in (CONFIG_FILE, file)]
+        folder = local if local.exists() else from_hub(source, names, advice)
+        for place in PLACES:
+            if (folder / place / CONFIG_FILE).is_file() and (folder / place / file).is_file():
+                return folder / place
+    files = f"{CONFIG_FILE} and {WEIGHTS_FILES[0]} (or .bin)"
+    raise WeightsError(f"{source}: no {files} there, nor in a subfolder vae; {advice}")
 
 
 def _read_weights(folder: Path) -> dict[str, Tensor]:
-    path = next(folder / name for name in WEIGHTS_FILES if (folder / name).is_file())
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        raise WeightsError(f"{path}: damaged or no weights ({first_line(error)}); fetch it again") from error
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-        raise WeightsError(f"{path}: not a mapping of names to tensors; give diffusers' own file")
-    return weights
+    path = folder / WEIGHTS_FILES[0]
+    if path.is_file():
+        weights = load_file(path)
+    else:
+        weights = torch.load(folder / WEIGHTS_FILES[1], map_location="cpu", weights_only=True)
+    return {_current_name(name): value for name, value in weights.items() if isinstance(value, Tensor)}
 
 
 def _current_name(name: str) -> str:

@@ -163,11 +163,12 @@ def _check_settings(place: str, hints: Mapping[str, Any], settings: Mapping[str,
         key = f"{place}.{name}".lstrip(".")
         if name not in hints:
             raise WeightsError(f"{shown(key)}: there is no such setting, but {', '.join(hints)}")
+        hint = hints[name]
         if name in PARTS and (value is not None or name != "view_encoder"):
             _check_part(key, value, PARTS[name])
-        elif is_typeddict(hints[name]) and isinstance(value, Mapping):
-            _check_settings(key, hints_of(hints[name]), value)
-        elif name not in PARTS and (refusals := refused(hints[name], value)):
+        elif isinstance(hint, type) and is_typeddict(hint) and isinstance(value, Mapping):
+            _check_settings(key, hints_of(hint), value)
+        elif name not in PARTS and (refusals := refused(hint, value)):
             raise WeightsError(f"{key}={shown(value)}: {refusals[0].reason}")
 
 

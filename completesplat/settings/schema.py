@@ -148,7 +148,7 @@ def refused(annotation: object, value: object) -> list[Refused]:
         unfit = refused(kind, value)
         return unfit or [Refused("", value, reason) for rule in rules if (reason := rule.refusal(value))]
     members = arguments if origin in (Union, UnionType) else (annotation,)
-    if all(get_origin(member) is Literal or member is NoneType for member in members):
+    if annotation is not NoneType and all(get_origin(m) is Literal or m is NoneType for m in members):
         choices = OneOf(tuple(choice for member in members for choice in get_args(member) or (None,)))
         return refused(Annotated[object, choices], value)
     if origin in (Union, UnionType):

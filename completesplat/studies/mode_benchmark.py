@@ -96,7 +96,7 @@ class _Ladder:
 
     def _rendered(self, latents: Float[Tensor, "sample channel _ _"], scene: SceneBatch) -> Renders:
         count = len(latents)
-        features = self.model.encoder.features(self._seen(scene), self.model.reconstructor.feature_levels)
+        features = self.model.encoder.features(self._seen(scene) * 2 - 1, self.model.reconstructor.feature_levels)
         splatter_image = self.model.reconstructor(latents, [feature.expand(count, -1, -1, -1) for feature in features])
         cameras = scene.reference.cameras.map(lambda tensor: tensor.expand(count, -1, -1))
         return _render(self.module, splatter_image.gaussians(cameras, scene.depth_range.expand(count, -1)), scene)

@@ -27,7 +27,6 @@ def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
     ("changes", "difference", "setting"),
     [
         ({"channels": (16, 16, 16, 16)}, "weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here", "channels=[8,8,16,16]"),
-        ({"layers_per_block": 2}, "resnets.1.norm1.weight is missing there", "layers_per_block=1"),
         ({"norm_groups": 8}, "4 groups and 8 here", "norm_groups=4"),  # every shape fits
     ],
 )
@@ -35,6 +34,12 @@ def test_another_size_names_the_difference_and_the_setting(folder, changes, diff
     message = refusal(folder, **changes)
     assert difference in message
     assert f"autoreconstructor.encoder.{setting}" in message
+
+
+def test_another_activation_is_refused(folder):
+    path = folder / "config.json"
+    path.write_text(path.read_text().replace('"silu"', '"gelu"'))
+    assert "its activation is gelu and silu here" in refusal(folder)
 
 
 def test_tensors_missing_or_too_many_are_named(folder):
@@ -48,10 +53,10 @@ def test_a_truncated_file_is_damaged_and_a_bin_file_that_is_no_mapping_of_tensor
     path = folder / SAFETENSORS
     for kept in (-1, 0):
         path.write_bytes(path.read_bytes()[:kept])
-        assert f"{path}: damaged" in refusal(folder)
+        assert f"{folder}: damaged" in refusal(folder)
     path.unlink()
     torch.save({"state_dict": vae.state_dict()}, folder / BIN)
-    assert "not a mapping of names to tensors" in refusal(folder)
+    assert "is missing there" in refusal(folder)
 
 
 @pytest.mark.parametrize("name", ["config.json", SAFETENSORS])
@@ -63,15 +68,7 @@ def test_a_folder_without_its_files_says_which_are_needed(folder, name):
     assert f"{folder / 'absent'}: no such folder" in refusal(folder / "absent")  # no id of the hub
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("", "cannot be read"),
-        ("[1]", "describes no model"),
-        ('{"_class_name": "UNet2DConditionModel"}', "describes UNet2DConditionModel"),
-        ('{"_class_name": "AutoencoderKL", "act_fn": "relu"}', "activation relu"),
-    ],
-)
-def test_a_configuration_of_anything_else_is_refused(folder, text, reason):
+@pytest.mark.parametrize("text", ["", "[1]"])
+def test_a_damaged_config_is_refused(folder, text):
     (folder / "config.json").write_text(text)
-    assert f"{folder / 'config.json'}: {reason}" in refusal(folder)
+    assert f"{folder}: damaged, or no VAE" in refusal(folder)

@@ -87,7 +87,7 @@ def test_a_removed_working_folder_is_named(command, tmp_path, monkeypatch):
     (tmp_path / "gone").mkdir()
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
-    for given in (["data", "toy"], ["fit", "--help"], ["--complete", "fit", "experiment="]):
+    for given in (["data", "toy"], ["fit", "--help"]):
         refused = command(*given)
         assert (refused.status, refused.err) == (2, "error: the working folder was removed: go to another folder\n")
 
