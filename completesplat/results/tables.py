@@ -44,15 +44,10 @@ EVALUATED_IF_POSSIBLE = [f"full_novel_{name}" for name in ("lpips", "fid", "kid"
 CSV_COLUMNS = ["table", "title", "source", "row", "group", "column", "text", "mark", "value"]
 
 
-def metric(name: str) -> str:
-    """Return a heading for `psnr` or `full_novel_psnr`: the metric and its better direction."""
-    name = name.rpartition("_")[2]
-    return f"{METRICS[name]} {'↓' if name in LOWER_IS_BETTER else '↑'}"
-
-
 def score_heading(name: str) -> "Heading":
-    """Return a heading for a score named `REGION_VIEW_METRIC`, grouped by region and view."""
-    return Heading(metric(name), GROUPS[name.rpartition("_")[0]])
+    """Return a heading for a score named `REGION_VIEW_METRIC`: its better direction, grouped by region and view."""
+    group, _, metric = name.rpartition("_")
+    return Heading(f"{METRICS[metric]} {'↓' if metric in LOWER_IS_BETTER else '↑'}", GROUPS[group])
 
 
 def marks(values: Sequence[float | None], competing: Sequence[bool], name: str) -> list[str]:

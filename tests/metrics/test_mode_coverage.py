@@ -39,14 +39,6 @@ def test_the_mean_of_the_modes_is_rejected_always(probabilities):
     assert classify(modes, modes, third).tolist() == [0, 1, 2]
 
 
-def test_a_sampler_of_one_mode_covers_one_of_k():
-    for count in (2, 4):
-        modes = MODES[:count]
-        result = scores(modes[1:2].expand(6, -1, -1), modes, torch.full((count,), 1 / count))
-        assert (result.coverage, result.total_variation) == pytest.approx((1 / count, 1 - 1 / count))
-        assert (result.sharpness, result.rejected) == (0, 0)
-
-
 def test_a_mixture_belongs_to_a_mode_only_on_its_side_of_the_middle_and_near_it():
     shares = torch.tensor([0.0, 0.2, 0.45, 0.5, 0.55, 1.0])[:, None, None]
     mixtures = (1 - shares) * MODES[0] + shares * MODES[1]

@@ -155,11 +155,6 @@ def test_naive_predictors_and_upper_bounds_do_not_compete() -> None:
     assert [cells[0].mark for cells in figures(rows, [PSNR])] == ["", "second", "best", "", ""]
 
 
-@pytest.mark.parametrize(("deviations", "text"), [({PSNR: 0.126}, "21.34 ± 0.13"), ({}, "21.34")])
-def test_a_figure_is_mean_and_deviation_equally_precise(deviations, text) -> None:
-    assert figures(scored([21.344], deviations=deviations), [PSNR])[0][0].text == text
-
-
 def test_times_are_in_the_units_of_the_paper() -> None:
     texts = [time_cell(seconds).text for seconds in (0.0157, 54, 246.0, None)]
     assert texts == ["15.7 ms", "54.0 sec", "4.1 min", "-"]

@@ -13,7 +13,6 @@ from completesplat.results.tables import (
     as_markdown,
     escape,
     evaluation_table,
-    metric,
     show,
     table,
     write_tables,
@@ -92,11 +91,6 @@ def test_all_files_have_the_published_figures_as_printed_and_the_csv_all_digits_
 def test_latex_prints_special_characters_literally() -> None:
     assert escape(r"a_b 50% & #1 {$c} a\b 1 ± 2") == r"a\_b 50\% \& \#1 \{\$c\} a\textbackslash{}b 1 $\pm$ 2"
     assert escape("x^2~y") == r"x\textasciicircum{}2\textasciitilde{}y"
-
-
-@pytest.mark.parametrize(("name", "arrow"), [("psnr", "PSNR ↑"), ("lpips", "LPIPS ↓")])
-def test_the_heading_says_which_direction_is_better(name, arrow) -> None:
-    assert metric(f"full_novel_{name}") == arrow
 
 
 def test_missing_entries_of_records_stay_empty(capsys) -> None:

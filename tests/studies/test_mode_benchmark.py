@@ -66,6 +66,7 @@ def test_constructed_predictors_have_their_scores():
     assert perfect["model"]["energy_visible"] == pytest.approx(0, abs=1e-12)
     collapsed = measured([2]).results(SAMPLES)["model"]
     assert (collapsed["coverage"], collapsed["total_variation"]) == (1 / MODES, 1 - 1 / MODES)
+    assert (collapsed["sharpness"], collapsed["rejected"]) == (0, 0)
     mean, true = perfect["mean_predictor"], perfect["true_sampler"]
     assert (mean["coverage"], mean["total_variation"], mean["rejected"]) == (0, 1, 1)
     assert mean["sharpness"] == pytest.approx(1)

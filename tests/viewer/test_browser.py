@@ -139,16 +139,6 @@ def test_the_page_draws_the_splats_as_our_rasterizer_does(tab):
         assert place(actual, color) == pytest.approx(place(expected, color), abs=1)
 
 
-def test_a_layer_disappears_when_it_is_switched_off(tab):
-    before = settled(tab)
-    tab.get_by_label("Layer 1", exact=True).click()
-    without = changed(tab, before)
-    assert not (abs(without - 255 * np.array(BALLS["red"][1])).max(-1) < 40).any()
-    place(without, BALLS["blue"][1])
-    tab.get_by_label("Layer 1", exact=True).click()
-    place(changed(tab, without), BALLS["red"][1])
-
-
 def test_the_page_has_our_title_and_icon_and_no_errors(tab):
     settled(tab)
     assert tab.title() == "completesplat"
@@ -189,17 +179,6 @@ def test_a_thumbnail_makes_its_sample_large_and_a_key_shows_all(tab, page):
     page.show([first])
 
 
-def test_too_large_a_file_is_refused_and_the_page_says_so(tab, page, tmp_path):
-    file = tmp_path / "large.png"
-    file.write_bytes(bytes(33 * 2**20))
-    with tab.expect_file_chooser() as chooser:
-        tab.get_by_role("button", name="Load an image").click()
-    chooser.value.set_files(file)
-    message = tab.get_by_text("large.png: 33 MiB; at most 32 MiB are taken at a time")
-    message.wait_for(state="attached", timeout=1000 * LIMIT)
-    assert page.server.gui._current_file_upload_states == {}
-
-
 def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     file = tmp_path / "photo.png"
     rng = np.random.default_rng(0)
@@ -221,16 +200,6 @@ def test_an_upload_gives_a_sample_and_a_slider_another(tab, page, tmp_path):
     seed.press("Enter")
     assert waited_for(lambda: page.view.samples[0].settings.get("seed") == 9), "no new sample"
     changed(tab, first)
-
-
-def test_a_browser_needs_the_whole_address_once(chromium, page):
-    bare = page.server.address.partition("?")[0]
-    with chromium.new_context() as context:
-        for address, status in ((bare, 403), (page.server.address, 200), (bare, 200)):
-            tab = context.new_page()
-            assert tab.goto(address).status == status
-        # What the page shows comes through its websocket.
-        tab.get_by_role("button", name="Load an image").wait_for(timeout=1000 * LIMIT)
 
 
 def test_the_offline_page_draws_the_splats(chromium, page, tmp_path):

@@ -34,15 +34,6 @@ def test_the_newest_waiting_job_of_a_kind_is_done_in_another_thread(worker):
     assert done["saved"] is done["third"] is not threading.current_thread()
 
 
-def test_an_error_is_reported_and_the_next_job_done(worker):
-    done = []
-    worker.submit("fail", lambda: 1 / 0)
-    worker.submit("draw", lambda: done.append(True))
-    assert worker.wait(LIMIT)
-    assert [type(error) for error in worker.failures] == [ZeroDivisionError]
-    assert done == [True]
-
-
 def test_waiting_jobs_are_dropped_on_close(worker):
     done = []
     release = blocked(worker)
