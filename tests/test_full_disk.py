@@ -109,11 +109,6 @@ def test_a_file_that_does_not_fit_is_refused_and_the_old_one_stays(tmp_path, nam
         assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_checkpoint_that_does_not_fit_says_how_large_it_is(tmp_path):
-    with quota(1000), pytest.raises(DiskError, match=r"14\.0 kB or more are needed"):  # 3500 numbers of four bytes
-        checkpoint(tmp_path / "last.ckpt")
-
-
 def test_rows_that_do_not_fit_are_refused(tmp_path):
     file = MetricsFile(str(tmp_path))
     for step in range(100):
@@ -207,27 +202,6 @@ def test_training_stops_where_its_folder_was_removed(command, pipeline, tmp_path
     finished = command("fit", *FIT, f"data.root={pipeline.toy}", f"out={run}")
     assert line(finished) == f"error: {run}/metrics.csv: cannot be written, {run} is not there any more"
     assert not run.exists()
-
-
-def test_predictions_stop_where_they_do_not_fit_or_their_folder_was_removed(
-    command, tiny_weights, pipeline, tmp_path, monkeypatch
-):
-    given = ["predict", f"image=[{pipeline.photograph()},{pipeline.photograph()}]", f"weights={tiny_weights}"]
-    given += ["samples=1", "video=null", "frames=2"]
-    with quota(20_000):
-        finished = command(*given, f"out={tmp_path}/one")
-    assert re.search(rf"sample_00\.ply: {SAID}$", line(finished))
-    from completesplat.commands import predict
-
-    drawn, out = predict._predict, tmp_path / "two"
-
-    def removed(*inputs) -> None:
-        drawn(*inputs)
-        shutil.rmtree(out)
-
-    monkeypatch.setattr(predict, "_predict", removed)
-    assert line(command(*given, f"out={out}")).endswith(f"{out} is not there any more")
-    assert not out.exists()
 
 
 def test_prepared_data_and_latents_that_do_not_fit(command, pipeline, packed_toys, tmp_path):

@@ -63,6 +63,8 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
     assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
     if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
         reason = f"its group normalisation has {groups} groups, not {encoder.network.conv_norm_out.num_groups}"
+    if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # weights do not show it
+        reason = f"its activation is {activation}, not silu"
     if reason is not None:
         raise WeightsError(f"{folder}: {reason}; {_needed_settings(config, part)}")
     vae.load_state_dict(loaded, strict=False)

@@ -1,13 +1,12 @@
 """`completesplat bench data`: reading speeds of published and packed forms of the same scenes."""
 
 import logging
-import shutil
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, NamedTuple, TypedDict
 
 from rich.console import Console
@@ -65,7 +64,7 @@ class Epoch(NamedTuple):
 def run(
     objects: Objects, rooms: Rooms | Literal[False],
     workers: Annotated[Sequence[Natural], Entries(1)], repeats: Positive,
-    codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Entries(1)], keep: bool, out: Path,
+    codecs: Annotated[Sequence[Annotated[str, OneOf(tuple(CODECS))]], Entries(1)], out: Path,
 ) -> None:  # fmt: skip
     """Write scenes, read them in all their forms, write `data.json`, and print tables.
 
@@ -74,26 +73,23 @@ def run(
         workers: numbers of loading processes; everything is measured with each of them.
         repeats: number of timed epochs of each form.
         codecs: codecs of the packed stores.
-        keep: whether to keep the files that were read in `out`.
     """
-    folder = Path(mkdtemp(prefix="bench_data_", dir=out))
     # Dozens of data modules would log their numbers of sequences.
     logger = logging.getLogger("completesplat.data")
     level = logger.level
     logger.setLevel(logging.WARNING)
     results: dict[str, list[Row]] = {}
     try:
-        # Write everything before reading anything, because writing shows its own progress bars.
-        forms = {"rows": _objects(objects, codecs, folder)}
-        if rooms:
-            forms["clips"] = _rooms(rooms, codecs, folder)
-        with Console(stderr=True).status("reading") as status:
-            for key, makers in forms.items():
-                results[key] = rows(makers, workers, repeats, lambda text: status.update(f"reading {text}"))
+        with TemporaryDirectory(prefix="bench_data_", dir=out) as folder:
+            # Write everything before reading anything, because writing shows its own progress bars.
+            forms = {"rows": _objects(objects, codecs, Path(folder))}
+            if rooms:
+                forms["clips"] = _rooms(rooms, codecs, Path(folder))
+            with Console(stderr=True).status("reading") as status:
+                for key, makers in forms.items():
+                    results[key] = rows(makers, workers, repeats, lambda text: status.update(f"reading {text}"))
     finally:
         logger.setLevel(level)
-        if not keep:
-            shutil.rmtree(folder)
     described = machine()
     write_json(out / "data.json", {"machine": described, **results})
     titles = {"rows": "Training batches", "clips": "Training batches of clips"}

@@ -23,12 +23,10 @@ from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Positive
 
 TORCH, PREDICT, AGAIN, VIEW = "import torch", "predict", "predict once more", "view, until its page is there"
-OTHER = ", other version"
 # The least that every prediction needs: diffusers' networks and scheduler, with what diffusers itself imports.
 NEEDED = "import torch and the networks of diffusers"
 NETWORKS = "import gc; gc.disable(); import torch; from diffusers import FlowMatchEulerDiscreteScheduler, UNet2DModel; "
 NETWORKS += "from diffusers.models.autoencoders import vae"
-PACKAGE = "completesplat"
 # The second call needs no imports and no compilation of kernels: it has settings, weights, a sample and files left.
 TWICE = """
 import json, sys, time
@@ -52,19 +50,16 @@ class Seconds(NamedTuple):
     wall: float
 
 
-def run(weights: str, repeats: Positive, against: str | None, out: Path) -> None:
+def run(weights: str, repeats: Positive, out: Path) -> None:
     """Time whole processes in turn, write `startup.json`, and print a table.
 
     Args:
         weights: draw one sample, without a video.
         repeats: number of timed processes of each kind, after an untimed one; the median counts.
-        against: a folder with another version of the package, which is measured in turn.
 
     Raises:
-        CompleteSplatError: `against` has no version of the package, or a process fails.
+        CompleteSplatError: a process fails.
     """
-    if against is not None and not (Path(against) / PACKAGE / "cli.py").is_file():
-        raise CompleteSplatError(f"against={against}: no {PACKAGE}/ here, of another version")
     with TemporaryDirectory(prefix="bench_startup_") as folder:
         image = Path(folder) / "image.png"
         Image.new("RGB", (64, 64), "grey").save(image)  # its content does not change the work
@@ -72,7 +67,7 @@ def run(weights: str, repeats: Positive, against: str | None, out: Path) -> None
         programs = {PREDICT: ["predict", str(image), "samples=1", "video=[]", *shared], VIEW: ["view", *shared]}
         if find_spec("viser") is None:
             del programs[VIEW]
-        times = timed(programs, repeats, None if against is None else Path(against).resolve())
+        times = timed(programs, repeats)
     rows: list[Row] = [
         {"what": name, "cpu_seconds": x.cpu, "wall_seconds": x.wall, "times_torch": x.cpu / times[TORCH].cpu}
         for name, x in times.items()
@@ -85,26 +80,21 @@ def run(weights: str, repeats: Positive, against: str | None, out: Path) -> None
     print(f"predict without what it takes once more: {starting:.1f} times import torch, in CPU time")
 
 
-def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | None) -> dict[str, Seconds]:
+def timed(programs: Mapping[str, Sequence[str]], repeats: int) -> dict[str, Seconds]:
     """Start processes in turn, each with one thread, and return their median times by name.
 
     `programs` has the arguments of `PREDICT`, and perhaps of `VIEW`, which is ended when it has printed an address.
-    `against` is the folder of another version, or None.
     """
-    kinds: dict[str, tuple[list[str], Path | None]] = {TORCH: (["-c", "import torch"], None)}
-    kinds[NEEDED] = ["-c", NETWORKS], None
-    for name, arguments in programs.items():
-        if against is not None:
-            kinds[name + OTHER] = ["-m", PACKAGE, *arguments], against
-        kinds[name] = ["-m", PACKAGE, *arguments], None
-    kinds[AGAIN] = ["-c", TWICE, *programs[PREDICT]], None
+    kinds = {TORCH: ["-c", "import torch"], NEEDED: ["-c", NETWORKS]}
+    kinds |= {name: ["-m", "completesplat", *arguments] for name, arguments in programs.items()}
+    kinds[AGAIN] = ["-c", TWICE, *programs[PREDICT]]
     taken: dict[str, list[Seconds]] = {name: [] for name in kinds}
     with Console(stderr=True).status("") as status:
         for number in range(repeats + 1):
-            for name, (arguments, package) in kinds.items():
+            for name, arguments in kinds.items():
                 status.update(f"{name}: {number} of {repeats}")
                 before, start = os.times(), time.perf_counter()
-                printed = _run(arguments, package, first_line=name.startswith(VIEW))
+                printed = _run(arguments, first_line=name == VIEW)
                 after, wall = os.times(), time.perf_counter() - start
                 cpu = after.children_user - before.children_user + after.children_system - before.children_system
                 seconds = Seconds(cpu, wall) if name != AGAIN else Seconds(*json.loads(printed.splitlines()[-1]))
@@ -112,14 +102,13 @@ def timed(programs: Mapping[str, Sequence[str]], repeats: int, against: Path | N
     return {name: Seconds(*map(statistics.median, zip(*taken[name], strict=True))) for name in kinds}
 
 
-def _run(arguments: Sequence[str], package: Path | None, first_line: bool = False) -> str:
-    """Return the output of Python with this process's package or that of a folder, until its end or its first line.
+def _run(arguments: Sequence[str], first_line: bool = False) -> str:
+    """Return the output of Python with this process's package, until its end or its first line.
 
     Raises:
         CompleteSplatError: the process fails.
     """
-    folder = Path(__file__).parents[2] if package is None else package
-    environment, pipe = {**os.environ, **SETTINGS, "PYTHONPATH": str(folder)}, subprocess.PIPE
+    environment, pipe = {**os.environ, **SETTINGS, "PYTHONPATH": str(Path(__file__).parents[2])}, subprocess.PIPE
     with subprocess.Popen(
         [sys.executable, *arguments], env=environment, stdout=pipe, stderr=pipe, text=True
     ) as process:

@@ -22,6 +22,13 @@ from completesplat.commands.protocol import write_json
 from completesplat.errors import WeightsError
 from completesplat.weights import SHIPPED, SUMS_FILE, check_folder
 
+EXTRAS = {
+    "cuda": "to draw on an NVIDIA GPU",
+    "view": "to show scenes in a browser",
+    "background": "to cut objects out of photos",
+    "colmap": "to read captures whose lens distorts",
+    "slurm": "to spread sweeps over a cluster",
+}
 STYLES = {"yes": "green", "no": "yellow", "broken": "bold red"}
 LEAST_SPACE = 100_000_000
 """Bytes that the files of a few predictions take."""
@@ -66,6 +73,18 @@ def required_packages(requirements: Iterable[Requirement]) -> Iterator[Finding]:
             message = f"{installed}, which is not {requirement.specifier}: it may or may not work"
             yield Finding(requirement.name, "no", message)
     yield Finding("packages", "yes", f"{others} in versions that fit")
+
+
+def check_extras(requirements: Iterable[str] | None = None) -> Iterator[Finding]:
+    """Yield the packages of each extra; one that is not installed is no error."""
+    lines = requires("completesplat") or () if requirements is None else requirements
+    for requirement in map(Requirement, lines):
+        for extra, purpose in EXTRAS.items():
+            if requirement.marker is not None and requirement.marker.evaluate({"extra": extra}):
+                try:
+                    yield Finding(requirement.name, "yes", f"{version(requirement.name)}: {purpose}")
+                except PackageNotFoundError:
+                    yield Finding(requirement.name, "no", f'{purpose}: `pip install "completesplat[{extra}]"`')
 
 
 def check_imports() -> Iterator[Finding]:
@@ -123,10 +142,11 @@ def check_tools(place: Path) -> Iterator[Finding]:
 
 def run(config: DictConfig, out: Path) -> None:
     """Print the table and write `doctor.json`; exit with status 1 if something that a prediction needs is broken."""
-    checks = {"packages": check_packages, "imports": check_imports, "device": check_device, "weights": check_weights}
+    checks = {"packages": check_packages, "extras": check_extras, "imports": check_imports, "device": check_device}
+    checks |= {"weights": check_weights, "tools": lambda: check_tools(Path.cwd())}
     table = Table("part", "what", "here", "which, or why not", title="completesplat doctor", title_justify="left")
     rows, broken = [], []
-    for part, check in (checks | {"tools": lambda: check_tools(Path.cwd())}).items():
+    for part, check in checks.items():
         for finding in findings_of(check):
             rows.append({"part": part, **finding._asdict()})
             table.add_row(part, Text(finding.name), Text(finding.state, STYLES[finding.state]), Text(finding.details))

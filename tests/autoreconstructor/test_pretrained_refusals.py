@@ -36,6 +36,12 @@ def test_another_size_names_the_difference_and_the_setting(folder, changes, diff
     assert f"autoreconstructor.encoder.{setting}" in message
 
 
+def test_another_activation_is_refused(folder):
+    path = folder / "config.json"
+    path.write_text(path.read_text().replace('"silu"', '"gelu"'))
+    assert "its activation is gelu, not silu" in refusal(folder)
+
+
 def test_tensors_missing_or_too_many_are_named(folder):
     rewrite(folder, lambda weights: weights.update({"decoder.extra": torch.zeros(1)}))
     assert "decoder.extra has no place here" in refusal(folder)

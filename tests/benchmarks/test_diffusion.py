@@ -1,13 +1,12 @@
 """`completesplat bench diffusion`: work and timing of the comparisons, and what the command writes and refuses."""
 
-from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
 import torch
 from hydra.utils import instantiate
-from support import compose_config, refused, strict_json, tiny_generator
+from support import compose_config, refused, strict_json
 
 from completesplat.benchmarks import diffusion, measuring
 from completesplat.benchmarks.diffusion import (
@@ -15,13 +14,9 @@ from completesplat.benchmarks.diffusion import (
     cached_vs_on_the_fly,
     chosen_of,
     measured,
-    sampling_comparisons,
 )
 from completesplat.benchmarks.measuring import WARM_UP
-from completesplat.benchmarks.training_step import Training
 from completesplat.errors import CompleteSplatError
-from completesplat.generator import CompleteSplat
-from completesplat.scene import CachedScene, SceneBatch
 
 CPU = torch.device("cpu")
 
@@ -62,41 +57,6 @@ def test_a_missing_gpu_is_refused(monkeypatch):
     assert line == "device=cuda: there is no GPU here; device=auto takes what there is"
 
 
-@pytest.fixture(scope="module")
-def compared() -> tuple[CompleteSplat, dict[str, Comparison]]:
-    model, few = tiny_generator(), compose_config("fit", "sampler=dpm10", "sampler.steps=3").sampler
-    return model, sampling_comparisons(model, few, samples=4, steps=2, batch=3)
-
-
-def batch_sizes(model: CompleteSplat, work: Callable[[], object]) -> tuple[list[int], ...]:
-    """Return batch sizes of the calls of the encoder, the denoiser and the reconstructor."""
-    frozen = model.autoreconstructor
-    networks = frozen.encoder.network.conv_in, model.denoiser, frozen.reconstructor
-    calls: tuple[list[int], ...] = [], [], []
-    hooks = [
-        network.register_forward_pre_hook(lambda _, inputs, sizes=sizes: sizes.append(len(inputs[0])))
-        for network, sizes in zip(networks, calls, strict=True)
-    ]
-    work()
-    for hook in hooks:
-        hook.remove()
-    return calls
-
-
-@pytest.mark.parametrize(
-    ("name", "a", "b"),
-    [
-        ("batch_vs_one_by_one_k4", ([1], [4] * 2, [4]), ([1], [1] * 2 * 4, [1] * 4)),
-        ("unguided_vs_guided", ([3], [3] * 2, [3]), ([3], [6] * 2, [3])),
-        ("few_steps_vs_50", ([3], [3] * 3, [3]), ([3], [3] * 50, [3])),
-    ],
-)
-def test_batches_of_the_networks(compared, name, a, b):
-    model, comparisons = compared
-    assert batch_sizes(model, comparisons[name].a[1]) == a
-    assert batch_sizes(model, comparisons[name].b[1]) == b
-
-
 CHANNELS = "channels=[8,8,16,16]"
 SMALL = [
     *(f"autoreconstructor.encoder.{CHANNELS}", f"conditioning.{CHANNELS}", "denoiser.channels=[16,32]"),
@@ -130,20 +90,6 @@ def test_the_cache_spares_frozen_networks_and_both_ways_train_the_rest(toy_root,
         assert calls == [(name, 2) for name in called]
         changed = [name for name, value in parts.named_parameters() if not torch.equal(value, before[name])]
         assert {name.split(".")[0] for name in changed} == set(trained)
-
-
-def test_both_ways_load_a_batch_for_each_step_and_decode_images_once(toy_root, tmp_path, monkeypatch):
-    module, data = prepared(toy_root)
-    loaded = []
-    monkeypatch.setattr(Training, "step", lambda self, batch: loaded.append(batch))
-    comparison = cached_vs_on_the_fly(module, "32-true", data, tmp_path / "latents")
-    monkeypatch.setattr("completesplat.data.images.crop.decode", lambda *_: pytest.fail("decoded again"))
-    for _ in range(5):
-        comparison.a[1]()
-        comparison.b[1]()
-    assert [type(batch) for batch in loaded] == [CachedScene, SceneBatch] * 5
-    for cached, fly in zip(loaded[::2], loaded[1::2], strict=True):
-        assert (cached.names, cached.reference_frame.tolist()) == (fly.names, fly.reference_frame.tolist())
 
 
 @pytest.mark.slow

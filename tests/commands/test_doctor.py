@@ -11,7 +11,7 @@ from completesplat.commands import doctor
 from completesplat.commands.doctor import Finding, findings_of, required_packages
 from completesplat.weights import write_sums
 
-PARTS = ["packages", "imports", "device", "weights", "tools"]
+PARTS = ["packages", "extras", "imports", "device", "weights", "tools"]
 
 
 def states(findings):
@@ -47,6 +47,12 @@ def test_failing_imports_and_packages_that_are_missing_or_of_another_version_are
     assert 'pip install "no-such-package>=2.5"' in missing.details
     assert "<1.0: it may or may not work" in older.details
     assert others.details.startswith("0 ")
+
+
+def test_the_packages_of_extras_are_listed_and_may_be_missing():
+    present, missing = doctor.check_extras(["numpy; extra == 'view'", "no-such-package; extra == 'colmap'", "torch>=2"])
+    assert (present.name, present.state, missing.state) == ("numpy", "yes", "no")
+    assert 'pip install "completesplat[colmap]"' in missing.details
 
 
 def test_weights_are_broken_if_changed_or_incomplete(tmp_path):

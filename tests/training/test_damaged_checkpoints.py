@@ -53,13 +53,6 @@ def test_a_damaged_checkpoint_is_refused_where_weights_are_loaded(checkpoint):
             load()
 
 
-def test_files_of_torch_are_read_without_a_checksum(tmp_path):
-    torch.save({"state_dict": {"a": torch.ones(2)}, "callbacks": {"own": bytes(range(256))}}, tmp_path / "own.ckpt")
-    contents = read_checkpoint(tmp_path / "own.ckpt")
-    assert contents["state_dict"]["a"].tolist() == [1, 1]
-    assert contents["callbacks"]["own"] == bytes(range(256))
-
-
 def test_weights_that_are_not_finite_are_refused(pipeline, tmp_path):
     run = shutil.copytree(pipeline.var, tmp_path / "run")
     path = run / "checkpoints/last.ckpt"
