@@ -28,8 +28,8 @@ def main() -> None:
 
         sys.exit(_refuse(f"no verb {arguments[0]!r}: there are {', '.join(VERBS)}{did_you_mean(arguments[0], VERBS)}"))
 
-    # This must be set before torch is loaded. By default its idle threads (GNU OpenMP's) spin for milliseconds and
-    # so keep the rasterizer's threads and other processes off the cores.
+    # This must be set before torch is loaded. By default its idle threads (GNU OpenMP's) spin for milliseconds,
+    # which keeps the rasterizer's threads and other processes off the cores.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     from completesplat.commands import exit_status, launch, refusal
 
@@ -37,7 +37,7 @@ def main() -> None:
         launch(arguments[0], arguments[1:])
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # whoever read the output (`head`, say) has seen enough
+    except BrokenPipeError:  # the reader of the output (`head`, say) closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except Exception as error:

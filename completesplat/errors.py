@@ -1,4 +1,4 @@
-"""Errors that the user sees as one line, `error: ...`, with exit status 2, or 1 after work that failed."""
+"""Errors that the user sees as one line, `error: ...`; the exit status is 2 for refused input, 1 for failed work."""
 
 
 class CompleteSplatError(Exception):
@@ -8,10 +8,10 @@ class CompleteSplatError(Exception):
 
 
 class DataError(CompleteSplatError):
-    """A part of a data set that is missing, broken or not in the expected layout; subclasses: `data/validation.py`.
+    """A missing or broken part of a data set, or one with another layout; its subclasses are in `data/validation.py`.
 
     Args:
-        reason: what is wrong, without the place.
+        reason: description of the problem, without the place.
         file, sequence, frame: the place: file or folder, name of the sequence, number of the frame in the data set.
     """
 

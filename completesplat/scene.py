@@ -1,4 +1,4 @@
-"""Batches of a data module: images with cameras, of a reference view and its targets; or their latents."""
+"""Batches of a data module: reference and target images with their cameras, or cached latents."""
 
 from dataclasses import dataclass, replace
 
@@ -13,7 +13,7 @@ from completesplat.tensors import TensorDataclass, concatenate
 class Views(TensorDataclass):
     """Images (sRGB, 0 to 1), their cameras and foreground probabilities (0 to 1).
 
-    `depths` is the true depth along the optical axes in the cameras' units, 0 where it is unknown; None: not loaded.
+    `depths` are true depths along the optical axes in the cameras' units, 0 where unknown; None if not loaded.
     """
 
     images: Float[Tensor, "*batch 3 height width"]
@@ -29,8 +29,8 @@ class SceneBatch(TensorDataclass):
     World coordinates are the reference camera's frame, after scaling; `depth_range` is (near, far) along its
     optical axis in those units. Without a batch axis this is one scene and `names` is a single string.
     `visible` is 1 where the conditioning may see the reference image, 0 within the boxes of masked diffusion.
-    `names` are those of sequences, `reference_frame` is the reference's index in its sequence. `seen` holds the same
-    scenes as the smaller images that the model takes, if its renders are compared with larger ones; else None.
+    `names` are the sequences' names, and `reference_frame` is the reference's index in its sequence. `seen` holds the
+    same scenes with the smaller images that the model takes, if its renders are compared with larger ones; else None.
     """
 
     reference: Views
@@ -59,7 +59,7 @@ class SceneBatch(TensorDataclass):
 class CachedScene(TensorDataclass):
     """Scenes for stage 2 whose reference images were encoded beforehand.
 
-    `mean` and `log_variance` are those of the autoreconstructor's posterior, not scaled. `condition` is the reference
+    `mean` and `log_variance` are the autoreconstructor's posterior before scaling. `condition` is the reference
     image (sRGB, 0 to 1; 0 within the boxes of masked diffusion), or the features that a frozen conditioning computes
     from it. `names` and `reference_frame` are as in `SceneBatch`.
     """

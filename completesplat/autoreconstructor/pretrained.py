@@ -20,7 +20,7 @@ PLACES = ("", "vae/")  # a VAE by itself, or within a whole pipeline
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*(/[\w.-]+)?")
 ENCODER = ("encoder.", "quant_conv.")
 HEAD = {"decoder.conv_out.weight", "decoder.conv_out.bias"}
-# The names of older diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
+# Names in older versions of diffusers (`_convert_deprecated_attention_blocks` in its modeling_utils.py).
 OLD_ATTENTION = {"query": "to_q", "key": "to_k", "value": "to_v", "proj_attn": "to_out.0"}
 # Keys of config.json, and our options with the same meaning.
 SETTINGS = {
@@ -42,7 +42,7 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         reconstructor: None loads the encoder of a conditioning; the checkpoint may then lack a decoder.
 
     Raises:
-        WeightsError: the checkpoint is missing, damaged, or of a VAE of another kind or size.
+        WeightsError: the checkpoint is missing or damaged, or its VAE has another kind or size.
     """
     part = "conditioning" if reconstructor is None else "autoreconstructor"
     folder = _vae_folder(source, part)
@@ -50,7 +50,7 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         config = dict(json.loads((folder / CONFIG_FILE).read_text()))
         weights = _read_weights(folder)
     except Exception as error:  # torch and safetensors raise many kinds for a damaged file
-        raise WeightsError(f"{folder}: damaged, or no VAE ({first_line(error)}); fetch it again") from error
+        raise WeightsError(f"{folder}: damaged, or not a VAE ({first_line(error)}); fetch it again") from error
     decoder: dict[str, nn.Module] = {}
     if reconstructor is None:
         weights = {name: value for name, value in weights.items() if name.startswith(ENCODER)}
@@ -58,20 +58,20 @@ def load_pretrained(source: str, encoder: Encoder, reconstructor: Reconstructor 
         decoder = {"post_quant_conv": reconstructor.post_quant_conv, "decoder": reconstructor.network}
     # Under these names the state dict's keys are those of diffusers' AutoencoderKL.
     vae = nn.ModuleDict({"encoder": encoder.network, "quant_conv": encoder.quant_conv, **decoder})
-    expected, given = ({k: x for k, x in named.items() if k not in HEAD} for named in (vae.state_dict(), weights))
-    reason, groups = mismatch(expected, given), config.get("norm_num_groups", 32)
+    expected, loaded = ({k: x for k, x in named.items() if k not in HEAD} for named in (vae.state_dict(), weights))
+    reason, groups = mismatch(expected, loaded), config.get("norm_num_groups", 32)
     assert isinstance(encoder.network.conv_norm_out, nn.GroupNorm)
     if reason is None and groups != encoder.network.conv_norm_out.num_groups:  # no tensor's shape shows it
-        reason = f"its group normalisation has {groups} groups and {encoder.network.conv_norm_out.num_groups} here"
-    if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # nor this
-        reason = f"its activation is {activation} and silu here"
+        reason = f"its group normalisation has {groups} groups, not {encoder.network.conv_norm_out.num_groups}"
+    if reason is None and (activation := config.get("act_fn", "silu")) != "silu":  # weights do not show it
+        reason = f"its activation is {activation}, not silu"
     if reason is not None:
         raise WeightsError(f"{folder}: {reason}; {_needed_settings(config, part)}")
-    vae.load_state_dict(given, strict=False)
+    vae.load_state_dict(loaded, strict=False)
 
 
 def _needed_settings(config: Mapping[str, object], part: str) -> str:
-    """Describe the options that fit a VAE's config: those of the autoreconstructor's encoder, or of a conditioning."""
+    """Name the options of the autoreconstructor's encoder, or of a conditioning, that fit a VAE's config."""
     conditioning = part == "conditioning"
     names = SETTINGS | ({"latent_channels": "out_channels"} if conditioning else {})
     place = part if conditioning else f"{part}.encoder"
@@ -88,8 +88,8 @@ def _vae_folder(source: str, part: str) -> Path:
     local, is_id = Path(source).expanduser(), HUB_ID.fullmatch(source) is not None
     hub_id = source if is_id and not local.exists() else "CompVis/stable-diffusion-v1-4"
     advice = (
-        f"where there is a network, `hf download {hub_id} --local-dir DIR` fetches it (of a whole pipeline, "
-        f"`--include 'vae/*'` is enough); then give {part}.pretrained=DIR"
+        f"run `hf download {hub_id} --local-dir DIR` with network access (add `--include 'vae/*'` for the VAE of a "
+        f"whole pipeline); then give {part}.pretrained=DIR"
     )
     if not local.exists() and not is_id:
         raise WeightsError(f"{source}: no such folder; {advice}")

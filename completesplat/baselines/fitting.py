@@ -66,7 +66,7 @@ class RawGaussians:
 def initial_gaussians(
     views: Views, depth_range: Float[Tensor, "batch 2"], count: int, opacity: float, generator: torch.Generator
 ) -> RawGaussians:
-    """Return round Gaussians on the rays of random pixels, with a pixel's colour and its size at that depth.
+    """Return isotropic Gaussians on the rays of random pixels, each with its pixel's colour and footprint.
 
     Depths along each view's optical axis are uniform in the depth range, in scene units. The generator is on the CPU.
     """
@@ -121,7 +121,7 @@ def fit_gaussians(
 
 
 def _optimizer(raw: RawGaussians, settings: FittingSettings, depth_range: Tensor) -> torch.optim.Adam:
-    """Return Adam with 3DGS's epsilon (`gaussian_model.py`), which is small beside the gradients of a Gaussian."""
+    """Return Adam with 3DGS's epsilon (`gaussian_model.py`), which is small compared with a Gaussian's gradients."""
     # Half of the mean depth range: the spread of the initial Gaussians (3DGS uses the spread of the cameras).
     extent = (0.5 * (depth_range[:, 1] - depth_range[:, 0])).mean().item()
     rates = {name: settings.other_rates * rate for name, rate in RATES.items()}

@@ -1,9 +1,9 @@
 """External baseline of the benchmark: gsplat's torch implementation, with replacements for three of its parts.
 
-gsplat 1.5.3 has torch versions of its kernels for its tests (`gsplat/cuda/_torch_impl.py`). Its projection and its
-offsets of tiles are called unchanged. This module replaces `_isect_tiles`, because that is a Python loop over single
-Gaussians (seconds for a splatter image), and two parts of `_rasterize_to_pixels`, because that needs a CUDA operator
-for the pairs of Gaussians and pixels, and nerfacc for the weights along rays.
+gsplat 1.5.3 has torch versions of its kernels for its tests (`gsplat/cuda/_torch_impl.py`). This module calls their
+projection and tile offsets unchanged. It replaces `_isect_tiles`, because that loops in Python over single Gaussians
+(seconds for a splatter image). It also replaces two parts of `_rasterize_to_pixels`: the pairs of Gaussians and pixels
+need a CUDA operator there, and the weights along rays need nerfacc.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ BUDGET = 2**20  # pairs of Gaussians and pixels that are examined at once
 class GsplatTorchRasterizer:
     """gsplat's rasterizer for float32 tensors on the CPU, which renders all views of a scene together.
 
-    Unlike in the other rasterizers, values that are not finite spread.
+    Unlike the other rasterizers, this one does not keep non-finite values from spreading.
 
     Raises:
         CompleteSplatError: gsplat is not installed, or the frustum margin differs from the one built into gsplat.
@@ -42,7 +42,7 @@ class GsplatTorchRasterizer:
         self.gsplat: ModuleType = _torch_impl
         self.constants = constants or RenderingConstants()
         if self.constants.frustum_margin != FRUSTUM_MARGIN:
-            raise CompleteSplatError(f"gsplat's torch implementation has a frustum_margin of {FRUSTUM_MARGIN} only")
+            raise CompleteSplatError(f"frustum_margin: gsplat's torch implementation supports {FRUSTUM_MARGIN} only")
 
     def __call__(self, gaussians: Gaussians, cameras: Cameras) -> Rendering:
         """Render scenes [batch] from cameras [batch view]."""
@@ -52,9 +52,9 @@ class GsplatTorchRasterizer:
         (height, width), view = cameras.image_size, cameras.intrinsics.shape[0]
         splats = self._project(gaussians, cameras)
         grid = -(-height // TILE_SIZE), -(-width // TILE_SIZE)
-        keys, listed = intersect_tiles(splats, grid, view)
+        keys, indices = intersect_tiles(splats, grid, view)
         offsets = self.gsplat._isect_offset_encode(keys, view, grid[1], grid[0]).flatten()
-        numbers, pixels = pairs(splats.detach(), listed, offsets, grid, cameras.image_size, self.constants)
+        numbers, pixels = pairs(splats.detach(), indices, offsets, grid, cameras.image_size, self.constants)
 
         x, y = pixels % width, pixels // width % height
         deltas = torch.stack([x, y], dim=-1) + 0.5 - splats.centers[numbers]
@@ -87,7 +87,7 @@ class GsplatTorchRasterizer:
 
 @dataclass(frozen=True)
 class _Splats(TensorDataclass):
-    """Gaussians as seen by the cameras, [view gaussian] flattened; `channels` are blended: colour, depth and one."""
+    """Gaussians projected into all views, [view gaussian] flattened; `channels` are colour, depth and one."""
 
     centers: Float[Tensor, "splat 2"]
     radii: Integer[Tensor, "splat 2"]
@@ -101,43 +101,43 @@ class _Splats(TensorDataclass):
 def intersect_tiles(
     splats: _Splats, grid: tuple[int, int], views: int
 ) -> tuple[Int[Tensor, " entry"], Int[Tensor, " entry"]]:
-    """Replace `_isect_tiles`: return sorted keys (from the highest bit: view, tile, depth) and their splats."""
+    """Replace `_isect_tiles`: return sorted keys (view, tile, depth from the highest bit) and their splat indices."""
     rows, columns = grid
     none, limits = torch.tensor([0, 0]), torch.tensor([columns, rows])
     first = ((splats.centers - splats.radii) / TILE_SIZE).floor().long().clamp(none, limits)
     last = ((splats.centers + splats.radii) / TILE_SIZE).ceil().long().clamp(none, limits)
     wide, high = (last - first).unbind(1)
     counts = torch.where((splats.radii > 0).all(1), wide * high, 0)
-    listed = torch.repeat_interleave(counts)
-    rank = torch.arange(listed.numel()) - (counts.cumsum(0) - counts)[listed]
-    x, y = first[listed, 0] + rank % wide[listed], first[listed, 1] + rank // wide[listed]
-    view = listed // max(1, splats.depths.numel() // views)
+    indices = torch.repeat_interleave(counts)
+    rank = torch.arange(indices.numel()) - (counts.cumsum(0) - counts)[indices]
+    x, y = first[indices, 0] + rank % wide[indices], first[indices, 1] + rank // wide[indices]
+    view = indices // max(1, splats.depths.numel() // views)
     tile = (view << (rows * columns).bit_length()) | (y * columns + x)
     # Positive floats have the same order as their bits.
-    keys, order = ((tile << 32) | splats.depths.view(torch.int32)[listed].long()).sort(stable=True)
-    return keys, listed[order]
+    keys, order = ((tile << 32) | splats.depths.view(torch.int32)[indices].long()).sort(stable=True)
+    return keys, indices[order]
 
 
 @torch.no_grad()
 def pairs(
     splats: _Splats,
-    listed: Int[Tensor, " entry"],
+    indices: Int[Tensor, " entry"],
     offsets: Integer[Tensor, " tile"],
     grid: tuple[int, int],
     image_size: tuple[int, int],
     constants: RenderingConstants,
 ) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
-    """Replace `rasterize_to_indices_in_range`: return pairs of a blended splat and its pixel.
+    """Replace `rasterize_to_indices_in_range`: return indices of blended splats and the pixels that they cover.
 
-    The pairs of a pixel follow each other, front to back. Pixels are numbered [view height width].
+    The pairs of one pixel are adjacent, front to back. Pixels are numbered in the order [view height width].
     """
     (height, width), (rows, columns) = image_size, grid
-    counts = torch.cat([offsets[1:], offsets.new_tensor([listed.numel()])]) - offsets
+    counts = torch.cat([offsets[1:], offsets.new_tensor([indices.numel()])]) - offsets
     inside = torch.arange(TILE_SIZE**2)
-    blended = [(listed[:0], listed[:0])]
+    blended = [(indices[:0], indices[:0])]
     for tiles in _chunks(counts):
         rank = torch.arange(int(counts[tiles].max()))
-        numbers = listed[(offsets[tiles, None] + rank).clamp(max=listed.numel() - 1)]
+        numbers = indices[(offsets[tiles, None] + rank).clamp(max=indices.numel() - 1)]
         x = (tiles % columns * TILE_SIZE)[:, None] + inside % TILE_SIZE
         y = (tiles // columns % rows * TILE_SIZE)[:, None] + inside // TILE_SIZE
         deltas = torch.stack([x, y], dim=-1)[:, :, None] + 0.5 - splats.centers[numbers][:, None]
@@ -152,15 +152,15 @@ def pairs(
 
 
 def _chunks(counts: Integer[Tensor, " tile"]) -> Iterator[Int[Tensor, " t"]]:
-    """Yield groups of tiles with lists of similar lengths, whose padded lists stay within the budget."""
+    """Yield groups of tiles with lists of similar lengths, so that the padded lists stay within the budget."""
     lengths, order = counts.sort()
     tiles = order[lengths > 0]
     while tiles.numel():
         lengths = counts[tiles]
         size = torch.arange(1, tiles.numel() + 1) * lengths * TILE_SIZE**2
-        taken = max(1, int((size <= BUDGET).sum()))
-        yield tiles[:taken]
-        tiles = tiles[taken:]
+        count = max(1, int((size <= BUDGET).sum()))
+        yield tiles[:count]
+        tiles = tiles[count:]
 
 
 def _alphas(
@@ -176,9 +176,9 @@ def _alphas(
 
 
 def weights_along_rays(alphas: Float[Tensor, " pair"], pixels: Int[Tensor, " pair"]) -> Float[Tensor, " pair"]:
-    """Replace nerfacc's `render_weight_from_alpha`: return alpha times the transmittance before it, per pixel.
+    """Replace nerfacc's `render_weight_from_alpha`: return each alpha times the transmittance in front of it.
 
-    Transmittances are differences of one running sum of logarithms, in float64 because the sum spans all pixels.
+    Transmittances come from one running sum of logarithms, which is in float64 because it spans all pixels.
     """
     logs = torch.log1p(-alphas.double())
     before = logs.cumsum(0) - logs

@@ -68,7 +68,7 @@ COLUMNS: list[Column] = [
 
 @dataclass(frozen=True)
 class Way:
-    """A way of computing networks: precision, and mode of `torch.compile`; None does not compile."""
+    """Precision of the networks and mode of `torch.compile`; None does not compile them."""
 
     name: str
     precision: str
@@ -94,18 +94,18 @@ def run(
         data, stage1, stage2: configs of the data module and of both stages' modules.
         steps: number of steps of the sampler.
         repeats: number of timed calls of each kind of work.
-        samples: number of samples that are drawn of one image at once.
+        samples: number of samples that are drawn for one image at once.
         compile: whether to measure with `torch.compile` and with CUDA graphs as well.
         training: whether to measure optimizer steps of both stages as well.
-        channels: channels of the `encoder` and the `denoiser`, which tell whether the work is the paper's.
+        channels: channels of the `encoder` and the `denoiser`, to compare them with the paper's.
 
     Raises:
         CompleteSplatError: there is no GPU.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise CompleteSplatError(
-            "the paper's figures are a GPU's, and there is none here: device=cpu measures all the same, "
-            "autoreconstructor=tiny conditioning=learned denoiser=tiny in minutes"
+            "device=cuda: no GPU is available; measure with device=cpu, which takes minutes with "
+            "autoreconstructor=tiny conditioning=learned denoiser=tiny"
         )
     ways = [way for way in WAYS if compile or way.compile is None]
     quieten()
@@ -128,11 +128,11 @@ def run(
     work = {"image_size": loaded.image_size, "batch": loaded.batch_size, "samples": samples, "steps": steps}
     if is_as_in_the_paper(work, channels):
         rows = [{"paper_ms": figure.paper_ms, "aim_ms": figure.aim_ms} | row for figure, row in _with_figures(rows)]
-    described, workload = machine(), {"device": device, **work, "repeats": repeats}
-    write_json(out / "paper.json", {"machine": described, "workload": workload, "rows": rows})
+    hardware, workload = machine(), {"device": device, **work, "repeats": repeats}
+    write_json(out / "paper.json", {"machine": hardware, "workload": workload, "rows": rows})
     title = "{image_size} x {image_size} pixels, {samples} samples in {steps} steps, training batches of {batch}"
     printed = table(title.format(**work), COLUMNS, [row | {"text": figure.text} for figure, row in _with_figures(rows)])
-    print_results(described, device_name(described, device), [printed])
+    print_results(hardware, device_name(hardware, device), [printed])
 
 
 def _with_figures(rows: Sequence[Row]) -> list[tuple[Figure, Row]]:
@@ -149,7 +149,7 @@ def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training:
     """Return a row for each kind of work: median ms and, on a GPU, torch's peak memory in MB, weights included.
 
     If some work fails, for example because memory is short, its row has the reason instead. Optimizer steps are left
-    out with CUDA graphs, because these do not go together.
+    out with CUDA graphs, because the two do not work together.
     """
     results: list[Row] = []
     with compiled(networks(module), way):
@@ -162,7 +162,7 @@ def rows_of(module: Stage, scenes: SceneBatch, way: Way, samples: int, training:
 
 
 def measured(work: Work, repeats: int, device: torch.device) -> Row:
-    """Return the median time, and on a GPU the peak memory; or the reason why there are none."""
+    """Return the median time, and on a GPU the peak memory; or the reason why the work failed."""
     try:
         for _ in range(WARM_UP):
             work()
@@ -192,7 +192,7 @@ def compiled(networks: list[nn.Module], way: Way) -> Iterator[None]:
 
 
 def networks(module: Stage) -> list[nn.Module]:
-    """Return the parts that are called as a whole, which can be compiled."""
+    """Return the parts that can be compiled, because each is called as a whole."""
     if isinstance(module, LatentDiffusion):
         parts = module.completesplat
         frozen = parts.autoreconstructor
@@ -202,7 +202,7 @@ def networks(module: Stage) -> list[nn.Module]:
 
 
 def works_of(module: Stage, scenes: SceneBatch, precision: str, samples: int) -> dict[str, Work]:
-    """Return the work of a stage by name; inference is of the first scene, training of all."""
+    """Return the work of a stage by name; inference uses the first scene, training uses all."""
     step = _step(module, scenes, precision)
     if isinstance(module, LatentDiffusion):
         draw = partial(_draw, module, scenes[:1], precision)
@@ -239,7 +239,7 @@ def orbit_cameras(camera: Cameras, gaussians: Gaussians) -> Cameras:
 
 
 def _step(module: Stage, scenes: SceneBatch, precision: str) -> Work:
-    """Return an optimizer step on scenes, which stage 2 encodes in this time."""
+    """Return the work of an optimizer step; in stage 2 this includes encoding the scenes."""
 
     @cache
     def training() -> Training:  # made late, because its optimizer needs memory

@@ -89,7 +89,7 @@ def run(
 
     Args:
         backends: keys of `CLASSES`; those that do not work on this machine are skipped, with the reason.
-        sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
+        sizes, views: sides of the images in pixels and numbers of views; every combination is timed.
         repeats: number of timed calls of each backend.
         training_step: settings of the training steps; False skips them.
         model: config of the module whose steps are timed.
@@ -112,11 +112,11 @@ def run(
             for backend in [backend for backend in working if backend.name in training_step["backends"]]:
                 tick(f"a training step with {backend.name}")
                 steps.append(share(backend, model, size, batch, targets, training_step["precision"]))
-    described = machine()
-    results = {"machine": described, "not_measured": absent, "rows": rows}
+    hardware = machine()
+    results = {"machine": hardware, "not_measured": absent, "rows": rows}
     write_json(out / "rasterizers.json", results | ({"training_step": steps} if training_step else {}))
     tables = [table("Speed", SPEED, rows), *([table("Share of a training step", STEP, steps)] if steps else [])]
-    print_results(described, device_name(described), tables, absent)
+    print_results(hardware, device_name(hardware), tables, absent)
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
@@ -127,7 +127,7 @@ def working_backends(names: Sequence[str], constants: RenderingConstants) -> tup
     """
     for name in names:
         if name not in CLASSES:
-            raise CompleteSplatError(f"there is no backend {name!r} to time; there are {', '.join(CLASSES)}")
+            raise CompleteSplatError(f"backends: {name!r} does not exist; choose from {', '.join(CLASSES)}")
     backends, absent = [], {}
     for name in names:
         module, _, class_name = CLASSES[name].rpartition(".")
@@ -162,9 +162,9 @@ def speed_rows(
 def side_by_side(
     backends: Sequence[Backend], gaussians: Gaussians, cameras: Cameras, repeats: int
 ) -> dict[str, Figures]:
-    """Return the figures of each backend; backends take turns.
+    """Time the backends in turn, and return the figures of each.
 
-    The first rendering with its backward pass gives the memory. Its time counts only if there is no other rendering.
+    The memory is that of the first rendering with its backward pass, whose time counts only if there is no other.
     """
     pixels = cameras.image_size[0] * cameras.image_size[1] * cameras.intrinsics.shape[1]
     backends = [backend for backend in backends if backend.takes(gaussians.count, pixels)]
@@ -182,7 +182,7 @@ def side_by_side(
         if spent[backend.name] <= LONGEST_SECONDS:
             render(backend)
     results = {}
-    for name, taken in times.items():
-        forward, both = (statistics.median(column) for column in zip(*(taken[1:] or taken), strict=True))
+    for name, pairs in times.items():
+        forward, both = (statistics.median(column) for column in zip(*(pairs[1:] or pairs), strict=True))
         results[name] = Figures(forward, both, peaks[name])
     return results

@@ -32,7 +32,7 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
     metadata for the header; characters outside ASCII are escaped.
 
     Returns:
-        Number of Gaussians in the file, which omits those that cannot be stored.
+        Number of Gaussians in the file; those that cannot be stored are left out.
 
     Raises:
         CompleteSplatError: no Gaussian of a nonempty set can be stored.
@@ -44,10 +44,10 @@ def write_ply(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = 
 
 
 def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
-    """Return a row for each Gaussian, computed in float64 so that the stored float32 is the nearest one."""
+    """Return a row for each Gaussian, computed in float64 so that only the stored float32 is rounded."""
     g = gaussians.detach().to("cpu", torch.float64)
     logits = g.opacities.logit(SMALLEST_ALPHA)[:, None]
-    # A quaternion of unit length up to float32 rounding stays, because normalising it again would change its bits.
+    # Quaternions of unit length (up to float32 rounding) stay, because normalising them again would change bits.
     is_unit = (g.quaternions.square().sum(-1, keepdim=True) - 1).abs() < 1e-6
     rotations = torch.where(is_unit, g.quaternions, normalize_quaternion(g.quaternions))
     rows = [g.means, torch.zeros_like(g.means), (g.colors - 0.5) / SH_C0, logits, g.scales.log(), rotations]
@@ -57,8 +57,8 @@ def _table(gaussians: Gaussians) -> Float[Tensor, "gaussian 17"]:
 def read_ply(path: str | Path) -> Gaussians:
     """Read a 3DGS `.ply`, binary or ASCII, of this project or another.
 
-    Other properties (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0 become 0, as in the
-    renderers of these files.
+    Other properties (f_rest_*: the view-dependent part of the colour) are ignored. Colours below 0 become 0, as in
+    other 3DGS renderers.
 
     Raises:
         PlyError: `read_vertices` fails, or a value is not finite.

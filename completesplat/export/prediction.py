@@ -155,7 +155,7 @@ def _write_sample(
     wanted: Wanted,
     comments: Sequence[str],
 ) -> tuple[Float[Tensor, "view 3 height width"], Float[Tensor, "1 height width"], dict[str, str]]:
-    """Write a sample's splats and videos; return views around it, the depth in the first, and file names by purpose."""
+    """Write a sample's splats and videos; return views around it, the first view's depth, and file names by purpose."""
     pivot = seen_center(rasterizer, scene, reference)
     view = PageView(reference, pivot, up, wanted.background)
     stored = with_screen_space_dilation(scene, reference) if wanted.screen_space_dilation else scene
@@ -210,7 +210,7 @@ def contact_sheet(
 def write_maps(
     folder: Path, scenes: Sequence[Gaussians], camera: Cameras, rasterizer: Rasterizer
 ) -> tuple[dict[str, str], tuple[float, float]]:
-    """Write `depth_00.png`, `normals_00.png`, `opacity_00.png` and so on, which a camera sees of each scene.
+    """Write the depth, normals and opacity that a camera sees of each scene, as `depth_00.png` and so on.
 
     Depth is coloured by `color_depth`, on one scale for all scenes, normals by `color_normals`; both are grey where a
     pixel is at most half opaque. Opacity is white where a pixel is fully opaque.

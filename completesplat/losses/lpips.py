@@ -66,7 +66,7 @@ def load_vgg16(weights: str, sha256: str | None = None) -> VGG16Features:
         part = {key: value for key, value in tensors.items() if key.startswith("features.")}
     except Exception as error:
         raise WeightsError(f"{path}: not a readable state dict ({type(error).__name__}); {ADVICE}") from error
-    # On "meta", the network draws no random weights: a run's seed gives the same with and without this loss.
+    # On "meta", the network draws no random numbers, so this loss does not change those of the rest of the run.
     with torch.device("meta"):
         network = VGG16Features()
     if reason := mismatch(network.state_dict(), part):
@@ -108,7 +108,7 @@ class PerceptualDistance(nn.Module):
     def directions(self, images: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _ _ _"]]:
         """Return each layer's activations with unit length over the channels; zero where no channel is active."""
         activations = self.features((2 * images - 1 - self.shift) / self.scale)
-        # Unlike the square root of a sum, this norm has a finite gradient (zero) where all channels are zero.
+        # Where all channels are zero, the gradient of this norm is zero; that of a square root of a sum is not finite.
         norms = [torch.linalg.vector_norm(layer, dim=1, keepdim=True) for layer in activations]
         return [layer / (norm + SMALLEST_NORM) for layer, norm in zip(activations, norms, strict=True)]
 

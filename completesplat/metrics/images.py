@@ -22,7 +22,7 @@ ADVICE = "give torchvision's VGG16 as evaluation.scoring.perceptual.vgg_weights=
 
 @dataclass(frozen=True)
 class Missing:
-    """Reason why metrics cannot be measured here, and their names in results; nothing replaces them."""
+    """Metrics that cannot be measured: the reason, and the names that are absent from results."""
 
     reason: str
     names: tuple[str, ...]
@@ -34,7 +34,7 @@ class Missing:
 def unless_missing(
     weights: str | None, load: Callable[[str], Metric], advice: str, names: tuple[str, ...]
 ) -> Metric | Missing:
-    """Load the weights; without weights (reason: `advice`) or with unusable ones, return why `names` are missing."""
+    """Load a metric; return `Missing` with `advice` if `weights` is None, or with the error if they are unusable."""
     if weights is None:
         return Missing(advice, names)
     try:
@@ -54,7 +54,7 @@ def psnr(predicted: Images, true: Images) -> PerImage:
 def ssim(predicted: Images, true: Images) -> PerImage:
     """Return the structural similarity with a Gaussian window of 11 pixels, sigma 1.5, for values in [0, 1].
 
-    The mean is over all pixels; the window sees the image mirrored beyond its border, as in torchmetrics.
+    The mean is over all pixels; the image is mirrored beyond its border, as in torchmetrics.
     """
     from torchmetrics.functional.image import structural_similarity_index_measure
 

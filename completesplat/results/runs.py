@@ -20,9 +20,9 @@ SCORES, MODES = "metrics.json", "hidden_modes.json"
 RECORD, CONFIG, PLAN, SCENE = "run.json", "config.yaml", "multirun.yaml", "scene.json"
 ROWS = ("samplers.json", "controls.json", "depth.json", "views.json")
 """Files that `completesplat report NAME` writes beside its figure: settings and rows."""
-PROTOCOL = "protocol"  # the key of how results were measured, beside the entries of the predictors
+PROTOCOL = "protocol"  # key of the entry that says how results were measured; the others are predictors
 MODEL, UPPER_BOUND = "model", "upper_bound"
-"""Predictor of a run's model; and mark of a model that has seen the views that it is scored on."""
+"""Name of the predictor that is the run's model; key that marks a predictor that saw the views of its scores."""
 SEED = "seed"
 HOW = "make them with `completesplat test ckpt=RUN/checkpoints/last.ckpt out=DIR`"
 
@@ -39,7 +39,7 @@ class Record(TypedDict, total=False):
 
 
 class Protocol(TypedDict, total=False):
-    """Entries of a statement of how results were measured on which code depends; others are only printed."""
+    """Statement of how results were measured. Code reads the entries below; others are only printed."""
 
     name: str
     method: str
@@ -67,7 +67,7 @@ def read_record(folder: Path) -> Record:
 
 
 def flat(entry: Mapping[str, object]) -> Scores:
-    """Return a predictor's numbers in `Evaluation.results` by the joined keys of all levels, without nulls."""
+    """Flatten a predictor's entry in `Evaluation.results`: join the keys of all levels, and drop nulls."""
     scores: Scores = {}
     for key, value in entry.items():
         if isinstance(value, Mapping):
@@ -124,15 +124,19 @@ def find(folder: Path) -> RunTree:
 
 
 def _result(path: Path, root: Path) -> Result:
-    """Read a file of results; raise ValueError with the reason if it is unusable."""
+    """Read a file of results.
+
+    Raises:
+        ValueError: the file is unusable, with the reason.
+    """
     content = read_mapping(path)
     if not content:
         raise ValueError("it cannot be read as a mapping in JSON")
     test = content if path.name == MODES or PROTOCOL in content else content.get("test")
     entries = {key: flat(entry) for key, entry in _mapping(test).items() if isinstance(entry, Mapping)}
     entries.pop(PROTOCOL, None)
-    stated = read_mapping(path.with_name("protocol.json")) if path.name == MODES else _mapping(test).get(PROTOCOL)
-    protocol = _mapping(stated)
+    statement = read_mapping(path.with_name("protocol.json")) if path.name == MODES else _mapping(test).get(PROTOCOL)
+    protocol = _mapping(statement)
     needed = () if path.name == MODES else ("data_set", "resolution", "scenes")
     if not protocol or not all(key in protocol for key in needed):
         raise ValueError(f"it does not say how it was measured; {HOW}")
@@ -161,7 +165,7 @@ def typed(command: Sequence[str]) -> str:
 class Job:
     """Job of a sweep: its folder's name (empty before its start), `run.json` and `metrics.json`.
 
-    `test` and `protocol` are empty where nothing was tested. `label` is the job's name among those of its sweep.
+    `test` and `protocol` are empty where nothing was tested. `label` tells the job from the others of its sweep.
     """
 
     name: str
@@ -176,7 +180,7 @@ class Job:
 
 
 def collect(*folders: Path) -> list[Job]:
-    """Return all jobs of a sweep's folder, at the end those that have not started and have no folder yet.
+    """Return all jobs of a sweep's folder; those that have not started, and so have no folder, come last.
 
     Several folders are parts of one sweep on several machines. Settings that only locate a machine's files are then
     ignored, and if a job is in several parts, the one with the most progress is taken.
@@ -191,7 +195,7 @@ def _joined(parts: Sequence[list[Job]]) -> list[Job]:
     for number, jobs in enumerate(parts):
         for key, value in (pair for job in jobs for pair in job.overrides.items()):
             values.setdefault(key, [set() for _ in parts])[number].add(value)
-    # Settings with the same path everywhere in a part, and other paths in other parts.
+    # Settings whose value is a path that is the same in all jobs of a part and differs between the parts.
     local = {
         key
         for key, by_part in values.items()
@@ -209,7 +213,7 @@ def _jobs(folder: Path) -> list[Job]:
     recorded = [job for job in jobs if job.record]
     known = [job.overrides for job in recorded]
     waiting = [Job("", overrides) for overrides in map(_pairs, _planned(folder)) if overrides not in known]
-    # `waiting` includes jobs that ended before they wrote a record, so as many folders without one are left out.
+    # `waiting` also has the jobs that ended before their record, so that many folders without a record are left out.
     silent = [job for job in jobs if not job.record][len(waiting) :]
     return [*recorded, *silent, *waiting]
 
@@ -256,10 +260,10 @@ def _labelled(jobs: Sequence[Job]) -> list[Job]:
     The choice of a config group is named by its value alone (`no_skips`), any other setting as `key=value`. A job
     without differing overrides takes the name of its experiment, or `all`.
     """
-    described = [job.overrides for job in jobs if job.overrides]
-    keys = dict.fromkeys(key for overrides in described for key in overrides if key != SEED)
-    differing = [key for key in keys if len({overrides.get(key) for overrides in described}) > 1]
-    # A group fills a mapping of the config, or acts on all of it and leaves nothing under the group's name.
+    all_overrides = [job.overrides for job in jobs if job.overrides]
+    keys = dict.fromkeys(key for overrides in all_overrides for key in overrides if key != SEED)
+    differing = [key for key in keys if len({overrides.get(key) for overrides in all_overrides}) > 1]
+    # A config group's key holds a mapping, or is absent if the group changes the whole config.
     settings = {key for job in jobs for key, value in job.config.items() if not isinstance(value, dict)}
     named = []
     for job in jobs:

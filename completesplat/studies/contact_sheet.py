@@ -24,23 +24,23 @@ from completesplat.geometry.cameras import Cameras, project, transform_points, u
 
 CELL = 216
 GREY, MASK = (190, 190, 190), (255, 220, 0)
-LEGEND = """Images: one cross stands at one place of each scene and must stick to it;
+LEGEND = """Images: a cross marks one point of each scene and must stay at it in all frames;
 red: to the first camera's right, green: up, blue: ahead; yellow: mask.
-Cameras: black: the first, then dark blue to orange with time; the tick is the image's upper edge;
-grey bar: near to far of the first (without a tick: farther); right, up and ahead are the first camera's."""
+Cameras: the first is black, later ones go from dark blue to orange; a tick marks the image's upper edge;
+grey bar: depth range of the first (no end tick: cut off); right, up and ahead are the first camera's."""
 
-# In units of half the first image's width, as the first camera sees it.
+# Length of an arm as the first camera sees it, in units of half its image's width.
 ARM = 0.3
-# Root mean squares. The horizon follows from image axes that turn at least this much (radians). Cameras look at one
-# thing if their optical axes spread at least this much and miss their common point by at most this share of its depth.
+# Root mean squares. The image axes determine the horizon if they turn by at least LEAST_TURN (radians). Cameras look at
+# one point if their optical axes spread by at least LEAST_SPREAD and miss it by at most LARGEST_MISS of its depth.
 LEAST_TURN, LEAST_SPREAD, LARGEST_MISS = 0.1, 0.2, 0.2
-# Share of an arm's length; lines nearer to a camera's plane are not drawn.
+# Parts of lines that are nearer to a camera's plane are not drawn (as a share of an arm's length).
 NEAREST = 0.05
 
 
 @dataclass(frozen=True)
 class Cross:
-    """Three arms from one place; rows of `arms`: right, up and ahead."""
+    """Cross of three arms that start at `center`; the rows of `arms` are right, up and ahead."""
 
     center: Float[Tensor, "3"]
     arms: Float[Tensor, "3 3"]
@@ -81,7 +81,7 @@ def level_axes(cameras: Cameras) -> Float[Tensor, "3 3"]:
 def visible_segments(
     camera: Cameras, segments: Float[Tensor, "segment 2 3"], nearest: float
 ) -> list[tuple[int, Float[Tensor, "2 2"]]]:
-    """Return number and ends (pixels) of the segments before a camera [], cut off at the depth `nearest`."""
+    """Return index and ends (pixels) of each segment in front of a camera [], cut off at the depth `nearest`."""
     _, depths = project(camera, segments.flatten(0, 1))
     result = []
     for index, (ends, depth) in enumerate(zip(segments, depths.reshape(-1, 2), strict=True)):
@@ -94,7 +94,7 @@ def visible_segments(
 
 
 def _common_point(cameras: Cameras) -> Float[Tensor, "3"] | None:
-    """Return the point nearest to all optical axes, if they pass close to it, from several sides, and face it."""
+    """Return the point nearest to all optical axes, or None if they miss it, face away or are almost parallel."""
     forward, centers = cameras.world_to_camera[:, 2, :3], cameras.centers
     across = torch.eye(3).to(forward) - forward[:, :, None] * forward[:, None, :]
     mean = across.mean(dim=0)
@@ -127,7 +127,7 @@ def frusta(cameras: Cameras, depth: float) -> Float[Tensor, "view 7 3"]:
 
 
 def drawn_range(sequence: PosedSequence, cross: Cross) -> tuple[Float[Tensor, "2 3"], bool]:
-    """Return the ends of the first camera's depth range, and whether far is beyond the drawings."""
+    """Return the ends of the first camera's depth range as drawn, and whether the far end is cut off."""
     cameras, centers = sequence.cameras, sequence.cameras.centers
     near, far = sequence.depth_ranges[0].tolist()
     reach = REACH * max(near, _extent(centers), (cross.center - centers[0]).norm().item())
@@ -138,7 +138,7 @@ def drawn_range(sequence: PosedSequence, cross: Cross) -> tuple[Float[Tensor, "2
 def drawings(sequence: PosedSequence, cross: Cross, side: int) -> dict[str, UInt8[np.ndarray, "side side 3"]]:
     """Draw cameras, depth range and cross in the units of the scene, as seen in each of `VIEWS`.
 
-    Right, up and ahead are the first camera's, levelled. Colours of cameras tell the time.
+    The axes are those of `level_axes`. The cameras' colours show their order in time.
     """
     axes, centers = level_axes(sequence.cameras), sequence.cameras.centers
     depth_range, cut = drawn_range(sequence, cross)
@@ -209,15 +209,15 @@ def _row(sequence: PosedSequence, images: int) -> Image.Image:
 
 
 def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
-    """Return an image with the cross; the label states if the cross is not in the image."""
+    """Return an image with the cross drawn into it; the label says so if the cross lies outside."""
     label = f"frame {sequence.frames[index]}"
     try:
-        picture = sequence.read(index)
+        frame = sequence.read(index)
     except DataError as error:
         cell = Image.new("RGB", (CELL, CELL), GREY)
         ImageDraw.Draw(cell).text((MARGIN, CELL // 2), error.kind, INK, ImageFont.load_default(size=13))
         return SheetCell(_tensor(cell), label)
-    cell = _with_outline(picture)
+    cell = _with_outline(frame)
     camera, draw = sequence.cameras[index], ImageDraw.Draw(cell)
     nearest = NEAREST * cross.arms.norm(dim=-1)[0].item()
     arms = visible_segments(camera, cross.ends(), nearest)
@@ -229,11 +229,11 @@ def _image_cell(sequence: PosedSequence, index: int, cross: Cross) -> SheetCell:
     return SheetCell(_tensor(cell), label + ("" if inside else ": cross outside" if arms else ": cross behind"))
 
 
-def _with_outline(picture: MaskedImage) -> Image.Image:
-    """Resize an image to a cell, with a line where the mask crosses one half."""
-    pixels = _resized(picture.image.permute(1, 2, 0).numpy()).copy()
-    if picture.mask is not None:
-        inside = _resized(picture.mask[0].numpy()) >= 128
+def _with_outline(frame: MaskedImage) -> Image.Image:
+    """Resize an image to a cell, and outline the region where the mask is at least one half."""
+    pixels = _resized(frame.image.permute(1, 2, 0).numpy()).copy()
+    if frame.mask is not None:
+        inside = _resized(frame.mask[0].numpy()) >= 128
         padded = np.pad(inside, 1, mode="edge")
         neighbors = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
         pixels[inside & ~neighbors] = MASK

@@ -1,4 +1,4 @@
-"""Images of a few fixed scenes while a model trains, and figures of its Gaussians, latents and samples."""
+"""Callbacks that draw a few fixed scenes while a model trains, and log figures of its Gaussians and samples."""
 
 import json
 from abc import abstractmethod
@@ -43,8 +43,8 @@ class DrawsFixedScenes(Callback):
 
     Args:
         folder, scenes: folder of the images, and the number of scenes in them.
-        every_n_steps: optimizer steps between drawings; there is another one at the end of training.
-        views: targets of a scene, evenly spread over all its targets; all, if these are fewer.
+        every_n_steps: optimizer steps between drawings; the last drawing is at the end of training.
+        views: number of targets drawn for each scene, evenly spread over its targets; all if it has fewer.
     """
 
     def __init__(self, folder: str, every_n_steps: int, scenes: int, views: int) -> None:
@@ -87,7 +87,7 @@ class DrawsFixedScenes(Callback):
 
 @contextmanager
 def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
-    """Switch to evaluation, with averaged weights if there are any, and restore everything, random numbers too."""
+    """Switch to evaluation mode and averaged weights, if any; then restore them and the random generators."""
     modes = {part: part.training for part in module.modules()}
     devices = [module.device] if module.device.type == "cuda" else []
     with torch.no_grad(), torch.random.fork_rng(devices), ExitStack() as contexts:
@@ -103,7 +103,7 @@ def untouched(trainer: Trainer, module: LightningModule) -> Iterator[None]:
 
 
 def fixed_scenes(batches: Iterable[SceneBatch], count: int, views: int = 1) -> list[SceneBatch]:
-    """Return the first scenes of the batches, with some of their targets."""
+    """Return the first `count` scenes of the batches, each with `views` of its targets."""
     scenes = (batch[index] for batch in batches for index in range(len(batch.names)))
     return [replace(scene, targets=scene.targets[_spread(scene, views)]) for scene in islice(scenes, count)]
 
@@ -114,11 +114,11 @@ def _spread(scene: SceneBatch, views: int) -> list[int]:
 
 
 class Pictures(DrawsFixedScenes):
-    """Callback that draws the first target of each scene and figures of its Gaussians; see `DrawsFixedScenes`.
+    """Callback that draws the first target of each scene and logs figures of its Gaussians; see `DrawsFixedScenes`.
 
-    `folder/step_000500.png` has a row for each scene (`scene_panels`), `folder/newest/` the scenes themselves
-    (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`; Weights &
-    Biases also gets the image.
+    `folder/step_000500.png` has a row for each scene (`scene_panels`); `folder/newest/` holds the scenes
+    themselves (`write_newest`). All loggers get `gaussian_figures`, `layer_figures` and the model's `latent_figures`;
+    Weights & Biases also gets the image.
     """
 
     def __init__(self, folder: str, every_n_steps: Positive = 1000, scenes: Natural = 4) -> None:
@@ -139,30 +139,30 @@ class Pictures(DrawsFixedScenes):
 
 
 def write_newest(folder: Path, step: int, gaussians: Gaussians, scenes: SceneBatch, up: Float[Tensor, "3"]) -> None:
-    """Write the scenes [batch] as `scene_0.ply` and so on, and `scenes.json`, over those of an earlier step.
+    """Write scenes [batch] as `scene_0.ply`, ..., and `scenes.json`, and replace those of an earlier step.
 
-    The JSON holds `step`, `up`, and for each file its name, its `scene` and its `reference_camera`. Gaussians are as in
+    The JSON holds `step`, `up`, and each file's name, `scene` and `reference_camera`. Gaussians are dilated as in
     predictions. A scene without storable Gaussians is left out.
     """
     make_folder(folder)
-    described = []
+    entries = []
     for index, name in enumerate(scenes.names):
         scene, camera = gaussians[index].to("cpu", torch.float32), scenes.reference.cameras[index].to("cpu")
         selected = scene.keep(storable(scene))
         if selected.count:
             file = f"scene_{index}.ply"
             write_ply(folder / file, with_screen_space_dilation(selected, camera), [f"scene {name}", f"step {step}"])
-            described.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
-    summary = {"step": step, "up": up.tolist(), "scenes": described}
+            entries.append({"file": file, "scene": name, "reference_camera": plain_camera(camera)})
+    summary = {"step": step, "up": up.tolist(), "scenes": entries}
     write_text(folder / "scenes.json", json.dumps(summary, indent=2) + "\n")
 
 
 def scene_panels(
     rasterizer: Rasterizer, gaussians: Gaussians, scenes: SceneBatch, background: float
 ) -> dict[str, Float[Tensor, "batch 3 height width"]]:
-    """Return input and first target, renders of the Gaussians [batch] from the target's camera, and of each layer.
+    """Return input, first target, and renders of all Gaussians [batch] and of each layer from the target's camera.
 
-    The error is the mean absolute difference of the colours, times 4. Each scene has a separate scale of depth.
+    The error is the mean absolute difference of the colours, times 4. Each scene has a separate colour scale of depth.
     """
     target = scenes.targets[:, :1]
 
@@ -191,7 +191,7 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
     """Return each layer's mean opacity on the object, and mean distance behind the first layer.
 
     Keys are `layers/opacity_1`, ... and `layers/behind_2`, ... (in scene units along the reference's optical axis). A
-    layer whose opacity goes to zero is dead: it shows nothing of what is hidden.
+    layer whose opacity goes to zero is dead: it adds no hidden surfaces.
     """
     size, on_object = scenes.reference.images.shape[-2:], scenes.reference.masks[:, 0]
     layers = gaussians.map(lambda tensor: tensor.view(len(tensor), -1, *size, *tensor.shape[2:]))  # by pixels
@@ -205,7 +205,7 @@ def layer_figures(gaussians: Gaussians, scenes: SceneBatch) -> dict[str, float]:
 
 
 def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
-    """Return percentiles of opacities, decimal logarithms of all scales, and depths in the reference's frame.
+    """Return percentiles of the opacities, of log10 of the scales, and of the depths in the reference's frame.
 
     Keys are `gaussians/opacity_p10`, `gaussians/log10_scale_p50` and so on; depths are in scene units.
     """
@@ -222,7 +222,7 @@ def gaussian_figures(gaussians: Gaussians) -> dict[str, float]:
 
 def log_drawings(trainer: Trainer, figures: dict[str, float], name: str, image: Image.Image) -> None:
     """Log figures to all loggers, and an image to Weights & Biases."""
-    step = trainer.global_step - 1  # Lightning's step of a row is the number of optimizer steps before it
+    step = trainer.global_step - 1  # Lightning numbers a row by the optimizer steps before it
     for logger in trainer.loggers:
         logger.log_metrics(figures, step=step)
         if isinstance(logger, WandbLogger):
@@ -240,7 +240,7 @@ class Samples(DrawsFixedScenes):
     `samples/psnr` (mean over the samples) and `samples/psnr_of_mean` (of their mean image).
 
     Args:
-        samples: samples of a scene, always from the same noise.
+        samples: number of samples of each scene, always from the same noise.
     """
 
     def __init__(
@@ -255,10 +255,10 @@ class Samples(DrawsFixedScenes):
         self.samples = samples
 
     def draw(self, trainer: Trainer, module: Stage, scenes: list[SceneBatch]) -> None:
-        drawn = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
-        sheet = samples_sheet(drawn)
+        drawings = [self._draw_scene(trainer, module, stack([scene]).to(module.device)) for scene in scenes]
+        sheet = samples_sheet(drawings)
         write_png(self.folder / f"step_{trainer.global_step:06}.png", sheet)
-        scores = [scene.scores() for scene in drawn]
+        scores = [scene.scores() for scene in drawings]
         figures = {f"samples/{name}": sum(values[name] for values in scores) / len(scores) for name in scores[0]}
         log_drawings(trainer, figures, "samples", sheet)
 
@@ -289,10 +289,10 @@ class SceneDrawings:
         return scores | {"diversity": diversity(images)} if len(images) > 1 else scores
 
 
-def samples_sheet(drawn: list[SceneDrawings]) -> Image.Image:
+def samples_sheet(drawings: list[SceneDrawings]) -> Image.Image:
     """Draw a sheet with a column for each view; views that a scene lacks stay white."""
     rows: list[list[SheetCell | None]] = []
-    for scene in drawn:
+    for scene in drawings:
         labelled = {"true": scene.true, **{f"sample {n}": images for n, images in enumerate(scene.samples, 1)}}
         for name, images in (labelled | {"depth of 1": color_depth(scene.depth[0])[0]}).items():
             first, *others = images.nan_to_num()  # values that are not finite are black

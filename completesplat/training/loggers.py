@@ -15,8 +15,8 @@ from completesplat.files import write_text, writing
 class ContinuedCSVLogger(CSVLogger):
     """Logger that writes each row to `metrics.csv` at once, so that a killed run loses no rows.
 
-    A resumed run keeps the file's rows before the step of its checkpoint and before the first new row, because it
-    repeats the steps after its last checkpoint.
+    A resumed run repeats the steps after its last checkpoint. It therefore keeps only those of the file's rows that
+    come before the step of its checkpoint and before the first new row.
     """
 
     def __init__(self, save_dir: str) -> None:
@@ -32,7 +32,7 @@ class ContinuedCSVLogger(CSVLogger):
 
 
 class MetricsFile(ExperimentWriter):
-    """Rows of numbers that are appended to `metrics.csv`; a new column replaces the whole file."""
+    """Writer that appends rows to `metrics.csv`, or replaces the whole file when there is a new column."""
 
     def __init__(self, log_dir: str) -> None:
         super().__init__(log_dir)
@@ -44,7 +44,11 @@ class MetricsFile(ExperimentWriter):
         """Keep the old file until it is replaced; Lightning would delete it here."""
 
     def save(self) -> None:
-        """Write the rows that are not written yet; raise DiskError if the disk refuses."""
+        """Write the rows that are not written yet.
+
+        Raises:
+            DiskError: the disk is full, or the folder no longer exists.
+        """
         if not self.metrics:
             return
         new = set().union(*self.metrics) - set(self.metrics_keys)

@@ -1,4 +1,4 @@
-"""The page: its viewing controls, its worker thread, and the files that it saves."""
+"""The viewer's page: its controls, its worker thread, and the files that it saves."""
 
 import logging
 import threading
@@ -96,7 +96,7 @@ class Saver:
         self._converter = cache(find_splat_transform)
 
     def save(self, kind: str, samples: Sequence[Sample]) -> list[Path]:
-        """Write samples in one of the formats or as videos; `html` is the page as it stands.
+        """Write samples in one of the formats or as videos; the kind `html` saves the current page.
 
         Raises:
             CompleteSplatError: there are no samples, or `write_formats` fails.
@@ -128,7 +128,7 @@ class Saver:
         return path
 
     def _video(self, sample: Sample) -> Path:
-        """Write a video of a full turn about a sample."""
+        """Write a video of a full turn around a sample."""
         path = self._next("orbit", ".mp4")
         camera = sample.reference
         up = camera.intrinsics.new_tensor(self.view.up.tolist())
@@ -143,7 +143,7 @@ class Saver:
 
 
 class Page:
-    """Controls and scene of one server, with switches for `layers`. Slow work is done by the worker."""
+    """Controls and scene of one server, with a switch for each of `layers` layers. Its worker does the slow work."""
 
     def __init__(self, server: GuardedServer, view: SplatView, saver: Saver, layers: int) -> None:
         self.server, self.view, self.saver = server, view, saver
@@ -168,8 +168,8 @@ class Page:
 
     def _draw_thumbnails(self, samples: Sequence[Sample]) -> None:
         """Render thumbnails in the worker's thread; a single sample needs none."""
-        few = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
-        self._thumbnails = [self.saver.thumbnail(sample, THUMBNAIL) for sample in few]
+        first = samples[:MOST_THUMBNAILS] if len(samples) > 1 else []
+        self._thumbnails = [self.saver.thumbnail(sample, THUMBNAIL) for sample in first]
         self._mark_thumbnail()
 
     def _mark_thumbnail(self) -> None:

@@ -27,7 +27,7 @@ def test_a_hub_id_while_offline_says_how_to_fetch_it(monkeypatch, tmp_path):
     ("changes", "difference", "setting"),
     [
         ({"channels": (16, 16, 16, 16)}, "weight is [8, 3, 3, 3] there and [16, 3, 3, 3] here", "channels=[8,8,16,16]"),
-        ({"norm_groups": 8}, "4 groups and 8 here", "norm_groups=4"),  # every shape fits
+        ({"norm_groups": 8}, "4 groups, not 8", "norm_groups=4"),  # every shape fits
     ],
 )
 def test_another_size_names_the_difference_and_the_setting(folder, changes, difference, setting):
@@ -39,7 +39,7 @@ def test_another_size_names_the_difference_and_the_setting(folder, changes, diff
 def test_another_activation_is_refused(folder):
     path = folder / "config.json"
     path.write_text(path.read_text().replace('"silu"', '"gelu"'))
-    assert "its activation is gelu and silu here" in refusal(folder)
+    assert "its activation is gelu, not silu" in refusal(folder)
 
 
 def test_tensors_missing_or_too_many_are_named(folder):
@@ -71,4 +71,4 @@ def test_a_folder_without_its_files_says_which_are_needed(folder, name):
 @pytest.mark.parametrize("text", ["", "[1]"])
 def test_a_damaged_config_is_refused(folder, text):
     (folder / "config.json").write_text(text)
-    assert f"{folder}: damaged, or no VAE" in refusal(folder)
+    assert f"{folder}: damaged, or not a VAE" in refusal(folder)

@@ -85,4 +85,4 @@ def test_a_refusal_is_one_line_and_status_two(command, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     finished = command("bench", "paper", "device=cuda", f"out={tmp_path / 'out'}")
     assert finished.status == 2
-    assert finished.err.splitlines()[-1].startswith("error: the paper's figures are a GPU's, and there is none here")
+    assert finished.err.splitlines()[-1].startswith("error: device=cuda: no GPU is available")

@@ -50,7 +50,7 @@ def test_it_is_frozen_and_stays_in_evaluation_mode():
     [
         ({"channels": (8, 8, 8, 8)}, "there and [8, ", "conditioning.channels=[8,8,16,16]"),
         ({"out_channels": 8}, "there and [16, ", "conditioning.out_channels=4"),
-        ({"norm_groups": 8}, "4 groups and 8 here", "conditioning.norm_groups=4"),
+        ({"norm_groups": 8}, "4 groups, not 8", "conditioning.norm_groups=4"),
     ],
 )
 def test_another_size_names_the_conditionings_settings(folder, change, reason, setting):

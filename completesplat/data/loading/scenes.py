@@ -19,7 +19,7 @@ from completesplat.errors import DataError
 from completesplat.scene import CachedScene, SceneBatch, Views
 from completesplat.tensors import stack
 
-ATTEMPTS = 10  # Items that are tried until one can be read.
+ATTEMPTS = 10  # Number of items that are tried before none is returned.
 
 Choice = tuple[int, list[int]]  # reference, targets
 
@@ -27,7 +27,7 @@ Choice = tuple[int, list[int]]  # reference, targets
 class Loaded(NamedTuple):
     """A scene or a batch of scenes, and the errors of those that could not be read.
 
-    `refused_depths` are the errors of scenes that lack their true depth although the data set has it.
+    `refused_depths` are the errors of scenes whose true depth exists but could not be read.
     """
 
     scenes: SceneBatch | CachedScene | None
@@ -39,9 +39,9 @@ class SceneStore:
     """Scenes from those sequences of a source that `names` lists, in this order.
 
     Args:
-        mask_threshold: masks are 1 where the foreground probability reaches it, else 0; None: they stay soft.
+        mask_threshold: masks are 1 where the foreground probability reaches it, else 0; None keeps soft masks.
         cache: keep decoded images (uint8) in memory after their first use.
-        background: grey value (0 to 1) that replaces the background of images with a mask; None: it stays.
+        background: grey value (0 to 1) that replaces the background of images with a mask; None keeps it.
     """
 
     def __init__(
@@ -59,17 +59,17 @@ class SceneStore:
         self._cache: dict[tuple[str, int], MaskedImage] | None = {} if cache else None
 
     def scene(self, sequence: PosedSequence, reference: int, targets: Sequence[int]) -> SceneBatch:
-        """Return the scene of the frames with these indices in the reference camera's frame, if all can be read."""
+        """Return the scene of the views with these indices, in the reference camera's coordinates."""
         views = [reference, *targets]
         pairs = [self._read(sequence, view) for view in views]
-        images, masks = _shares([pair.image for pair in pairs]), self._masks(pairs)
+        images, masks = _as_floats([pair.image for pair in pairs]), self._masks(pairs)
         cameras = sequence.cameras[views].relative_to(sequence.cameras[reference]).to(torch.float32)
-        seen, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
+        loaded, visible = Views(images, cameras, masks), torch.ones_like(masks[0])
         ranges, frame = sequence.depth_ranges[reference], torch.tensor(reference)
-        return SceneBatch(seen[0], seen[1:], ranges, visible, frame, sequence.name)
+        return SceneBatch(loaded[0], loaded[1:], ranges, visible, frame, sequence.name)
 
     def image(self, sequence: PosedSequence, view: int) -> UInt8[Tensor, "3 height width"]:
-        """Return one image, if it can be read."""
+        """Return the image of one view."""
         return self._read(sequence, view).image
 
     def _read(self, sequence: PosedSequence, view: int) -> MaskedImage:
@@ -82,7 +82,7 @@ class SceneStore:
 
     def _masks(self, pairs: Sequence[MaskedImage]) -> Float[Tensor, "view 1 size size"]:
         everywhere = torch.full_like(pairs[0].image[:1], 255)
-        masks = _shares([everywhere if pair.mask is None else pair.mask for pair in pairs])
+        masks = _as_floats([everywhere if pair.mask is None else pair.mask for pair in pairs])
         return masks if self.mask_threshold is None else (masks >= self.mask_threshold).float()
 
     def _on_background(self, pair: MaskedImage) -> MaskedImage:
@@ -93,8 +93,8 @@ class SceneStore:
         return pair._replace(image=torch.from_numpy(mixed.astype(np.uint8)))
 
 
-def _shares(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
-    # NumPy, because torch would start its threads for little work, and they would block cores that others need.
+def _as_floats(images: Sequence[UInt8[Tensor, "_ size size"]]) -> Float[Tensor, "view _ size size"]:
+    # NumPy, because torch would start threads for this little work, and they would block other processes' cores.
     return torch.from_numpy(np.divide([image.numpy() for image in images], 255, dtype=np.float32))
 
 
@@ -105,7 +105,7 @@ class TrainingScenes(Dataset[Loaded]):
 
     Args:
         choose: (number of frames, epoch, random generator) -> views.
-        references: items of each sequence in one epoch.
+        references: number of items of each sequence in one epoch.
     """
 
     def __init__(
@@ -140,16 +140,16 @@ class TrainingScenes(Dataset[Loaded]):
         return Loaded(None, tuple(refused))
 
     def draw(self, name: str, epoch: int, rng: np.random.Generator) -> SceneBatch | CachedScene:
-        """Draw random views of the sequence `name` and return them as a scene, if all can be read."""
+        """Return a scene of random views of the sequence `name`."""
         sequence = self.store.source.read(name)
         scene = self.store.scene(sequence, *self.choose(len(sequence.frames), epoch, rng))
         return self.augment(scene, rng)
 
     def groups(self) -> list[list[int]]:
-        """Return groups of items that are best loaded one after the other."""
-        several = range(self.references)
+        """Return groups of item indices; the items of a group are best loaded one after the other."""
+        offsets = range(self.references)
         groups = self.store.source.groups(self.store.names)
-        return [[name * self.references + i for name in group for i in several] for group in groups]
+        return [[name * self.references + i for name in group for i in offsets] for group in groups]
 
 
 class EvaluationScenes(Dataset[Loaded]):
@@ -158,7 +158,7 @@ class EvaluationScenes(Dataset[Loaded]):
     Args:
         choose: sequence -> views; it raises a DataError if the sequence lacks one of them.
         names: sequences to evaluate; None: all.
-        seen: makes the smaller images that the model sees; None: it sees the images of `store`.
+        seen: store of the smaller images that the model sees; None: it sees the images of `store`.
         depths: also read the true depth if the data set has it.
     """
 

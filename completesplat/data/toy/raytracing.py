@@ -11,7 +11,7 @@ from numba import njit
 
 from completesplat.data.toy.shapes import BOX, CHECKS, ELLIPSOID, FRUSTUM, RIPPLES, STRIPES, Array, Shapes
 
-# Faces of the surroundings: of a room (across x, y and z, the lower one first), or the ground and the dome.
+# Numbers of faces. A room has two across each of x, y and z, the lower one first; else there are a ground and a dome.
 FLOOR, CEILING = 2, 3
 WALLS = (0, 1, 4, 5)
 GROUND, DOME = 6, 7
@@ -22,9 +22,9 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 class Light(NamedTuple):
-    """Light in the direction `place`, or at this point, and ambient light.
+    """Ambient light, and direct light from the direction `place`, or from the point `place` if `is_point`.
 
-    `sky` is the share of the ambient light that comes from above, `shadow` the share of direct light in shadows.
+    `sky` is the share of the ambient light from above, and `shadow` is the share of direct light that shadows keep.
     """
 
     place: Array
@@ -35,7 +35,7 @@ class Light(NamedTuple):
 
 
 class Dome(NamedTuple):
-    """Ground plane at height `ground` (two colours, pattern) and a dome (palette) over it.
+    """Ground plane at height `ground` with two colours and a pattern, under a dome with a palette.
 
     The dome's hue is `hue` + 0.17 sin(azimuth - `turn`), with panels of the same phase. This law is the same in all
     scenes, so that the dome behind a camera can partly be inferred from the one in front. A `plain` dome is grey.
@@ -51,7 +51,7 @@ class Dome(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """Disc on the first part where the cosine between the normal and the direction `facing` exceeds `edge`.
+    """Disc on an object's first part: its normals have a cosine above `edge` with the direction `facing`.
 
     `heights` is the local range of y that it may cover.
     """
@@ -87,7 +87,7 @@ def compiled(function: F, cache: bool = True, forceinline: bool = False) -> F:
     return machine_code
 
 
-# Passing a tuple of arrays to a function that is not inlined costs as much as hitting a sphere.
+# Passing a tuple of arrays to a function that is not inlined costs as much as intersecting a sphere.
 inlined = partial(compiled, cache=False, forceinline=True)
 
 
@@ -175,7 +175,7 @@ def _hit_cube(ox, oy, oz, dx, dy, dz):
 
 @inlined
 def _hit_shapes(shapes, ox, oy, oz, dx, dy, dz):
-    """Return the nearest shape along a ray: distance (in lengths of the direction), shape (or -1), local normal."""
+    """Return the nearest shape along a ray: distance (in units of the direction), shape (or -1), local normal."""
     nearest, shape, nx, ny, nz = np.inf, -1, 0.0, 0.0, 0.0
     balls = shapes.bounding_balls
     square = dx * dx + dy * dy + dz * dz
@@ -331,7 +331,7 @@ def _brightness(shapes, light, x, y, z, nx, ny, nz):
 def _shade(shapes, light, dome, patch, room, ox, oy, oz, dx, dy, dz):
     """Return colour, distance and shape (-1: none) along a ray."""
     t, shape, hx, hy, hz = _hit_shapes(shapes, ox, oy, oz, dx, dy, dz)
-    # Either the dome or the room is None. Numba removes the branch on what is None when it compiles.
+    # Either the dome or the room is None. Numba compiles no code for the one that is None.
     far, face, nx, ny, nz = np.inf, 0, 0.0, 0.0, 0.0
     if dome is not None:
         far, face, nx, ny, nz = _hit_dome(dome, ox, oy, oz, dx, dy, dz)
@@ -386,8 +386,8 @@ def trace(
 ) -> tuple[Array, Array, Array]:
     """Render colours [pixel 3], coverage by shapes [pixel] and distances [pixel] for the pose `camera_to_world`.
 
-    Colours and coverage are means over each pixel's `rays` [pixel sample 3], which are in the camera's frame, and of
-    unit length in a dome. The distance is the middle ray's, in lengths of this ray.
+    The `rays` [pixel sample 3] are in the camera's frame and, in a dome, have unit length. Colours and coverage are
+    means over a pixel's rays. The distance is measured along the middle ray, in units of its length.
     """
     dome, patch, room = (None, None, surroundings) if isinstance(surroundings, Room) else (*surroundings, None)
     traced: tuple[Array, Array, Array] = _trace(shapes, light, dome, patch, room, pose, rays)

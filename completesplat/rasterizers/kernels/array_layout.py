@@ -1,7 +1,7 @@
 """Columns of the arrays that kernels pass to each other.
 
 prepared   [17 lane] float32: values that do not depend on the view; padded to a multiple of 16 with Gaussians that are
-           left out
+           not drawn
 records    [gaussian 16] float32: the visible Gaussians of one view, packed front to back, one cache line each
 gradients  [gaussian 16] float32: sums over the pixels of one view, at the Gaussian's row in the scene
 camera     [20] float64
@@ -15,7 +15,7 @@ rounding, and row bounds follow from it directly. Alpha is then 2^(LOG2_OPACITY 
 MEAN = 0  # 3
 ROOT = 3  # 9, row-major: R(quaternion) diag(scales), whose square is the covariance
 LOG2_OPACITY_AND_COLOR = 12  # 4, as in the records
-REACH = 16  # the largest u^2 + v^2 at which alpha is not below min_alpha; negative if the Gaussian is left out
+REACH = 16  # the largest u^2 + v^2 at which alpha >= min_alpha; negative if the Gaussian is not drawn
 PREPARED_WIDTH = 17
 
 # records
@@ -29,11 +29,11 @@ INDEX = 14  # as int32: the Gaussian's row in the scene
 RECORD_WIDTH = 16
 
 # gradients
-SUM_COLOR = 0  # 3 columns; sums of weight times gradient of each of the three colour images
+SUM_COLOR = 0  # 3 columns; sums of weight times the gradient of a colour channel
 SUM_DEPTH = 3
 SUM_S = 4  # s is -dL/dsigma at a pixel
 SUM_SU, SUM_SV, SUM_SUU, SUM_SUV, SUM_SVV = 5, 6, 7, 8, 9
-REACHED = 10  # 1 if any pixel was reached; the other columns are undefined where this is 0
+REACHED = 10  # 1 if the Gaussian reaches any pixel; if 0, the other columns are undefined
 GRADIENT_WIDTH = 16
 
 # camera
@@ -48,6 +48,6 @@ GRAD_CAMERA_WIDTH = 16  # the same columns up to PRINCIPAL_Y
 BLOCK = 4
 BLOCK_SHIFT = 2
 
-# Blocks are chosen for alphas down to 2^-SLACK of the threshold (1e-4 below it), because rounding in this choice must
-# not lose a pixel. The test at the pixel itself decides.
+# A Gaussian's blocks are chosen with the threshold of alpha times 2^-SLACK (1e-4 below it), so that rounding in this
+# choice loses no pixel. The test at each pixel uses the threshold itself.
 SLACK = 1.5e-4
