@@ -1,4 +1,4 @@
-"""`completesplat bench rasterizers`: speed of the backends."""
+"""`completesplat bench rasterizers`: speed and memory of the backends, and their share of a training step."""
 
 import statistics
 import time
@@ -6,15 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypedDict
 
 from hydra.utils import instantiate
 from rich.console import Console
 
 from completesplat.benchmarks.measuring import Row, device_name, print_results
+from completesplat.benchmarks.training_step import share
 from completesplat.benchmarks.workloads import (
     OPACITIES,
     Backend,
+    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
@@ -28,8 +30,10 @@ from completesplat.results.machine import machine
 from completesplat.results.tables import Column, table
 from completesplat.settings.schema import Positive
 
+# `gsplat_torch` is a baseline for this comparison; training cannot choose it.
 CLASSES = {
     "reference": "completesplat.rasterizers.reference.ReferenceRasterizer",
+    "gsplat_torch": "completesplat.benchmarks.gsplat_torch.GsplatTorchRasterizer",
     "tiled": "completesplat.rasterizers.tiled.TiledRasterizer",
     "cuda": "completesplat.rasterizers.cuda.CudaRasterizer",
 }
@@ -43,32 +47,58 @@ SPEED: list[Column] = [
     ("forward\nms", "forward_ms", ",.1f"),
     ("with backward\nms", "forward_backward_ms", ",.1f"),
     ("times\ntiled", "times_tiled", ",.1f"),
+    ("peak\nMB", "peak_mb", ",.0f"),
 ]
+STEP: list[Column] = [
+    ("backend", "backend", ""),
+    ("size", "size", ""),
+    ("batch", "batch", ""),
+    ("views", "views", ""),
+    ("step\nms", "step_ms", ",.0f"),
+    ("rasterizer\nms", "rasterizer_ms", ",.1f"),
+    ("share", "share", ".1%"),
+]
+
 Tick = Callable[[str], None]
 
 
+class StepSettings(TypedDict):
+    """Settings of the training steps: backends, size of the scenes, and Lightning's precision."""
+
+    backends: Sequence[str]
+    size: Positive
+    batch: Positive
+    targets: Positive
+    precision: str
+
+
 class Figures(NamedTuple):
-    """Median times of the forward pass and of both passes in ms."""
+    """Median times of the forward pass and of both passes in ms, and the memory that a first rendering adds."""
 
     forward_ms: float
     forward_backward_ms: float
+    peak_mb: float | None
 
 
 def run(
     backends: Sequence[str], sizes: Sequence[Positive], views: Sequence[Positive], repeats: Positive,
-    constants: Mapping[str, object], out: Path,
+    training_step: StepSettings | Literal[False], model: Mapping[str, object], constants: Mapping[str, object],
+    out: Path,
 ) -> None:  # fmt: skip
-    """Time the rasterizers, write `rasterizers.json`, and print a table.
+    """Time the rasterizers, write `rasterizers.json`, and print tables.
 
     Args:
         backends: keys of `CLASSES`; those that do not work on this machine are skipped, with the reason.
         sizes, views: sides of the images in pixels and numbers of views; every pair is timed.
         repeats: number of timed calls of each backend.
+        training_step: settings of the training steps; False skips them.
+        model: config of the module whose steps are timed.
         constants: config of the `RenderingConstants` that all backends share.
 
     Raises:
         CompleteSplatError: a backend does not exist.
     """
+    steps: list[Row] = []
     with Console(stderr=True).status("compiling") as status:
 
         def tick(text: str) -> None:
@@ -77,9 +107,16 @@ def run(
         working, absent = working_backends(backends, instantiate(constants))
         quieten()
         rows = speed_rows(working, sizes, views, repeats, tick)
+        if training_step:
+            size, batch, targets = training_step["size"], training_step["batch"], training_step["targets"]
+            for backend in [backend for backend in working if backend.name in training_step["backends"]]:
+                tick(f"a training step with {backend.name}")
+                steps.append(share(backend, model, size, batch, targets, training_step["precision"]))
     described = machine()
-    write_json(out / "rasterizers.json", {"machine": described, "not_measured": absent, "rows": rows})
-    print_results(described, device_name(described), [table("Speed", SPEED, rows)], absent)
+    results = {"machine": described, "not_measured": absent, "rows": rows}
+    write_json(out / "rasterizers.json", results | ({"training_step": steps} if training_step else {}))
+    tables = [table("Speed", SPEED, rows), *([table("Share of a training step", STEP, steps)] if steps else [])]
+    print_results(described, device_name(described), tables, absent)
 
 
 def working_backends(names: Sequence[str], constants: RenderingConstants) -> tuple[list[Backend], dict[str, str]]:
@@ -127,22 +164,25 @@ def side_by_side(
 ) -> dict[str, Figures]:
     """Return the figures of each backend; backends take turns.
 
-    The first rendering of a backend counts only if it has no other.
+    The first rendering with its backward pass gives the memory. Its time counts only if there is no other rendering.
     """
     pixels = cameras.image_size[0] * cameras.image_size[1] * cameras.intrinsics.shape[1]
     backends = [backend for backend in backends if backend.takes(gaussians.count, pixels)]
     times: dict[str, list[tuple[float, float]]] = {backend.name: [] for backend in backends}
     spent = dict.fromkeys(times, 0.0)
 
-    for _, backend in product(range(1 + repeats), backends):
-        if spent[backend.name] > LONGEST_SECONDS:
-            continue
+    def render(backend: Backend) -> None:
         start = time.perf_counter()
         inputs = gaussians.to(backend.device), cameras.to(backend.device)
         times[backend.name].append(rendering_milliseconds(backend.rasterizer, *inputs))
         spent[backend.name] += time.perf_counter() - start
+
+    peaks = {backend.name: peak_megabytes(lambda: render(backend), backend.device) for backend in backends}  # noqa: B023
+    for _, backend in product(range(repeats), backends):
+        if spent[backend.name] <= LONGEST_SECONDS:
+            render(backend)
     results = {}
     for name, taken in times.items():
         forward, both = (statistics.median(column) for column in zip(*(taken[1:] or taken), strict=True))
-        results[name] = Figures(forward, both)
+        results[name] = Figures(forward, both, peaks[name])
     return results

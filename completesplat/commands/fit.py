@@ -17,7 +17,7 @@ from completesplat.commands.jobs import LAST, METRICS
 from completesplat.commands.protocol import checkpoint_facts, protocol, write_json
 from completesplat.data.loading.data_module import SceneDataModule
 from completesplat.data.loading.distributed import batch_per_process
-from completesplat.errors import CompleteSplatError
+from completesplat.errors import CompleteSplatError, WeightsError
 from completesplat.results.tables import evaluation_table, show
 from completesplat.settings.checks import check_image_size, check_optimizer, check_verb
 from completesplat.training.checkpoints import newest_whole
@@ -25,6 +25,7 @@ from completesplat.training.stage import Stage
 from completesplat.training.stopping import stopped_together
 from completesplat.training.wandb import wandb_runs
 from completesplat.weights import RUN_WEIGHTS
+from completesplat.weights.checkpoint_reading import check_whole
 
 logger = logging.getLogger(__name__)
 
@@ -105,6 +106,9 @@ def checkpoint_to_continue(config: DictConfig, out: Path) -> str | None:
     path = newest_whole(out / LAST) if config.ckpt_path == "last" else config.ckpt_path
     if path is None:
         return None
+    if not Path(path).is_file():
+        raise WeightsError(f"{path}: no such checkpoint")
+    check_whole(Path(path))  # now, because data may be made first
     for part in (config.autoreconstructor, config.conditioning, config.model):
         for key in OTHER_WEIGHTS & part.keys():
             part[key] = None

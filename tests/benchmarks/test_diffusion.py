@@ -37,6 +37,13 @@ def test_the_ways_take_turns_and_the_medians_of_the_later_calls_count(monkeypatc
     assert calls == ["a", "b"] * (1 + WARM_UP + 3)
 
 
+def test_the_operations_of_both_ways_are_counted():
+    a, b = torch.ones(20, 30), torch.ones(30, 50)
+    row = measured(Comparison(("once", lambda: a @ b), ("twice", lambda: a @ b @ b.T)), 1, CPU)
+    assert row["a_tflop"] * 1e12 == pytest.approx(2 * 20 * 30 * 50)
+    assert row["b_tflop"] == pytest.approx(2 * row["a_tflop"])
+
+
 def test_comparisons_are_chosen_by_name_and_an_unknown_one_is_refused():
     assert chosen_of(["x", "y"], ["x"]) == ["x"]
     assert chosen_of(["x", "y"], None) == ["x", "y"]

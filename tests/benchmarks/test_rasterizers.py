@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 from support import compose_config, strict_json
 
-from completesplat.benchmarks import measuring, rasterizers, workloads
+from completesplat.benchmarks import measuring, rasterizers, training_step, workloads
 from completesplat.benchmarks.rasterizers import (
     CLASSES,
     LONGEST_SECONDS,
@@ -44,15 +44,15 @@ def test_a_failing_backend_is_absent_with_its_reason(monkeypatch: pytest.MonkeyP
 
 
 def test_backends_keep_their_order_and_get_the_constants_and_an_unknown_name_is_refused() -> None:
-    constants = RenderingConstants(max_alpha=0.9)
+    constants, config = RenderingConstants(max_alpha=0.9), compose_config("bench")
     for names in (["tiled", "reference"], ["reference", "tiled"]):
         backends, absent = working_backends(names, constants)
         assert absent == {}
         assert [backend.name for backend in backends] == names
         assert all(backend.rasterizer.constants == constants for backend in backends)
-    with pytest.raises(CompleteSplatError, match=r"'nonsense'.* reference, tiled, cuda"):
+    with pytest.raises(CompleteSplatError, match=r"'nonsense'.* reference, .* tiled, cuda"):
         working_backends(["tiled", "nonsense"], constants)
-    assert set(compose_config("bench").backends) == set(CLASSES)
+    assert {*config.backends, *config.training_step.backends} == set(CLASSES)
 
 
 class Clock:
@@ -97,6 +97,7 @@ def test_there_is_one_row_for_each_backend_and_workload(clock: Clock, monkeypatc
     ]
     for row in rows:
         assert row["forward_ms"] == row["forward_backward_ms"] == milliseconds[row["backend"]]
+        assert row["peak_mb"] is None or row["peak_mb"] >= 0
     assert len(messages) == len(works)
 
 
@@ -105,7 +106,7 @@ def test_backends_take_turns_and_the_time_is_the_median_without_the_first_run(cl
     slow, quick = clock.backend("slow", LONGEST_SECONDS + 1, 1.0), clock.backend("quick", 1.0, 0.5, 0.125, 0.25)
     backends = [slow, quick, clock.backend("other", 0.1)]
     figures = side_by_side(backends, *splatter_scene(4, 1, "trained"), repeats=3)
-    assert clock.turns == ["slow", *["quick", "other"] * 4]  # the first one does not count
+    assert clock.turns == ["slow", *["quick", "other"] * 4]  # one for the memory, three for the time
     assert figures["slow"].forward_ms == (LONGEST_SECONDS + 1) * 1000
     assert figures["quick"].forward_ms == 250
     clock.turns.clear()
@@ -127,7 +128,10 @@ QUICK = ["bench", "rasterizers", "sizes=[16]", "views=[1]", "repeats=1"]
 def test_results_are_written_and_printed(command, tmp_path, monkeypatch):
     """A backend that does not work on this machine is named with the reason."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    finished = command(*QUICK, "backends=[tiled,reference,cuda]", f"out={tmp_path / 'out'}")
+    monkeypatch.setattr(training_step, "UNTIMED_STEPS", 0)
+    monkeypatch.setattr(training_step, "TIMED_STEPS", 1)
+    small = ["training_step.size=32", "training_step.batch=1", "training_step.targets=1"]
+    finished = command(*QUICK, "backends=[tiled,reference,cuda]", *small, f"out={tmp_path / 'out'}")
     assert finished.status == 0, finished.err
     assert finished.out.splitlines()[-1] == str(tmp_path / "out")
     results = strict_json(tmp_path / "out/rasterizers.json")
@@ -136,5 +140,8 @@ def test_results_are_written_and_printed(command, tmp_path, monkeypatch):
         (name, opacity) for opacity in ("trained", "initial") for name in ("tiled", "reference")
     ]
     assert {(row["size"], row["gaussians"], row["views"]) for row in results["rows"]} == {(16, 512, 1)}
+    (step,) = results["training_step"]
+    assert (step["backend"], step["size"], step["batch"], step["views"]) == ("tiled", 32, 1, 2)
     missing = f"cuda: not measured, because {results['not_measured']['cuda']}"
-    assert all(text in finished.out for text in ("Speed", results["machine"]["processor"], missing))
+    texts = ("Speed", "Share of a training step", results["machine"]["processor"], missing)
+    assert all(text in finished.out for text in texts)

@@ -1,21 +1,25 @@
-"""The scenes that are timed, and the time of one rendering."""
+"""The scenes that are timed, and the time and memory of one rendering."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from rasterizer_scenes import render_with_gradients
 
-from completesplat.benchmarks import measuring
+from completesplat.benchmarks import measuring, workloads
 from completesplat.benchmarks.workloads import (
     FOV_DEGREES,
     OPACITIES,
+    peak_megabytes,
     rendering_milliseconds,
     splatter_scene,
 )
 from completesplat.gaussians import Gaussians
 from completesplat.geometry.cameras import Cameras, pinhole
 from completesplat.rasterizers import Rendering
+from completesplat.rasterizers.kernels import drawing
 from completesplat.rasterizers.reference import ReferenceRasterizer
 
 
@@ -33,6 +37,11 @@ def test_the_workload_looks_like_a_splatter_image(opacity: str) -> None:
     else:
         assert gaussians.opacities.max() > 0.9
         assert (alpha > 0.99).float().mean() > 0.5
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system has no /proc")
+FLOATS = 60 * 2**20 // 4  # 60 MB
+CPU = torch.device("cpu")
 
 
 def test_gradients_of_all_images_are_taken_for_all_parameters() -> None:
@@ -66,3 +75,20 @@ def test_the_first_figure_is_the_forward_pass_and_the_second_both(monkeypatch: p
         return Rendering(color, color[:, :, :1], color[:, :, :1])
 
     assert rendering_milliseconds(rasterizer, *splatter_scene(4, 1, "initial")) == (2000.0, 5000.0)
+
+
+@needs_proc
+def test_the_peak_is_the_memory_that_work_adds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Freed memory counts, and so does memory that the kernels would use again."""
+    arrays = [np.ones(FLOATS, np.float32)]  # memory from before does not count
+    assert peak_megabytes(lambda: None, CPU) < 5
+    assert 50 < peak_megabytes(lambda: np.ones(FLOATS, np.float32), CPU) < 70
+    assert all(peak_megabytes(lambda: drawing.Buffers().empty((FLOATS,)).fill(1), CPU) > 50 for _ in range(2))
+    assert 50 < peak_megabytes(lambda: arrays.append(np.ones(FLOATS, np.float32)), CPU) < 70
+
+
+def test_without_proc_the_work_is_done_and_its_memory_unknown(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(workloads, "Path", lambda _: tmp_path / "nowhere/clear_refs")
+    calls = []
+    assert peak_megabytes(lambda: calls.append(1), CPU) is None
+    assert calls == [1]

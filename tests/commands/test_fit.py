@@ -95,3 +95,13 @@ def test_a_missing_setting_is_asked_for(experiment, place, asked):
     with pytest.raises(CompleteSplatError) as caught:
         refuse_missing(compose_config("fit", f"experiment={experiment}", *given))
     assert str(caught.value) == f"{place} is needed: give {place}={asked}"
+
+
+def test_a_checkpoint_that_is_missing_or_cut_off_is_refused_before_data_are_made(command, pipeline, tmp_path):
+    damaged = tmp_path / "damaged.ckpt"
+    damaged.write_bytes((pipeline.var / "checkpoints/last.ckpt").read_bytes()[:-100])
+    for path, reason in ((tmp_path / "nowhere.ckpt", "no such checkpoint"), (damaged, "not a readable checkpoint")):
+        finished = command("fit", f"ckpt_path={path}", f"data.root={tmp_path / 'new'}", "data.make=true", *SMALL)
+        assert finished.status == 2
+        assert finished.err.startswith(f"error: {path}: {reason}")
+    assert not (tmp_path / "new").exists()

@@ -108,6 +108,12 @@ def _take(size: int) -> np.ndarray:
     return np.empty(needed, np.uint8)
 
 
+def release() -> None:
+    """Return unused memory to the system."""
+    with _buffers_lock:
+        _free.clear()
+
+
 class Parameters(NamedTuple):
     """Arrays [batch gaussian ...] of a `Gaussians`, or the gradients with respect to them; float32, contiguous."""
 
