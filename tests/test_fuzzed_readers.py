@@ -87,10 +87,7 @@ def pictures() -> dict[str, list[bytes]]:
         ],
         "JPEG": [encoded(rgb, "JPEG", mode) for mode in (None, "L", "CMYK")]
         + [encoded(rgb, "JPEG", progressive=True, **more)],
-        "TIFF": [
-            encoded(rgb, "TIFF", compression=kind)
-            for kind in (None, "tiff_lzw", "tiff_adobe_deflate", "jpeg", "packbits")
-        ]
+        "TIFF": [encoded(rgb, "TIFF", compression=kind) for kind in COMPRESSIONS]
         + [encoded(part, "TIFF") for part in (grey, alpha, grey.astype(np.float32) / 255, PIXELS)],
         "others": [
             *(encoded(rgb, form) for form in ("BMP", "GIF", "PPM", "JPEG2000", "WEBP", "AVIF", "MPO")),

@@ -76,12 +76,3 @@ def test_parts_can_be_left_out(quick):
     assert set(results) == {"machine", "rows"}
     assert [row["form"] for row in results["rows"]] == ["raw", "prepared jpeg"]
     assert not list(out.glob("bench_data_*"))
-
-
-def test_nothing_is_left_behind_when_it_fails(command, tmp_path):
-    codecs = ("codecs=[png,webp]", "error: codecs=['png', 'webp']: choose one of png, jpeg, bmp\n")
-    for setting, message in (("objects.write.frames=1", "toy_objects: frames=1: must lie between 2 and 1000"), codecs):
-        finished = command(*QUICK, setting, f"out={tmp_path / 'out'}")
-        assert finished.status == 2
-        assert message in finished.err
-        assert not list((tmp_path / "out").glob("*data*"))

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from support import compose_config, strict_json
 
@@ -37,16 +36,6 @@ def test_both_stages_are_measured_written_and_printed(command, tmp_path, monkeyp
     assert results["workload"] == work
     assert all(figure.text in finished.out for figure in FIGURES.values())
     assert finished.out.splitlines()[-1] == str(tmp_path / "out")
-
-
-@pytest.mark.parametrize("task", ["paper", "diffusion"])
-def test_scenes_are_made_in_the_temporary_folder(task, tmp_path, monkeypatch):
-    """Elsewhere toy data have to be asked for."""
-    monkeypatch.setattr("os.cpu_count", lambda: 1)  # starting workers costs more than writing a few images
-    sizes = [f"data.{setting}" for setting in ("scenes=2", "frames=4", "image_size=32")]
-    data = compose_config("bench", f"bench_task={task}", *sizes).task.data
-    instantiate(data, root=str(tmp_path / "scenes"), workers=1, _convert_="all").prepare_data()
-    assert len(list(tmp_path.rglob("*.jpg"))) >= 6
 
 
 def papers_work(*settings: str) -> bool:

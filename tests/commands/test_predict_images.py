@@ -12,7 +12,6 @@ import pytest
 import torch
 from fake_converter import calls, install
 from PIL import Image
-from safetensors.torch import load_file, save_file
 from support import compose_config, some_gaussians, strict_json
 
 from completesplat.commands.predict import find_images, remarks, run, unusual_field_of_view
@@ -20,7 +19,6 @@ from completesplat.data.images.photograph import Photograph
 from completesplat.errors import CompleteSplatError
 from completesplat.gaussians import Gaussians, concatenate
 from completesplat.generator import CompleteSplat
-from completesplat.weights import SUMS_FILE, WEIGHTS_FILE
 
 QUICK = ["samples=1", "frames=2", "steps=1", "video=[]", "rasterizer=reference"]
 
@@ -129,18 +127,6 @@ def test_a_name_that_is_too_long_is_refused_in_a_short_line(predict):
     assert (finished.status, finished.err.count("\n")) == (2, 1)
     assert len(finished.err) < 600
     assert "File name too long" in finished.err
-
-
-def test_weights_that_are_not_finite_are_refused_as_such(predict, tiny_weights, tmp_path):
-    weights = load_file(tiny_weights / WEIGHTS_FILE)
-    folder = tmp_path / "weights"
-    folder.mkdir()
-    for file in tiny_weights.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    (folder / SUMS_FILE).unlink()
-    save_file(weights | {"latent_std": torch.full_like(weights["latent_std"], torch.nan)}, folder / WEIGHTS_FILE)
-    finished = predict(save(tmp_path / "a.png"), f"weights={folder}")
-    assert (finished.status, finished.err) == (2, f"error: {folder}: latent_std is not finite\n")
 
 
 def model_with(tiny_weights: Path, **facts: object) -> CompleteSplat:

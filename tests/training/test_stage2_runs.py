@@ -82,14 +82,8 @@ def test_the_weights_hold_facts_about_the_training_images(run):
     assert [len(facts[name]) for name in ("picture_mean", "picture_std")] == [8, 8]
 
 
-def test_the_latents_and_the_losses_by_timestep_are_logged(run):
+def test_the_latents_moments_are_logged(run):
     table = pandas.read_csv(run.folder / "metrics.csv")
-    rows = table.groupby("step")[[name for name in table if name.startswith("train/loss")]].max()
-    for step in (0, 1):
-        # Two samples, both in one bucket or each in its own: the mean over the buckets is that over the samples.
-        row = rows.loc[step].dropna()
-        assert len(row) in (2, 3)
-        assert row.drop("train/loss").mean() == pytest.approx(row["train/loss"], rel=1e-5)
     values = table.filter(regex="^latent").dropna()
     assert len(values) == 1
     measured = values.iloc[0]
