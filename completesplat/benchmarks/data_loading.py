@@ -108,8 +108,8 @@ def _objects(settings: Objects, codecs: Sequence[str], folder: Path) -> dict[str
 
 def _rooms(settings: Rooms, codecs: Sequence[str], folder: Path) -> dict[str, MakeData]:
     root = settings["write"](out=folder / "rooms")
-    chunks, text = (partial(settings["data"], root=str(root / form)) for form in ("chunks", "text"))
-    return {"chunks": chunks, "text": text, **prepared(text, folder / "prepared rooms", codecs)}
+    text = partial(settings["data"], root=str(root / "text"))
+    return {"text": text, **prepared(text, folder / "prepared rooms", codecs)}
 
 
 def prepared(data: MakeData, folder: Path, codecs: Sequence[str]) -> dict[str, MakeData]:

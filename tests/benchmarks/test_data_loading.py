@@ -62,7 +62,7 @@ def quick(command, tmp_path, monkeypatch):
 def test_everything_is_measured_written_and_printed(quick):
     results, printed, out = quick()
     prepared = ["prepared bmp", "prepared png", "prepared jpeg"]
-    for form_rows, forms in [(results["rows"], ["raw", *prepared]), (results["clips"], ["chunks", "text", *prepared])]:
+    for form_rows, forms in [(results["rows"], ["raw", *prepared]), (results["clips"], ["text", *prepared])]:
         assert [(row["workers"], row["form"]) for row in form_rows] == [(n, form) for n in (0, 2) for form in forms]
         for row in form_rows:
             assert row["images_per_second"] == pytest.approx(4 * row["scenes_per_second"])

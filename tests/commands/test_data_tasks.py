@@ -23,7 +23,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def sets(toy_root: Path, rooms: Path) -> dict[str, list[str]]:
     return {
         "objects": ["data=toy_objects", f"data.root={toy_root}", "data.image_size=16"],
-        "rooms": ["data=toy_rooms", f"data.root={rooms}", "data.image_size=16", "data.form=chunks"],
+        "rooms": ["data=toy_rooms", f"data.root={rooms}", "data.image_size=16"],
     }
 
 

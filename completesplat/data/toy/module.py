@@ -71,15 +71,13 @@ class ToyObjectsDataModule(CO3DDataModule):
 class ToyRoomsDataModule(RE10KDataModule):
     """`RE10KDataModule` of toy rooms, which are written to `root` on first use: below `OWN_PLACE`, or with `make`.
 
-    Existing clips are used as they are, whatever their number is. `form` selects one of RealEstate10K's two forms,
-    "text" or "chunks", which have the same content. `scenes`, `frames`, `height` and `data_seed` determine the data to
-    write; the others are settings of `RE10KDataModule`.
+    Existing clips are used as they are, whatever their number is. `scenes`, `frames`, `height` and `data_seed`
+    determine the data to write; the others are settings of `RE10KDataModule`.
     """
 
     def __init__(
         self,
         root: str,
-        form: str = "text",
         scenes: Positive = 100,
         frames: Positive = 60,
         height: Side = 72,
@@ -88,7 +86,7 @@ class ToyRoomsDataModule(RE10KDataModule):
         **reading: Any,
     ) -> None:
         home = Path(root)
-        super().__init__(str(home if is_packed(home) else home / ROOMS / form), **reading)
+        super().__init__(str(home if is_packed(home) else home / ROOMS / "text"), **reading)
         self.home, self.make = home, make
         self.making = scenes, frames, height, data_seed
 

@@ -1,16 +1,13 @@
-"""Writers of toy data: objects as a CO3D category, rooms in both of RealEstate10K's forms."""
+"""Writers of toy data: objects as a CO3D category, rooms in RealEstate10K's layout."""
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
-from numpy.typing import NDArray
 from PIL import Image
 from rich.console import Console
 from rich.progress import track
@@ -30,7 +27,6 @@ MOST_FRAMES = 1000
 FRAMES_PER_SECOND, ROOM_FRAMES_PER_SECOND = 10.0, 30
 MICROSECONDS = 1_000_000
 LATEST_START = 9000
-CLIPS_PER_CHUNK = 16
 ROOMS = "toy_rooms"
 SUBSET = "fewview_train"
 DRAW: dict[str, Callable[[np.random.Generator, int], ToyScene]] = {
@@ -183,99 +179,45 @@ def _write_lists(category: Path, written: list[Written]) -> None:
     write_annotations(category, annotations, [sequence for _, _, sequence in written], SUBSET, lists)
 
 
-@dataclass(frozen=True)
-class ClipFiles:
-    """Clip of a room in the text form: `folder`/`key`.txt and `folder`/`key`/`timestamp`.jpg.
-
-    `cameras` [frame 18] are the numbers in the text: fx fy cx cy as fractions of width or height, two zeros, and
-    `world_to_camera` by rows.
-    """
-
-    folder: Path
-    key: str
-    timestamps: list[int]
-    cameras: NDArray[np.float32]
-
-    @property
-    def url(self) -> str:  # no real video
-        return f"https://example.com/toy/{self.key}"
-
-    def image(self, frame: int) -> Path:
-        """Return the path of a frame's image."""
-        return self.folder / self.key / f"{self.timestamps[frame]}.jpg"
-
-
-def clip_files(folder: Path, key: str, start: int, intrinsics: Array, world_to_camera: Array) -> ClipFiles:
-    """Return a clip whose first frame is `start` frames into its video; poses are [frame 3 4]."""
-    frames = len(world_to_camera)
-    timestamps = [round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND) for frame in range(frames)]
-    rows = [np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), world_to_camera.reshape(frames, 12)]
-    return ClipFiles(folder, key, timestamps, np.concatenate(rows, axis=1).astype(np.float32))
-
-
-def write_text(clip: ClipFiles) -> None:
-    """Write the text (the address, then timestamp and camera of each frame in a line) and make the frames' folder."""
-    (clip.folder / clip.key).mkdir(parents=True)
-    lines = [clip.url]
-    for time, row in zip(clip.timestamps, clip.cameras, strict=True):
-        # Nine digits identify a float32 exactly, so text and chunks hold the same numbers.
-        lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
-    (clip.folder / f"{clip.key}.txt").write_text("\n".join(lines) + "\n")
-
-
-def write_chunks(folder: Path, clips: list[ClipFiles]) -> None:
-    """Write `folder`/NNNNNN.torch from the text form's frames, and `folder`/index.json."""
-    folder.mkdir(parents=True)
-    index = {clip.key: f"{number // CLIPS_PER_CHUNK:06d}.torch" for number, clip in enumerate(clips)}
-    for name in sorted(set(index.values())):
-        torch.save([_chunk_entry(clip) for clip in clips if index[clip.key] == name], folder / name)
-    (folder / "index.json").write_text(json.dumps(index) + "\n")
-
-
-def _chunk_entry(clip: ClipFiles) -> dict[str, object]:
-    images = [clip.image(frame).read_bytes() for frame in range(len(clip.timestamps))]
-    return {
-        "url": clip.url,
-        "timestamps": torch.tensor(clip.timestamps, dtype=torch.int64),
-        "cameras": torch.from_numpy(clip.cameras),
-        "images": [torch.frombuffer(bytearray(image), dtype=torch.uint8) for image in images],
-        "key": clip.key,
-    }
-
-
 def write_rooms(
     out: Path, scenes: int, frames: int, size: int, seed: int, workers: int | None = None, progress: bool = True
 ) -> Path:
     """Write `scenes` clips of `frames` images, `size` high and 16 / 9 as wide, with poses and intrinsics.
 
-    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg; `chunks`/<split>/ has the same clips in NNNNNN.torch and
-    index.json. The first and every tenth clip after it are in the split `test`, the others in `train`. See `write_once`
-    for the numbers; `workers` are processes (None: one for each core). Return the folder, `out`/toy_rooms.
+    `text`/<split>/ has <key>.txt and <key>/<timestamp>.jpg. The first and every tenth clip after it are in the split
+    `test`, the others in `train`. See `write_once` for the numbers; `workers` are processes (None: one for each core).
+    Return the folder, `out`/toy_rooms.
     """
     splits = ["test" if index % 10 == 0 else "train" for index in range(scenes)]
 
     def fill(folder: Path) -> None:
-        write = partial(_write_clip, folder / "text", frames, size, seed)
-        clips = write_scenes(write, splits, workers, ROOMS, progress)
-        for split in ("train", "test"):
-            write_chunks(folder / "chunks" / split, [clip for clip in clips if clip.folder.name == split])
+        write_scenes(partial(_write_clip, folder / "text", frames, size, seed), splits, workers, ROOMS, progress)
 
     return write_once(out / ROOMS, fill, progress, 2, scenes=scenes, frames=frames, size=size, seed=seed)
 
 
-def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> ClipFiles:
-    """Write the text form of one clip, drawn from a separate random generator."""
+def _write_clip(text: Path, frames: int, size: int, seed: int, place: tuple[int, str]) -> None:
+    """Write one clip, drawn from a separate random generator.
+
+    The text has the address of the video, then a line for each frame: timestamp, fx fy cx cy as fractions of width or
+    height, two zeros, and `world_to_camera` by rows.
+    """
     index, split = place
     rng = np.random.default_rng([seed, index])
     scene = draw_room_scene(rng, frames)
     width, start = image_width(size), int(rng.integers(LATEST_START))
-    intrinsics = scene.move.intrinsics(size, width)
-    clip = clip_files(text / split, f"room{index:05d}", start, intrinsics, scene.move.world_to_camera())
-    write_text(clip)
-    for frame in range(frames):
-        image, _ = render_room_frame(scene, frame, size, width)
-        write_image(clip.image(frame), image)
-    return clip
+    intrinsics, poses = scene.move.intrinsics(size, width), scene.move.world_to_camera().reshape(frames, 12)
+    rows = np.concatenate([np.broadcast_to(intrinsics, (frames, 4)), np.zeros((frames, 2)), poses], axis=1)
+    key = f"room{index:05d}"
+    images = text / split / key
+    images.mkdir(parents=True)
+    lines = [f"https://example.com/toy/{key}"]  # no real video
+    for frame, row in enumerate(rows.astype(np.float32)):
+        time = round((start + frame) * MICROSECONDS / ROOM_FRAMES_PER_SECOND)
+        # Nine digits identify a float32 exactly.
+        lines.append(" ".join([str(time), *(f"{number:.9g}" for number in row)]))
+        write_image(images / f"{time}.jpg", render_room_frame(scene, frame, size, width)[0])
+    (text / split / f"{key}.txt").write_text("\n".join(lines) + "\n")
 
 
 KINDS: dict[str, Callable[..., Path]] = {
