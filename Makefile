@@ -54,7 +54,7 @@ demo-train: $(READY) ## Make toy scenes, train both stages briefly, evaluate, co
 # The processes fill the cores: further threads would take turns with them, and those that wait at full speed, as GNU
 # OpenMP's do by default, would keep another process off its core. Where an environment forbids Python to keep compiled
 # modules, rewriting every assertion takes ten seconds each time.
-test: check ## Lint, types and the tests (CPU, 6 to 12 minutes on two cores)
+test: check ## Lint, types and the tests (CPU, 4 to 8 minutes on two cores)
 	OMP_NUM_THREADS=1 GOMP_SPINCOUNT=3000 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --numprocesses auto --maxprocesses 4 --dist worksteal
 
 test-processes: $(READY) ## The tests that start processes and servers, send signals, damage files at random, fill disks
