@@ -4,6 +4,7 @@ import pytest
 import torch
 from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution
 from hydra.utils import instantiate
+from kornia.metrics import ssim as kornia_ssim
 from lightning import Trainer
 from scenes_for_training import scene_batch
 from support import NETWORKS, compose_config, some_gaussians
@@ -16,7 +17,7 @@ from completesplat.losses import Prediction, WeightedSum
 from completesplat.losses.kl import KullbackLeibler
 from completesplat.losses.mse import MeanSquaredError
 from completesplat.losses.regularizers import MeanOpacity, MeanScale
-from completesplat.losses.ssim import StructuralDissimilarity
+from completesplat.losses.ssim import StructuralDissimilarity, structural_similarity
 from completesplat.scene import Views
 
 SHAPE = (2, 3, 3, 24, 24)
@@ -37,13 +38,30 @@ def pair():
     return torch.rand(SHAPE, generator=generator), torch.rand(SHAPE, generator=generator)
 
 
-def test_ssim_is_one_minus_torchmetrics_value(pair):
-    """The two libraries differ at the border only: compare smooth images, on which the border has its mean value."""
-    smooth = [torch.nn.functional.avg_pool2d(x.flatten(0, 1), 5, 1, 2, count_include_pad=False) for x in pair]
-    ours = StructuralDissimilarity()(prediction(smooth[0].view(SHAPE)), views(smooth[1].view(SHAPE)))
-    theirs = structural_similarity_index_measure(smooth[0], smooth[1], data_range=1.0)
-    assert ours.item() == pytest.approx(1 - theirs.item(), abs=0.05)
-    assert StructuralDissimilarity()(prediction(pair[0]), views(pair[0])).item() == pytest.approx(0, abs=1e-5)
+def test_ssim_has_the_values_and_gradients_of_other_libraries(pair):
+    first, second = (images.flatten(0, 1)[..., :20].double() for images in pair)
+    values = structural_similarity(first.requires_grad_(), second)
+    assert values.mean().item() == pytest.approx(kornia_ssim(first, second, window_size=11).mean().item(), abs=2e-9)
+    theirs = structural_similarity_index_measure(first, second, data_range=1.0, reduction="none")
+    torch.testing.assert_close(values.mean((1, 2, 3)), theirs, rtol=0, atol=1e-12)
+    (ours,) = torch.autograd.grad(values.mean(), first)
+    (expected,) = torch.autograd.grad(theirs.mean(), first)
+    torch.testing.assert_close(ours, expected, rtol=0, atol=1e-12)
+
+
+def test_ssim_is_computed_in_full_precision_and_is_one_for_equal_images(pair):
+    term, truth = StructuralDissimilarity(), views(pair[1])
+    full = term(prediction(pair[0]), truth)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert term(prediction(pair[0]), truth) == full
+    assert term(prediction(pair[0]), views(pair[0])).item() == pytest.approx(0, abs=1e-5)
+
+
+def test_ssim_in_a_test_does_not_prevent_a_training(pair):
+    images = pair[0].flatten(0, 1)[..., :23]
+    with torch.inference_mode():
+        structural_similarity(images, images)
+    structural_similarity(images.clone().requires_grad_(), images).mean().backward()
 
 
 @pytest.mark.parametrize("size", [16, 64])
