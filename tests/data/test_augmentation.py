@@ -1,10 +1,13 @@
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from kornia import enhance
 from torch import Tensor
 
+from completesplat.data.images.colors import HUE, change_colors
 from completesplat.data.loading.augmentation import BoxMasks, ColorJitter, augment, mirrored
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import Cameras, look_at, pinhole, project
@@ -137,6 +140,26 @@ def test_hue_rotates_colors_up_to_their_complement_and_keeps_grey_grey() -> None
     quarter = [ColorJitter(0, 0, 0, 0.25)(images, rng(seed))[0, 0, 0, 0] for seed in range(100)]
     # A quarter turn either way ends half-way between yellow and green, or between magenta and blue.
     assert 0.5 - 1e-5 <= min(quarter) < 0.55
+
+
+def test_changes_in_any_order_are_kornias() -> None:
+    """As if all views were one image, because the mean grey level is that of all."""
+    functions = (
+        enhance.adjust_brightness_accumulative,
+        enhance.adjust_contrast_with_mean_subtraction,
+        enhance.adjust_saturation_with_gray_subtraction,
+        enhance.adjust_hue,
+    )
+    for seed in range(30):
+        draw, images = rng(seed), pictures(3, 3, 7, 9, seed=seed)
+        images[:, :, :3] = (4 * images[:, :, :3]).round() / 4  # equal channels, greys, black and white
+        order, factors = draw.permutation(4), [*draw.uniform(0.4, 1.6, 3), draw.uniform(0, 6)]
+        tall = torch.cat([*images], dim=1)
+        for change in order:
+            tall = functions[change](tall, factors[change] * (math.pi / 3 if change == HUE else 1)).clamp(0, 1)
+        ours = images.numpy().copy()
+        change_colors(ours, order, np.array(factors, np.float32))
+        torch.testing.assert_close(torch.cat([*torch.from_numpy(ours)], dim=1), tall, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("change", ["contrast", "saturation"])

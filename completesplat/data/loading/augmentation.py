@@ -1,17 +1,15 @@
 """Random augmentation of training scenes: one colour jitter for all views, flips, boxes over the reference image."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 import torch
-from einops import rearrange
 from jaxtyping import Float
-from kornia import enhance
 from torch import Tensor
 
+from completesplat.data.images.colors import HUE, change_colors
 from completesplat.errors import CompleteSplatError
 from completesplat.geometry.cameras import mirror
 from completesplat.scene import SceneBatch, Views
@@ -51,25 +49,13 @@ class ColorJitter:
         self, images: Float[Tensor, "view 3 height width"], rng: np.random.Generator
     ) -> Float[Tensor, "view 3 height width"]:
         """Change images (sRGB, clamped to 0 to 1) at random; any strengths use equally many random numbers."""
-        strengths = (self.brightness, self.contrast, self.saturation)
-        factors = [rng.uniform(max(0.0, 1 - strength), 1 + strength) for strength in strengths]
-        factors.append(2 * math.pi * rng.uniform(-self.hue, self.hue))
-        functions = (
-            enhance.adjust_brightness_accumulative,
-            enhance.adjust_contrast_with_mean_subtraction,
-            enhance.adjust_saturation_with_gray_subtraction,
-            enhance.adjust_hue,
-        )
-        changes = list(zip(functions, (*strengths, self.hue), factors, strict=True))
-        # All views are stacked into one tall image, so that the mean is taken over the scene.
-        column = rearrange(images, "view channel height width -> channel (view height) width")
-        for index in rng.permutation(len(changes)):
-            change, strength, factor = changes[index]
-            if strength > 0:
-                column = change(column, factor).clamp(0, 1)
-        return rearrange(
-            column, "channel (view height) width -> view channel height width", view=len(images)
-        ).contiguous()
+        strengths = np.array([self.brightness, self.contrast, self.saturation, self.hue])
+        factors = [rng.uniform(max(0.0, 1 - strength), 1 + strength) for strength in strengths[:HUE]]
+        factors.append(6 * rng.uniform(-self.hue, self.hue) % 6)
+        order = rng.permutation(len(strengths))
+        changed = images.numpy().copy()
+        change_colors(changed, order[strengths[order] > 0], np.array(factors, np.float32))
+        return torch.from_numpy(changed)
 
 
 @dataclass(frozen=True)
